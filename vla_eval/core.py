@@ -1,0 +1,231 @@
+"""The contracts of one evaluated episode: what is seen, what is done, what came of it.
+
+Read this file, then `rollout.py`, and you can follow an episode from reset to record. Everything
+here is numpy and the standard library: it knows nothing of simulators, models or files.
+
+A *slot* is one of the episodes that run side by side in one environment object; every per-episode
+value is keyed by it. An episode is a function of (task, seed, actions) alone, whatever its slot.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.specs import EnvSpec, PolicySpec
+
+Phase = Literal["cue", "delay", "response"]
+"""Part of an episode: the cue is shown; nothing to remember it by is in view; the answer is due."""
+
+Stage = Literal["setup", "reset", "step", "inference"]
+"""What a worker is busy with; each stage has a time limit of its own."""
+
+FloatArray = NDArray[np.float32]
+ImageArray = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrivilegedState:
+    """The world as it truly is, for scripted controls. Never given to a learned policy.
+
+    Attributes:
+        phase: the phase that holds at this step.
+        response_step: the step at which the response phase begins (0 for a task without phases).
+        tcp_position_m: (3,) tool centre point, world frame.
+        tcp_velocity_m_s: (3,) its linear velocity, world frame.
+        gripper_width_m: gap between the fingers, 0 to 0.08.
+        candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
+            be), world frame, in candidate order; (0, 3) for a task without candidates.
+        target: index of the right candidate, or None for a task without candidates.
+        bodies: moving bodies by name: `ball`, `goal`. Positions (3,) and velocities (3,), world frame.
+    """
+
+    phase: Phase
+    response_step: int
+    tcp_position_m: NDArray[np.float64]
+    tcp_velocity_m_s: NDArray[np.float64]
+    gripper_width_m: float
+    candidate_positions_m: NDArray[np.float64]
+    target: int | None
+    bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyState:
+    """Position (m) and linear velocity (m/s) of a body, each (3,) in the world frame."""
+
+    position_m: NDArray[np.float64]
+    velocity_m_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """What can be observed after `step` control steps.
+
+    Attributes:
+        step: control steps executed since reset; 0 is the reset observation.
+        images: camera name -> (H, W, 3) uint8 RGB. Empty where nobody asked for pictures: a camera
+            is never replaced by a blank one.
+        state: name -> (D,) float32, as `EnvSpec.states` describes them.
+        privileged: the true state of the world; None unless the policy declares that it is privileged.
+    """
+
+    step: int
+    images: Mapping[str, ImageArray]
+    state: Mapping[str, FloatArray]
+    privileged: PrivilegedState | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationWindow:
+    """The observations since the previous inference of one episode, oldest first, never empty.
+
+    A policy that reads only the last frame gets just that one.
+    """
+
+    slot: int
+    frames: tuple[Observation, ...]
+
+    @property
+    def last(self) -> Observation:
+        """The newest observation."""
+        return self.frames[-1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionChunk:
+    """Actions for the control steps from the observed one on.
+
+    Attributes:
+        actions: (T, A) float32; row i is meant for step `window.last.step + i`.
+    """
+
+    actions: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeStart:
+    """What a policy is told when an episode begins.
+
+    Attributes:
+        slot: the slot the episode runs in.
+        task: task id, for example `RememberColor3-v0`.
+        seed: the episode's seed; the environment is reset with it.
+        run: which of several independent runs (training seeds) this is, from 0.
+        instruction: the language instruction.
+        horizon_steps: the episode ends after so many control steps.
+    """
+
+    slot: int
+    task: str
+    seed: int
+    run: int
+    instruction: str
+    horizon_steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskStatus:
+    """What the task says of the episode so far; reading it changes nothing.
+
+    Attributes:
+        phase: the phase at this step.
+        success: the success rule holds at this very step.
+        fail: the episode is lost for good (`strict_choice`, first wrong candidate).
+        target: index of the right candidate; None for a task without candidates.
+        n_candidates: how many candidates there are; 0 for a task without candidates.
+        first_choice: index of the candidate that was touched first in the response phase, if any.
+        n_wrong_choices: how many different wrong candidates have been touched in the response phase.
+    """
+
+    phase: Phase
+    success: bool
+    fail: bool
+    target: int | None
+    n_candidates: int
+    first_choice: int | None
+    n_wrong_choices: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepResult:
+    """What comes back from a reset or a control step of one slot."""
+
+    observation: Observation
+    status: TaskStatus
+    reward: float = 0.0
+
+
+class SimEnv(Protocol):
+    """Some episodes of one task, side by side. Seeds have no default."""
+
+    @property
+    def spec(self) -> EnvSpec:
+        """Cameras, states, action and horizon, as they are for every slot."""
+
+    def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
+        """Begin an episode in each of the given slots.
+
+        Args:
+            seeds: slot -> seed.
+            render: whether the reset observations hold images.
+        """
+
+    def step(
+        self, actions: Mapping[int, FloatArray], *, render: frozenset[int]
+    ) -> dict[int, StepResult]:
+        """Execute one control step in each of the given slots.
+
+        Args:
+            actions: slot -> (A,) float32.
+            render: the slots whose new observation must hold images.
+        """
+
+    def hold_action(self, slot: int) -> FloatArray:
+        """Return the (A,) action that leaves arm and gripper as they are now."""
+
+    def close(self) -> None:
+        """Release the simulator."""
+
+
+class Policy(Protocol):
+    """Observations in, chunks of actions out.
+
+    A policy may also offer `act_batch(windows) -> list[ActionChunk]`; the loop then calls that
+    instead of `act`, once for all slots that are due. The chunk must not depend on the other slots.
+    """
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy reads and how long its chunks are."""
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin these episodes: forget all else that was known of their slots."""
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Decide on the actions from the last observation of the window on."""
+
+
+class BatchPolicy(Policy, Protocol):
+    """A policy that infers for several slots at once."""
+
+    def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
+        """Decide for each window; the order of the answers is that of the windows."""
+
+
+class StepObserver(Protocol):
+    """Watches episodes without touching them: videos, datasets, viewers, heartbeats."""
+
+    def wants_images(self, step: int) -> bool:
+        """Whether the observation after `step` control steps must hold images for this observer."""
+
+    def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
+        """Called once per episode with the reset observation."""
+
+    def on_inference(self, episode: EpisodeStart, step: int, chunk: ActionChunk) -> None:
+        """Called with each chunk that the policy returned for the observation at `step`."""
+
+    def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
+        """Called after each control step with the action that was executed."""

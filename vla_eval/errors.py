@@ -1,0 +1,86 @@
+"""Every error a caller can cause, one class per cause, under one root.
+
+A `VlaEvalError` is a user's mistake or a fact about the machine: the command line prints its message
+without a traceback and exits with code 1. A message says what was expected, what was found, where,
+and what to do next.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class VlaEvalError(Exception):
+    """Root of all errors of this package."""
+
+
+class UnknownNameError(VlaEvalError):
+    """A task, policy, recipe, field or flag was named that does not exist."""
+
+
+class RecipeError(VlaEvalError):
+    """A recipe file (or an override of one) cannot be read, or holds a value that is not allowed."""
+
+
+class TaskArgumentError(VlaEvalError):
+    """A task was given arguments that are impossible, or impossible together."""
+
+
+class SpecMismatchError(VlaEvalError):
+    """A policy needs something that the environment does not provide, or gives it in another form."""
+
+
+class InvalidActionError(VlaEvalError):
+    """A policy returned actions of a wrong shape or type, or with values that are not finite."""
+
+
+class MissingInstructionError(VlaEvalError):
+    """A task has no language instruction where one is needed."""
+
+
+class MissingDependencyError(VlaEvalError):
+    """An optional package, a driver or a library of the machine is not there."""
+
+
+class RenderingError(VlaEvalError):
+    """The renderer could not be started or did not give a picture."""
+
+
+class RunFolderError(VlaEvalError):
+    """A run folder is in use, damaged, or not a run folder."""
+
+
+class RunChangedError(RunFolderError):
+    """A run cannot be continued, because its configuration or its machine has changed."""
+
+
+class StorageFullError(RunFolderError):
+    """A record could not be made durable."""
+
+
+class ReportError(VlaEvalError):
+    """Runs cannot be put into one table as asked."""
+
+
+class TooManyErrorsError(VlaEvalError):
+    """A run was stopped because episode after episode ended in an error."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `" Did you mean 'x'?"` for the closest known name, or `""` if none is close.
+
+    Args:
+        name: what the user wrote.
+        known: the names that exist. Upper and lower case are not told apart when comparing.
+    """
+    by_folded = {candidate.lower(): candidate for candidate in known}
+    close = difflib.get_close_matches(name.lower(), list(by_folded), n=1, cutoff=0.5)
+    return f" Did you mean '{by_folded[close[0]]}'?" if close else ""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:
+    """Build the error for a name that does not exist: what it was, what exists, and a suggestion."""
+    names = sorted(known)
+    prefix = f"{where}: " if where else ""
+    return UnknownNameError(
+        f"{prefix}there is no {kind} '{name}'.{did_you_mean(name, names)} Known: {', '.join(names)}."
+    )

@@ -1,0 +1,1 @@
+"""Policies: the chunk executor, scripted controls, and one adapter per model family."""

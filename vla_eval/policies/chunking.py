@@ -1,0 +1,111 @@
+"""Turn chunks of actions into one action per control step. Knows nothing of policies or simulators.
+
+Time is counted in control steps since reset. A chunk inferred from the observation at step `s` holds
+actions for steps `s, s + 1, …`; with a delay of `d` steps it is available from step `s + d` on.
+
+- `receding_horizon`: the first `n_action_steps` actions are executed, then a new inference replaces
+  the rest. With `n_action_steps` equal to the chunk's length this is open-loop execution.
+- `temporal_ensemble`: an inference every `n_action_steps` steps; the action of a step is the weighted
+  mean of what all chunks say about that step, weight `exp(-decay * i)` for the i-th oldest chunk.
+  Source: Zhao et al. 2023 (ACT, arXiv:2304.13705), section IV-B, where decay is called m.
+
+With a delay, what a chunk says about steps that are past when it arrives is dropped (`delay_alignment:
+skip`), as a robot that goes on moving during inference must do; or the whole chunk is executed late
+(`stale`), which is what a loop that does not know of its own latency does.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vla_eval.core import ActionChunk, FloatArray
+from vla_eval.errors import RecipeError, SpecMismatchError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkingSpec:
+    """How chunks are executed; see the module's text.
+
+    Raises:
+        RecipeError: a value out of its range.
+    """
+
+    n_action_steps: int
+    mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
+    delay_steps: int = 0
+    delay_alignment: Literal["skip", "stale"] = "skip"
+    ensemble_decay: float = 0.01  # the value of ACT's public code
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name, least in (("n_action_steps", 1), ("delay_steps", 0), ("ensemble_decay", 0)):
+            if getattr(self, name) < least:
+                raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ {least}.")
+
+    @property
+    def n_skipped(self) -> int:
+        """How many actions of each chunk are over before it arrives."""
+        return self.delay_steps if self.delay_alignment == "skip" else 0
+
+    @property
+    def min_chunk_size(self) -> int:
+        """The shortest chunk that leaves no step without an action."""
+        return self.n_action_steps + self.n_skipped
+
+    def check_chunk_size(self, chunk_size: int, *, policy: str) -> None:
+        """Raise `SpecMismatchError` if chunks of this length are too short."""
+        if chunk_size < self.min_chunk_size:
+            raise SpecMismatchError(
+                f"policy '{policy}' predicts chunks of {chunk_size} actions, but n_action_steps="
+                f"{self.n_action_steps} with delay_steps={self.delay_steps} ({self.delay_alignment}) needs "
+                f"{self.min_chunk_size}. Lower n_action_steps or the delay, or choose a policy with longer chunks."
+            )
+
+
+class _Arrived(NamedTuple):
+    first_step: int  # the step that actions[0] is executed at
+    usable_from: int
+    actions: FloatArray
+
+
+class ChunkExecutor:
+    """Executes the chunks of one episode; one object per slot, emptied by `reset`."""
+
+    def __init__(self, spec: ChunkingSpec) -> None:
+        """Start with no chunks."""
+        self.spec = spec
+        self._chunks: list[_Arrived] = []
+        self._next_inference_step = 0
+
+    def reset(self) -> None:
+        """Forget all chunks: a new episode begins at step 0."""
+        self._chunks = []
+        self._next_inference_step = 0
+
+    def infers_at(self, step: int) -> bool:
+        """Whether the observation at this step is to be given to the policy."""
+        return step == self._next_inference_step
+
+    def submit(self, step: int, chunk: ActionChunk) -> None:
+        """Take the chunk that was inferred from the observation at `step`."""
+        spec = self.spec
+        arrival = step + spec.delay_steps
+        self._chunks.append(_Arrived(arrival - spec.n_skipped, arrival, chunk.actions.copy()))
+        self._next_inference_step = step + spec.n_action_steps
+
+    def action(self, step: int) -> FloatArray | None:
+        """Return the (A,) action to execute at `step`, or None while no chunk has arrived yet."""
+        self._chunks = [c for c in self._chunks if step < c.first_step + len(c.actions)]
+        usable = [c for c in self._chunks if c.usable_from <= step]
+        if not usable:
+            return None
+        if self.spec.mode == "receding_horizon":
+            newest = usable[-1]
+            chosen: FloatArray = newest.actions[step - newest.first_step].copy()
+            return chosen
+        weights = np.array([math.exp(-self.spec.ensemble_decay * i) for i in range(len(usable))])
+        proposed = np.stack([c.actions[step - c.first_step] for c in usable]).astype(np.float64)
+        mean: FloatArray = (weights @ proposed / weights.sum()).astype(np.float32)
+        return mean

@@ -1,0 +1,23 @@
+"""What a policy adapter is told when it is made: the one signature all adapters share."""
+
+from dataclasses import dataclass
+
+from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.specs import EnvSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicyContext:
+    """The first argument of every policy factory; the recipe's `args` follow as keyword arguments.
+
+    Attributes:
+        name: the policy's name in records and tables.
+        env: what the environment offers.
+        chunking: how its chunks will be executed; a scripted policy plans `min_chunk_size` actions.
+        n_candidates: how many candidates the task has; 0 for a task without candidates.
+    """
+
+    name: str
+    env: EnvSpec
+    chunking: ChunkingSpec
+    n_candidates: int

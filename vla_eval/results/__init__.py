@@ -1,0 +1,1 @@
+"""Records of episodes, the run folder they live in, and what can be said from them."""

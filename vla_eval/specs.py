@@ -1,0 +1,93 @@
+"""What an environment provides and a policy needs, as data that can be compared before the first step.
+
+Knows nothing of simulators or models.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vla_eval.errors import SpecMismatchError, did_you_mean
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSpec:
+    """One camera: (height_px, width_px, 3) uint8 RGB frames; `fov_rad` is the vertical field of view."""
+
+    name: str
+    height_px: int
+    width_px: int
+    fov_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StateSpec:
+    """One proprioceptive vector: float32, one entry per name in `dims`; `unit` and `frame` in words."""
+
+    name: str
+    dims: tuple[str, ...]
+    unit: str
+    frame: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionSpec:
+    """The action vector: one entry per name in `dims`, each in [low, high]; beyond that it is clipped."""
+
+    dims: tuple[str, ...]
+    low: float
+    high: float
+    control_mode: str
+    gripper_open: float
+    """Value of the last entry that opens the gripper; the opposite sign closes it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvSpec:
+    """All that one task offers to a policy."""
+
+    task: str
+    cameras: tuple[CameraSpec, ...]
+    states: tuple[StateSpec, ...]
+    action: ActionSpec
+    horizon_steps: int
+    control_hz: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicySpec:
+    """What a policy reads and what it returns.
+
+    Attributes:
+        name: for messages.
+        reads: `last` if only the newest frame matters (the frames between two inferences are then
+            not rendered), `every` if the policy must see each control step.
+        cameras: the cameras it needs; empty means that nothing is ever rendered for it.
+        states: the proprioceptive vectors it needs.
+        chunk_size: how many actions one inference gives.
+        privileged: whether it reads the true state of the world (scripted controls only).
+    """
+
+    name: str
+    reads: Literal["last", "every"]
+    cameras: tuple[str, ...]
+    states: tuple[str, ...]
+    chunk_size: int
+    privileged: bool = False
+
+
+def check_compatible(policy: PolicySpec, env: EnvSpec) -> None:
+    """Raise `SpecMismatchError` unless the environment provides all that the policy needs."""
+    wanted = (
+        ("camera", policy.cameras, [camera.name for camera in env.cameras]),
+        ("state", policy.states, [state.name for state in env.states]),
+    )
+    for kind, needed, offered in wanted:
+        for name in needed:
+            if name not in offered:
+                raise SpecMismatchError(
+                    f"policy '{policy.name}' needs the {kind} '{name}', which {env.task} does not provide "
+                    f"(it has: {', '.join(offered) or 'none'}).{did_you_mean(name, offered)} "
+                    f"Correct the {kind} names in the policy's recipe."
+                )
+    if policy.chunk_size < 1:
+        raise SpecMismatchError(f"policy '{policy.name}': chunk_size is {policy.chunk_size}, expected ≥ 1.")

@@ -1,0 +1,1 @@
+"""The MIKASA-Robo tasks. `catalog` names them without importing a simulator."""

@@ -1,0 +1,83 @@
+"""All task ids, one row each. Importing it starts no simulator.
+
+Horizons, phases and instructions: the paper, appendix "VLA experiments", and `docs/tasks.md`.
+"""
+
+from vla_eval.errors import unknown_name
+from vla_eval.tasks.spec import TaskSpec
+
+_REMEMBER_COLOR = {
+    n: TaskSpec(
+        id=f"RememberColor{n}-v0",
+        version=1,
+        entry_point="vla_eval.tasks.remember:RememberColorEnv",
+        kwargs={"n_items": n},
+        horizon_steps=60,
+        memory="object",
+        instruction_key="RememberColor",
+        description=(
+            f"A cube of one colour is shown, the table is empty for a while, then {n} cubes of "
+            "different colours lie there: reach the one that has the colour shown."
+        ),
+        success="The tool centre point is within 5 cm of the right cube and the arm is at rest.",
+        oracle="goes to the right cube once the choice has appeared; reads the poses of all cubes",
+        candidates="cubes",
+        chance_success=1 / n,
+        max_reward=3.0,
+    )
+    for n in (3, 5, 9)
+}
+
+TASKS: dict[str, TaskSpec] = {
+    spec.id: spec
+    for spec in (
+        *_REMEMBER_COLOR.values(),
+        TaskSpec(
+            id="ShellGameTouch-v0",
+            version=1,
+            entry_point="vla_eval.tasks.shell_game:ShellGameTouchEnv",
+            horizon_steps=90,
+            memory="object",
+            instruction_key="ShellGameTouch",
+            description=(
+                "A ball lies at one of three places, then a mug stands on each of them: reach the mug "
+                "that hides the ball."
+            ),
+            success="The tool centre point is within 8 cm of the right mug and the arm is at rest.",
+            oracle="goes above the right mug once the mugs have appeared; reads the poses of all mugs",
+            candidates="mugs",
+            chance_success=1 / 3,
+            max_reward=3.0,
+        ),
+        TaskSpec(
+            id="InterceptMedium-v0",
+            version=1,
+            entry_point="vla_eval.tasks.intercept:InterceptEnv",
+            kwargs={"velocity_range_m_s": (0.5, 0.75)},
+            horizon_steps=90,
+            memory="spatial",
+            instruction_key="InterceptMedium",
+            description="A ball rolls across the table: deflect it so that it passes over the target disc.",
+            success="The ball is within 10 cm of the target's centre, measured in the table's plane.",
+            oracle="cradles the ball with the fingers and pushes it to the target; reads ball and target",
+            candidates=None,
+            chance_success=None,
+            max_reward=30.0,
+        ),
+    )
+}
+
+
+def task_spec(task_id: str) -> TaskSpec:
+    """Return the row of a task.
+
+    Args:
+        task_id: `RememberColor3-v0`, with or without the `vla_eval/` namespace.
+
+    Raises:
+        UnknownNameError: there is no such task; the message suggests the closest one.
+    """
+    name = task_id.removeprefix("vla_eval/")
+    if name not in TASKS:
+        raise unknown_name("task", name, TASKS)
+    return TASKS[name]

@@ -1,0 +1,1 @@
+"""Conformance checks for environments, policies and tasks, for us and for third parties."""
