@@ -1,0 +1,53 @@
+"""Make an environment from its settings. The one place that knows which simulators there are.
+
+Each simulator is imported when it is asked for, so that no command pays for one that it does not use.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import cast
+
+from vla_eval.core import SimEnv
+from vla_eval.envs.settings import EnvSettings, RenderSettings
+from vla_eval.errors import MissingDependencyError, unknown_name
+
+__all__ = ["EnvSettings", "RenderSettings", "describe_device", "make_env"]
+
+SIMULATORS = {
+    "maniskill": "vla_eval.envs.maniskill:make_maniskill_env",
+    "fake": "vla_eval.envs.fake:make_fake_env",
+}
+
+
+def make_env(settings: EnvSettings) -> SimEnv:
+    """Make the environment that the settings describe.
+
+    Raises:
+        MissingDependencyError: the simulator is not installed.
+        TaskArgumentError: the task does not take these arguments.
+        RenderingError: cameras are wanted and no renderer can be started.
+    """
+    if settings.simulator not in SIMULATORS:
+        raise unknown_name("simulator", settings.simulator, SIMULATORS)
+    module_name, _, attribute = SIMULATORS[settings.simulator].partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as exc:
+        if exc.name is None or exc.name.split(".")[0] == "vla_eval":
+            raise
+        raise MissingDependencyError(
+            f"simulator '{settings.simulator}' needs the package '{exc.name}', which is not installed. "
+            f"Install it with: pip install 'mikasa-vla-eval[sim]'. `mikasa-vla doctor` checks the machine."
+        ) from exc
+    factory = cast("Callable[[EnvSettings], SimEnv]", getattr(module, attribute))
+    return factory(settings)
+
+
+def describe_device(env: SimEnv) -> Mapping[str, str] | None:
+    """Return what the environment says of the device it runs on, if it says anything.
+
+    An environment may carry a `device` mapping (name of the render device, driver …). It is written
+    into the run folder: pictures may differ from device to device.
+    """
+    device: Mapping[str, str] | None = getattr(env, "device", None)
+    return dict(device) if device else None

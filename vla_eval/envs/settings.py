@@ -1,0 +1,50 @@
+"""What an environment is made from, as data that can be compared and sent to a worker.
+
+Knows nothing of simulators; `vla_eval.envs.factory` makes the environment.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+SimBackend = Literal["cpu", "gpu"]
+Simulator = Literal["maniskill", "fake"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RenderSettings:
+    """How pictures are made.
+
+    Attributes:
+        wrist_mesh: the mesh of the wrist camera's housing: as ManiSkill ships it, or a simpler one
+            that renders faster on a CPU and looks a little different.
+        backend: `auto`, `cpu`, `gpu`, or a device as SAPIEN names it (`cuda:1`).
+    """
+
+    wrist_mesh: Literal["shipped", "simplified"] = "shipped"
+    backend: str = "auto"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvSettings:
+    """One environment object; two equal settings give interchangeable environments.
+
+    Attributes:
+        task: task id from the catalogue.
+        kwargs: the user's task arguments; they go on top of the catalogue row's own.
+        simulator: `maniskill`, or `fake` (arrays only, for tests and dry runs).
+        sim_backend: where the physics runs.
+        render: how pictures are made.
+        cameras: the cameras that may be asked for pictures; empty: no renderer is started.
+        privileged: whether observations carry the true state of the world.
+        n_slots: how many episodes run side by side.
+    """
+
+    task: str
+    kwargs: Mapping[str, Any] = field(default_factory=dict)  # Any: whatever the task's arguments are
+    simulator: Simulator = "maniskill"
+    sim_backend: SimBackend = "cpu"
+    render: RenderSettings = field(default_factory=RenderSettings)
+    cameras: tuple[str, ...] = ()
+    privileged: bool = False
+    n_slots: int = 1
