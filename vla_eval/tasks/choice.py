@@ -1,0 +1,126 @@
+"""Tasks that end in a choice: one of N candidates is right, and it was shown before.
+
+Knows where candidates may lie, which one is touched first, and when the choice is a success; what the
+candidates are and how the cue is shown is the family's affair.
+"""
+
+from typing import Any
+
+import torch
+from mani_skill.utils.structs import Actor, Pose
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
+
+NO_CHOICE = -1
+
+
+class ChoiceEnv(MemoryTableEnv):
+    """A memory task with candidates; see the families for what is shown.
+
+    A candidate counts as touched when, in the response phase, it is the nearest one to the tool centre
+    point, within `goal_threshold_m` of it, and the arm is at rest.
+
+    Args:
+        goal_threshold_m: how near the tool centre point must come.
+        strict_choice: the first wrong candidate that is touched ends the episode as a failure.
+    """
+
+    REACH_SCALE_PER_M: float
+    candidates: list[Actor]
+
+    def __init__(
+        self, *args: Any, goal_threshold_m: float, strict_choice: bool = False, **kwargs: Any
+    ) -> None:
+        """Check the threshold and build the scene."""
+        if not goal_threshold_m > 0:
+            raise TaskArgumentError(f"goal_threshold_m={goal_threshold_m}: expected > 0.")
+        self.goal_threshold_m = goal_threshold_m
+        self.strict_choice = strict_choice
+        super().__init__(*args, **kwargs)
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        super()._load_scene(options)
+        n_candidates = len(self.candidates)
+        self._target = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._slots = torch.zeros(self.num_envs, n_candidates, 3, device=self.device)
+        self._first_choice = torch.full_like(self._target, NO_CHOICE)
+        self._touched = torch.zeros(self.num_envs, n_candidates, dtype=torch.bool, device=self.device)
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        self._first_choice[mask] = NO_CHOICE
+        self._touched[mask] = False
+
+    def candidate_positions_m(self) -> torch.Tensor:
+        """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
+        return torch.stack([actor.pose.p for actor in self.candidates], dim=1)
+
+    def final_positions_m(self) -> torch.Tensor:
+        """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""
+        revealed = (self._elapsed_steps >= self._response_step)[:, None, None]
+        return torch.where(revealed, self.candidate_positions_m(), self._slots)
+
+    def target_index(self) -> torch.Tensor:
+        """Return (B,) the index of the right candidate."""
+        return self._target
+
+    def target_distance_m(self) -> torch.Tensor:
+        """Return (B,) the distance from the tool centre point to the right candidate's centre."""
+        return self._of_target(self._distances_m())
+
+    def _distances_m(self) -> torch.Tensor:
+        offsets = self.candidate_positions_m() - self.tcp_position_m()[:, None, :]
+        return torch.linalg.norm(offsets, dim=2)
+
+    def _of_target(self, per_candidate: torch.Tensor) -> torch.Tensor:
+        rows = torch.arange(self.num_envs, device=self.device)
+        return per_candidate[rows, self._target]
+
+    def _update_latches(self, step: torch.Tensor) -> None:
+        distance, nearest = self._distances_m().min(dim=1)
+        touches = (distance <= self.goal_threshold_m) & self.is_static() & (step >= self._response_step)
+        self._first_choice = torch.where(
+            touches & (self._first_choice == NO_CHOICE), nearest, self._first_choice
+        )
+        rows = torch.arange(self.num_envs, device=self.device)
+        self._touched[rows, nearest] |= touches
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success, failure and choices; changes nothing."""
+        placed = self.target_distance_m() <= self.goal_threshold_m
+        static = self.is_static()
+        success = self.gated(placed & static)
+        n_wrong = self._touched.sum(dim=1) - self._of_target(self._touched.long())
+        lost = (n_wrong > 0) if self.strict_choice else torch.zeros_like(success)
+        return {
+            "success": success & ~lost,
+            "fail": lost,
+            "is_obj_placed": placed,
+            "is_robot_static": static,
+            "obj_to_goal_pos": self._of_target(self.candidate_positions_m()) - self.tcp_position_m(),
+            "first_choice": self._first_choice.clone(),
+            "n_wrong_choices": n_wrong,
+        }
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return (B,) uint8: the index of the right candidate."""
+        return self._target.to(torch.uint8)
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Reach the right candidate, slow down there, stand still there (`docs/tasks.md`, rewards)."""
+        placed = info["is_obj_placed"]
+        return {
+            "reaching": nearness(self.REACH_SCALE_PER_M, self.target_distance_m()),
+            "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * placed,
+            "resting": self.RESTING_WEIGHT * (info["is_robot_static"] & placed),
+        }
+
+    SLOWING_WEIGHT = 1.0
+    RESTING_WEIGHT = 1.0
+
+    def reveal(self, mask: torch.Tensor, orientation_wxyz: torch.Tensor) -> None:
+        """Put all candidates to their slots where the mask holds; orientation is (4,)."""
+        for index, actor in enumerate(self.candidates):
+            positions = self._slots[:, index]
+            quaternions = orientation_wxyz.expand(self.num_envs, 4)
+            self.move(actor, mask, Pose.create_from_pq(positions, quaternions))

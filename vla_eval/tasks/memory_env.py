@@ -1,0 +1,317 @@
+"""What all memory tasks share: robot, cameras, table, phases, placing and parking of objects.
+
+Differences from the official code that concern every task (reasons in `docs/tasks.md`):
+
+- Objects are hidden and revealed in one hook at phase edges, with velocities zeroed, on any backend;
+  `evaluate()` only reads. Hidden objects are parked on the floor, `PARK_X_M` away, beyond the far
+  plane of every camera: never seen, never touched, at rest.
+- All randomness comes from `streams.generator(seed, purpose)` of the single episode.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.scene_builder.table import TableSceneBuilder
+from mani_skill.utils.structs import Actor, Pose
+
+from vla_eval.core import Phase
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks import robots as _robots  # registers the arm with the simplified camera mesh
+from vla_eval.tasks.streams import Stream, generator
+
+PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
+"""Index of a phase in tensors -> its name."""
+
+ROBOT_BASE_X_M = -0.615
+# Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
+REST_QPOS_RAD = (0.0, 0.0, 0.0, -2 * np.pi / 3, 0.0, 2 * np.pi / 3, np.pi / 4, 0.04, 0.04)
+QPOS_NOISE_RAD = 0.02
+N_ARM_JOINTS = 7
+FLOOR_Z_M = -0.9196429  # ManiSkill's table is as high as this
+PARK_X_M = 150.0  # every camera's far plane is at 100 m
+PARK_SPACING_M = 0.3
+CAMERA_SIZE_PX = 128
+CAMERA_FOV_RAD = np.pi / 2
+
+StepRange = int | Sequence[int]
+
+
+def step_range(name: str, value: StepRange) -> tuple[int, int]:
+    """Return (least, most) of a duration in control steps given as a number or as a pair.
+
+    Raises:
+        TaskArgumentError: not a whole number ≥ 0, nor a pair of such numbers in order.
+    """
+    pair = (value, value) if isinstance(value, int) else tuple(value)
+    if len(pair) != 2 or not all(isinstance(v, int) and v >= 0 for v in pair) or pair[0] > pair[1]:
+        raise TaskArgumentError(
+            f"{name}={value!r}: expected a number of control steps ≥ 0, or a pair (least, most) of them."
+        )
+    return int(pair[0]), int(pair[1])
+
+
+class MemoryTableEnv(BaseEnv):
+    """A Panda with a wrist camera at a table, and the clock of cue, delay and response.
+
+    Args:
+        cue_steps: control steps during which the cue is shown; a pair is drawn from per episode.
+        delay_steps: control steps between the cue and the choice; likewise.
+        freeze_until_choice: hold arm and gripper width until the response phase, whatever the action.
+        phase_gate_success: success counts only in the response phase (the official code has no gate).
+        static_threshold_rad_s: the arm is at rest if no joint moves faster.
+        instruction: the sentence for `info["language_instruction"]`; the paper's by default.
+        robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh.
+    """
+
+    SUPPORTED_ROBOTS = _robots.ROBOT_UIDS
+    SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
+    MAX_REWARD: float
+    HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
+    HUMAN_CAMERA_TARGET: tuple[float, float, float] = (-0.3, 0.0, 0.0)
+
+    def __init__(
+        self,
+        *args: Any,
+        robot_uids: str = "panda_wristcam",
+        cue_steps: StepRange = 5,
+        delay_steps: StepRange = 5,
+        freeze_until_choice: bool = False,
+        phase_gate_success: bool = True,
+        static_threshold_rad_s: float = 0.2,
+        instruction: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Check the arguments and build the scene."""
+        self.cue_steps_range = step_range("cue_steps", cue_steps)
+        self.delay_steps_range = step_range("delay_steps", delay_steps)
+        self.freeze_until_choice = freeze_until_choice
+        self.phase_gate_success = phase_gate_success
+        self.static_threshold_rad_s = static_threshold_rad_s
+        self.instruction = instruction
+        if static_threshold_rad_s <= 0:
+            raise TaskArgumentError(f"static_threshold_rad_s={static_threshold_rad_s}: expected > 0.")
+        # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
+        kwargs.setdefault("enhanced_determinism", True)
+        super().__init__(*args, robot_uids=robot_uids, **kwargs)
+
+    # ---------------------------------------------------------------- scene
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        pose = sapien_utils.look_at(eye=[0.3, 0, 0.6], target=[-0.1, 0, 0.1])
+        return [CameraConfig("base_camera", pose, CAMERA_SIZE_PX, CAMERA_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        pose = sapien_utils.look_at(list(self.HUMAN_CAMERA_EYE), list(self.HUMAN_CAMERA_TARGET))
+        return CameraConfig("render_camera", pose, 512, 512, 1.0, 0.01, 100)
+
+    def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(options, sapien.Pose(p=[ROBOT_BASE_X_M, 0, 0]))
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        self.table_scene = TableSceneBuilder(env=self, robot_init_qpos_noise=QPOS_NOISE_RAD)
+        self.table_scene.build()
+        self._park_index: dict[str, int] = {}
+        self._response_step = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._cue_end_step = torch.zeros_like(self._response_step)
+        self._load_items()
+
+    def _load_items(self) -> None:
+        """Build the objects of the task, each at `parking_pose(...)`."""
+        raise NotImplementedError
+
+    def parking_pose(self, name: str, *, half_height_m: float) -> sapien.Pose:
+        """Return where the object of this name rests while hidden, world frame."""
+        index = self._park_index.setdefault(name, len(self._park_index))
+        return sapien.Pose(p=[PARK_X_M + PARK_SPACING_M * index, 0, FLOOR_Z_M + half_height_m])
+
+    # ---------------------------------------------------------------- episode
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        qpos = np.empty((len(env_idx), len(REST_QPOS_RAD)))
+        for row, env in enumerate(env_idx.tolist()):
+            qpos[row] = REST_QPOS_RAD
+            noise = self.episode_generator(env, Stream.ROBOT).normal(0, QPOS_NOISE_RAD, N_ARM_JOINTS)
+            qpos[row, :N_ARM_JOINTS] += noise
+            phases = self.episode_generator(env, Stream.PHASES)
+            self._cue_end_step[env] = int(phases.integers(*self.cue_steps_range, endpoint=True))
+            delay = int(phases.integers(*self.delay_steps_range, endpoint=True))
+            self._response_step[env] = self._cue_end_step[env] + delay
+        self.agent.reset(qpos.astype(np.float32))
+        self.agent.robot.set_pose(sapien.Pose([ROBOT_BASE_X_M, 0, 0]))
+        for env in env_idx.tolist():
+            self._sample_episode(env)
+        mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        mask[env_idx] = True
+        self._on_episode_start(mask)
+        self._on_phase_edges(torch.zeros_like(self._elapsed_steps), mask)
+
+    def _sample_episode(self, env: int) -> None:
+        """Draw all that is random of one episode, from `episode_generator` alone."""
+        raise NotImplementedError
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        """Put everything where it is before the first phase, and empty the latches, where `mask` holds."""
+        raise NotImplementedError
+
+    def episode_generator(self, env: int, stream: Stream) -> np.random.Generator:
+        """Return the generator of one purpose of the episode that runs in parallel environment `env`."""
+        return generator(int(self._episode_seed[env]), stream)
+
+    # ---------------------------------------------------------------- phases
+
+    def phase_index(self, step: torch.Tensor) -> torch.Tensor:
+        """Return (B,) indices into `PHASES` for observations after `step` control steps."""
+        return (step >= self._cue_end_step).long() + (step >= self._response_step).long()
+
+    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+        """Hide and reveal objects where a phase begins at `step`; the only place that does.
+
+        Returns:
+            Whether anything was moved.
+        """
+        raise NotImplementedError
+
+    def _update_latches(self, step: torch.Tensor) -> None:
+        """Take down what happened in this control step and will be asked for later."""
+
+    def _after_control_step(self) -> None:
+        if self.gpu_sim_enabled:
+            self.scene._gpu_fetch_all()
+        step = self._elapsed_steps + 1  # ManiSkill counts only after this hook
+        moved = self._on_phase_edges(step, torch.ones_like(self.scene._reset_mask))
+        if moved and self.gpu_sim_enabled:
+            self.scene._gpu_apply_all()
+            self.scene._gpu_fetch_all()
+        self._update_latches(step)
+
+    @contextmanager
+    def _only(self, mask: torch.Tensor) -> Iterator[None]:
+        """Let setters of actors write only where `mask` holds: ManiSkill writes by `scene._reset_mask`."""
+        previous = self.scene._reset_mask
+        self.scene._reset_mask = mask
+        try:
+            yield
+        finally:
+            self.scene._reset_mask = previous
+
+    def move(self, actor: Actor, mask: torch.Tensor, poses: Pose | sapien.Pose) -> None:
+        """Put an actor, at rest, to a pose in the environments of the mask.
+
+        Args:
+            actor: dynamic or kinematic.
+            mask: (B,) bool.
+            poses: (B,) poses of which the rows of the mask are used, or one pose for all; world frame.
+        """
+        if not bool(mask.any()):
+            return
+        chosen = poses if isinstance(poses, sapien.Pose) else Pose.create(poses.raw_pose[mask])
+        with self._only(mask):
+            actor.set_pose(chosen)
+            if actor.px_body_type == "dynamic":
+                zero = torch.zeros(3, device=self.device)
+                actor.set_linear_velocity(zero)
+                actor.set_angular_velocity(zero)
+
+    # ---------------------------------------------------------------- actions
+
+    def hold_action(self) -> torch.Tensor:
+        """Return the (B, A) action that moves neither arm nor fingers: zero motion, present gripper width.
+
+        Raises:
+            TaskArgumentError: the control mode has no action for that.
+        """
+        if "delta" not in self.control_mode:
+            raise TaskArgumentError(f"control_mode={self.control_mode!r}: only delta modes can hold still.")
+        action = torch.zeros(self.num_envs, self.single_action_space.shape[0], device=self.device)
+        gripper = self.agent.controller.controllers["gripper"]
+        low, high = gripper.config.lower, gripper.config.upper
+        width = self.agent.robot.get_qpos()[:, -2:].mean(dim=1)
+        action[:, -1] = ((width - low) / (high - low) * 2 - 1).clamp(-1, 1)
+        return action
+
+    def _step_action(self, action: Any) -> Any:
+        if self.freeze_until_choice and action is not None:
+            given = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.device)
+            frozen = self._elapsed_steps < self._response_step
+            action = torch.where(frozen[:, None], self.hold_action(), given.reshape(self.num_envs, -1))
+        return super()._step_action(action)
+
+    # ---------------------------------------------------------------- reading
+
+    def tcp_position_m(self) -> torch.Tensor:
+        """Return the (B, 3) tool centre point, world frame."""
+        position: torch.Tensor = self.agent.tcp.pose.p
+        return position
+
+    def is_static(self) -> torch.Tensor:
+        """Return (B,) bool: no arm joint moves faster than the threshold."""
+        static: torch.Tensor = self.agent.is_static(self.static_threshold_rad_s)
+        return static
+
+    def arm_speed(self) -> torch.Tensor:
+        """Return the (B,) Euclidean norm of the seven arm joint velocities, rad/s."""
+        return torch.linalg.norm(self.agent.robot.get_qvel()[:, :N_ARM_JOINTS], dim=1)
+
+    def gated(self, success: torch.Tensor) -> torch.Tensor:
+        """Return success where it may count: in the response phase, or always if the gate is open."""
+        if not self.phase_gate_success:
+            return success
+        return success & (self._elapsed_steps >= self._response_step)
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return what only an oracle may know, (B, …)."""
+        raise NotImplementedError
+
+    def get_info(self) -> dict[str, Any]:
+        """Return the info of the present step; every tensor in it is a new one."""
+        info = {"elapsed_steps": self._elapsed_steps.clone(), **self.evaluate()}
+        info["phase"] = self.phase_index(self._elapsed_steps)
+        info["cue_steps"] = self._cue_end_step.clone()
+        info["delay_steps"] = self._response_step - self._cue_end_step
+        info["oracle_info"] = self.oracle_info().clone()
+        if self.instruction is not None:
+            info["language_instruction"] = [self.instruction] * self.num_envs
+        return info
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        extra = {"tcp_pose": self.agent.tcp.pose.raw_pose}
+        if self.obs_mode_struct.use_state:
+            extra.update(self._privileged_extra())
+        return extra
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        """Return the task's entries of the state observation; never part of a visual observation."""
+        raise NotImplementedError
+
+    # ---------------------------------------------------------------- reward
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Return the (B,) summands of the dense reward where the episode is not solved."""
+        raise NotImplementedError
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
+        """Return the (B,) sum of the terms, or `MAX_REWARD` where the success rule holds."""
+        terms = self.reward_terms(info)
+        info["reward_dict"] = terms
+        total = torch.stack([term.float() for term in terms.values()]).sum(dim=0)
+        return torch.where(info["success"], torch.full_like(total, self.MAX_REWARD), total)
+
+    def compute_normalized_dense_reward(
+        self, obs: Any, action: torch.Tensor, info: dict[str, Any]
+    ) -> torch.Tensor:
+        """Return the dense reward divided by its value at success."""
+        return self.compute_dense_reward(obs, action, info) / self.MAX_REWARD
+
+
+def nearness(scale_per_m: float, distance_m: torch.Tensor) -> torch.Tensor:
+    """Return `1 - tanh(scale * distance)`, the official code's shaping: 1 at no distance, 0 far away."""
+    return 1 - torch.tanh(scale_per_m * distance_m)

@@ -1,0 +1,129 @@
+"""ShellGameTouch: a ball is shown at one of three places, then mugs stand there; find the ball's mug."""
+
+import math
+from typing import Any, Literal
+
+import sapien
+import torch
+from mani_skill.utils.building import actors
+from mani_skill.utils.structs import Pose
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks import mug as mugs
+from vla_eval.tasks.choice import ChoiceEnv
+from vla_eval.tasks.memory_env import StepRange
+from vla_eval.tasks.streams import Stream
+
+N_MUGS = 3
+MUG_SPACING_M = 0.2
+LAYOUT_HALF_RANGE_M = 0.1
+BALL_RADIUS_M = 0.02
+MUG_REST_Z_M = mugs.HEIGHT_M / 2  # the official 0.04 would sink the mug 0.5 mm into the table
+_NORM = math.sqrt(1.25)
+UPSIDE_DOWN_WXYZ = (0.0, 1 / _NORM, 0.5 / _NORM, 0.0)  # official (0, 1, 0.5, 0), made a unit quaternion
+
+
+class ShellGameTouchEnv(ChoiceEnv):
+    """Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
+    stands on each of them, one over the ball (response, without a delay).
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: pose of the right mug 7, of the ball 7, oracle 1).
+
+    Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 where solved.
+
+    Starting state: middle of the row uniform in ±10 cm; the ball's place uniform.
+
+    Episode end: 90 control steps; success and failure are reported but end nothing by themselves.
+
+    Arguments: `mug` (`primitive`, or `ycb` where installed), and those of `ChoiceEnv`, `MemoryTableEnv`.
+
+    Chance level: 1/3 for a perfect arm that ignores the cue.
+
+    Version history: 1, first version.
+    """  # noqa: D205, D415  # Gymnasium's sections instead of a summary line
+
+    MAX_REWARD = 3.0
+    REACH_SCALE_PER_M = 5.0
+    HUMAN_CAMERA_EYE = (0.6, 0.7, 0.6)
+    HUMAN_CAMERA_TARGET = (0.0, 0.0, 0.15)
+
+    def __init__(
+        self,
+        *args: Any,
+        goal_threshold_m: float = 0.08,
+        delay_steps: StepRange = 0,
+        mug: Literal["primitive", "ycb"] = "primitive",
+        **kwargs: Any,
+    ) -> None:
+        """Check the choice of the mug and build the scene."""
+        if mug not in ("primitive", "ycb"):
+            raise TaskArgumentError(f"mug={mug!r}: expected 'primitive' or 'ycb'.")
+        self.mug = mug
+        super().__init__(*args, goal_threshold_m=goal_threshold_m, delay_steps=delay_steps, **kwargs)
+
+    def _load_items(self) -> None:
+        self.candidates = []
+        make_builder = mugs.ycb_mug_builder if self.mug == "ycb" else mugs.primitive_mug_builder
+        for name in ("mug_left", "mug_center", "mug_right"):
+            builder = make_builder(self.scene)
+            builder.initial_pose = self._mug_parking_pose(name)
+            self.candidates.append(builder.build(name=name))
+        # Without collision shape: the ball can neither be pushed out of its mug nor push the mug.
+        self.ball = actors.build_sphere(
+            self.scene,
+            radius=BALL_RADIUS_M,
+            color=[1.0, 0.0, 0.0, 1.0],
+            name="ball",
+            body_type="kinematic",
+            add_collision=False,
+            initial_pose=sapien.Pose(p=[0, 0, BALL_RADIUS_M]),
+        )
+
+    def _mug_parking_pose(self, name: str) -> sapien.Pose:
+        pose = self.parking_pose(name, half_height_m=MUG_REST_Z_M)
+        return sapien.Pose(p=pose.p, q=list(UPSIDE_DOWN_WXYZ))
+
+    def _sample_episode(self, env: int) -> None:
+        self._target[env] = int(self.episode_generator(env, Stream.TARGET).integers(N_MUGS))
+        layout = self.episode_generator(env, Stream.LAYOUT)
+        x, y = layout.uniform(-LAYOUT_HALF_RANGE_M, LAYOUT_HALF_RANGE_M, 2)
+        for index in range(N_MUGS):
+            place = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
+            self._slots[env, index] = torch.tensor(place, dtype=torch.float32)
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        super()._on_episode_start(mask)
+        for actor in self.candidates:
+            self.move(actor, mask, self._mug_parking_pose(actor.name))
+        self._put_ball_under(self._of_target(self._slots), mask)
+
+    def _put_ball_under(self, positions: torch.Tensor, mask: torch.Tensor) -> None:
+        resting = positions.clone()
+        resting[:, 2] = BALL_RADIUS_M
+        self.move(self.ball, mask, Pose.create_from_pq(resting))
+
+    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+        choice_begins = mask & (step == self._response_step)
+        hidden = mask & (step >= self._cue_end_step) & (step < self._response_step)
+        self.reveal(choice_begins, torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device))
+        # Between cue and choice the ball is out of sight; later it goes where its mug goes.
+        self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
+        covered = mask & (step >= self._response_step)
+        self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
+        return bool((choice_begins | hidden | covered).any())
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
+        begun = self._elapsed_steps >= self._response_step
+        return {name: term * begun for name, term in super().reward_terms(info).items()}
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        poses = torch.stack([actor.pose.raw_pose for actor in self.candidates], dim=1)
+        return {
+            "obj_pose": self._of_target(poses),
+            "ball_pose": self.ball.pose.raw_pose,
+            "oracle_info": self.oracle_info(),
+        }
