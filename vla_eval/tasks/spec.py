@@ -22,7 +22,8 @@ class TaskSpec:
         instruction_key: the task's name in `prompts/*.yaml`.
         description: one sentence: what must be done.
         success: one sentence: the success rule.
-        oracle: name of the scripted expert in `policies/`, and what it may see.
+        oracle: `module:attribute` of the scripted expert.
+        oracle_sees: what the expert may see, and when it acts, in words.
         candidates: what the N things are among which the policy chooses; None if there is no choice.
         chance_success: success rate of a perfect arm that ignores the cue; None where it has to be
             measured (there is no choice among candidates).
@@ -39,6 +40,7 @@ class TaskSpec:
     description: str
     success: str
     oracle: str
+    oracle_sees: str
     candidates: str | None
     chance_success: float | None
     max_reward: float

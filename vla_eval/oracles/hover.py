@@ -1,0 +1,51 @@
+"""Expert for choices by touch: go over the chosen candidate, then down, and rest just above it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import PrivilegedState
+from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state
+
+GAIN_PER_M = 13.0  # action per metre of distance; 0.039 m per step and unit: half the way per step
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoverExpert:
+    """Reaches a candidate without touching anything.
+
+    Attributes:
+        rest_above_m: height over the candidate's centre where the tool centre point comes to rest.
+        over_radius_m: within this horizontal distance the arm goes down.
+        travel_above_m: until then it keeps at least this height over the candidate's centre.
+        descend_to_m: and goes down to this height over the table on the way.
+    """
+
+    rest_above_m: float
+    over_radius_m: float
+    travel_above_m: float
+    descend_to_m: float
+
+    def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7) that bring the arm towards a candidate, planned from `state` alone."""
+        centre = state.candidate_positions_m[candidate]
+        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+        rows = []
+        for _ in range(n_actions):
+            translation = np.clip(GAIN_PER_M * (self._goal(centre, arm.position_m) - arm.position_m), -1, 1)
+            rows.append(action_row(translation, GRIPPER_OPEN))
+            arm = advance(arm, translation)
+        return np.stack(rows)
+
+    def _goal(self, centre: Vector, tcp: Vector) -> Vector:
+        goal = centre.copy()
+        if np.linalg.norm((centre - tcp)[:2]) < self.over_radius_m:
+            goal[2] += self.rest_above_m
+        else:
+            goal[2] = max(centre[2] + self.travel_above_m, min(tcp[2], self.descend_to_m))
+        return goal
+
+
+CUBES = HoverExpert(rest_above_m=0.040, over_radius_m=0.04, travel_above_m=0.09, descend_to_m=0.12)
+MUGS = HoverExpert(rest_above_m=0.066, over_radius_m=0.05, travel_above_m=0.116, descend_to_m=0.17)
