@@ -1,0 +1,251 @@
+"""A stand-in for the simulator: the same contract, arrays only. For tests and dry runs.
+
+The tool centre point is a point that moves as it is told; candidates lie in a row; the ball of the
+Intercept tasks rolls straight and is carried along once the point reaches it. No physics, no arm.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import (
+    BodyState,
+    FloatArray,
+    ImageArray,
+    Observation,
+    Phase,
+    PrivilegedState,
+    StepResult,
+    TaskStatus,
+)
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import TaskArgumentError, did_you_mean
+from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.tasks.catalog import task_spec
+
+M_PER_STEP = 0.039  # what ManiSkill's pd_ee_delta_pose really moves per step at action 1
+CONTROL_HZ = 20.0
+TCP_START_M = (-0.07, 0.0, 0.318)
+CANDIDATE_SPACING_M = 0.1
+CANDIDATE_Z_M = 0.02
+REACH_M = 0.05
+STATIC_ACTION = 0.2  # below it in each dimension the point counts as at rest
+GOAL_RADIUS_M = 0.1
+GRIPPER_MAX_M = 0.08
+IMAGE_SIZE_PX = 128
+CAMERA_NAMES = ("base_camera", "hand_camera")
+ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(slots=True, kw_only=True)
+class _Episode:
+    """One running episode."""
+
+    seed: int
+    candidates_m: Vector
+    target: int | None
+    ball_m: Vector
+    ball_velocity_m_s: Vector
+    goal_m: Vector
+    step: int = 0
+    tcp_m: Vector = field(default_factory=lambda: np.array(TCP_START_M))
+    tcp_velocity_m_s: Vector = field(default_factory=lambda: np.zeros(3))
+    gripper_width_m: float = GRIPPER_MAX_M
+    is_static: bool = True
+    touched: list[int] = field(default_factory=list)
+
+
+class FakeEnv:
+    """Implements `SimEnv`; `n_renders` counts the observations that were rendered.
+
+    Args:
+        settings: `kwargs` may hold `n_items`, `cue_steps`, `delay_steps` for tasks with candidates, and
+            `velocity_range_m_s` for the others.
+    """
+
+    def __init__(self, settings: EnvSettings) -> None:
+        """Check the arguments."""
+        task = task_spec(settings.task)
+        defaults: dict[str, Any] = (  # Any: numbers and a pair of numbers
+            {"cue_steps": 5, "delay_steps": 5, "n_items": 3}
+            if task.candidates
+            else {"velocity_range_m_s": (0.5, 0.75)}
+        )
+        for name in settings.kwargs:
+            if name not in defaults:
+                raise TaskArgumentError(
+                    f"{task.id} takes no argument '{name}'.{did_you_mean(name, defaults)} "
+                    f"Known: {', '.join(defaults)}."
+                )
+        self._arguments = {**defaults, **task.kwargs, **settings.kwargs}
+        self._n_items: int = self._arguments.get("n_items", 0)
+        self._cue_steps: int = self._arguments.get("cue_steps", 0)
+        self._response_step: int = self._cue_steps + self._arguments.get("delay_steps", 0)
+        self._settings = settings
+        self._episodes: dict[int, _Episode] = {}
+        self.n_renders = 0
+        self.device = {"renderer": "fake"}
+        self.spec = EnvSpec(
+            task=task.id,
+            cameras=tuple(
+                CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
+                for name in CAMERA_NAMES
+            ),
+            states=(
+                StateSpec(
+                    name="tcp_pose",
+                    dims=("x", "y", "z", "qw", "qx", "qy", "qz"),
+                    unit="m, wxyz",
+                    frame="world",
+                ),
+                StateSpec(name="qpos", dims=tuple(f"q{i}" for i in range(9)), unit="rad, m", frame="joint"),
+                StateSpec(
+                    name="qvel", dims=tuple(f"v{i}" for i in range(9)), unit="rad/s, m/s", frame="joint"
+                ),
+            ),
+            action=ActionSpec(
+                dims=ACTION_DIMS, low=-1.0, high=1.0, control_mode="pd_ee_delta_pose", gripper_open=1.0
+            ),
+            horizon_steps=task.horizon_steps,
+            control_hz=CONTROL_HZ,
+        )
+
+    def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
+        """Begin an episode in each of the given slots; see `SimEnv`."""
+        self._episodes.update({slot: self._new_episode(seed) for slot, seed in seeds.items()})
+        return {slot: self._result(slot, render=render) for slot in seeds}
+
+    def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
+        """Execute one control step in each of the given slots; see `SimEnv`."""
+        for slot, action in actions.items():
+            self._advance(self._episodes[slot], np.clip(action.astype(np.float64), -1, 1))
+        return {slot: self._result(slot, render=slot in render) for slot in actions}
+
+    def hold_action(self, slot: int) -> FloatArray:
+        """Return the action that leaves point and gripper as they are."""
+        action = np.zeros(len(ACTION_DIMS), dtype=np.float32)
+        action[-1] = self._episodes[slot].gripper_width_m / GRIPPER_MAX_M * 2 - 1
+        return action
+
+    def close(self) -> None:
+        """Forget all episodes."""
+        self._episodes = {}
+
+    def _new_episode(self, seed: int) -> _Episode:
+        rng = np.random.default_rng([seed, self._n_items])
+        places = rng.permutation(self._n_items) - (self._n_items - 1) / 2
+        candidates = np.column_stack(
+            [np.zeros(self._n_items), places * CANDIDATE_SPACING_M, np.full(self._n_items, CANDIDATE_Z_M)]
+        )
+        low, high = self._arguments.get("velocity_range_m_s", (0.0, 0.0))
+        return _Episode(
+            seed=seed,
+            candidates_m=candidates,
+            target=int(rng.integers(self._n_items)) if self._n_items else None,
+            ball_m=np.array([rng.uniform(-0.1, 0.1), -0.6, CANDIDATE_Z_M]),
+            ball_velocity_m_s=np.array([0.0, rng.uniform(low, high), 0.0]),
+            goal_m=np.array([rng.uniform(0.15, 0.2), 0.3, 0.0]),
+        )
+
+    def _advance(self, episode: _Episode, action: Vector) -> None:
+        moved = action[:3] * M_PER_STEP
+        episode.step += 1
+        episode.tcp_m = episode.tcp_m + moved
+        episode.tcp_velocity_m_s = moved * CONTROL_HZ
+        episode.gripper_width_m = float((action[-1] + 1) / 2 * GRIPPER_MAX_M)
+        episode.is_static = bool(np.all(np.abs(action[:3]) < STATIC_ACTION))
+        # The arm comes from above: a ball that rolls under a lifted point is not caught.
+        if episode.target is None and np.linalg.norm(episode.ball_m - episode.tcp_m) <= REACH_M:
+            episode.ball_velocity_m_s = episode.tcp_velocity_m_s * (1, 1, 0)
+        episode.ball_m = episode.ball_m + episode.ball_velocity_m_s / CONTROL_HZ
+        touched = self._touched(episode)
+        if touched is not None and touched not in episode.touched:
+            episode.touched.append(touched)
+
+    def _touched(self, episode: _Episode) -> int | None:
+        """Return the candidate that is being touched, if any: near, at rest, in the response phase."""
+        if episode.step < self._response_step or not episode.is_static or not self._n_items:
+            return None
+        distances = np.linalg.norm(episode.candidates_m - episode.tcp_m, axis=1)
+        nearest = int(np.argmin(distances))
+        return nearest if distances[nearest] <= REACH_M else None
+
+    def _phase(self, episode: _Episode) -> Phase:
+        if episode.step >= self._response_step:
+            return "response"
+        return "cue" if episode.step < self._cue_steps else "delay"
+
+    def _result(self, slot: int, *, render: bool) -> StepResult:
+        episode = self._episodes[slot]
+        if episode.target is None:
+            success = bool(np.linalg.norm((episode.ball_m - episode.goal_m)[:2]) <= GOAL_RADIUS_M)
+        else:
+            success = self._touched(episode) == episode.target
+        status = TaskStatus(
+            phase=self._phase(episode),
+            success=success,
+            fail=False,
+            target=episode.target,
+            n_candidates=self._n_items,
+            first_choice=episode.touched[0] if episode.touched else None,
+            n_wrong_choices=sum(choice != episode.target for choice in episode.touched),
+        )
+        return StepResult(
+            observation=self._observe(episode, render=render), status=status, reward=float(success)
+        )
+
+    def _observe(self, episode: _Episode, *, render: bool) -> Observation:
+        fingers = [episode.gripper_width_m / 2] * 2
+        state = {
+            "tcp_pose": [*episode.tcp_m, 0, 1, 0, 0],
+            "qpos": [*episode.tcp_m, 0, 0, 0, 0, *fingers],
+            "qvel": [*episode.tcp_velocity_m_s, 0, 0, 0, 0, 0, 0],
+        }
+        render = render and bool(self._settings.cameras)
+        self.n_renders += render
+        return Observation(
+            step=episode.step,
+            images={name: self._picture(episode, name) for name in self._settings.cameras} if render else {},
+            state={name: np.array(values, dtype=np.float32) for name, values in state.items()},
+            privileged=self._privileged(episode) if self._settings.privileged else None,
+        )
+
+    def _picture(self, episode: _Episode, camera: str) -> ImageArray:
+        """Return a picture that shows the cue in its first rows, and otherwise depends on the state alone."""
+        view = CAMERA_NAMES.index(camera)
+        rng = np.random.default_rng(
+            [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
+        )
+        picture = rng.integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
+        picture[:8] = (
+            20 * (episode.target + 1) if self._phase(episode) == "cue" and episode.target is not None else 0
+        )
+        return picture
+
+    def _privileged(self, episode: _Episode) -> PrivilegedState:
+        bodies = {}
+        if episode.target is None:
+            bodies["ball"] = BodyState(
+                position_m=episode.ball_m.copy(), velocity_m_s=episode.ball_velocity_m_s.copy()
+            )
+            bodies["goal"] = BodyState(position_m=episode.goal_m.copy(), velocity_m_s=np.zeros(3))
+        return PrivilegedState(
+            phase=self._phase(episode),
+            response_step=self._response_step,
+            tcp_position_m=episode.tcp_m.copy(),
+            tcp_velocity_m_s=episode.tcp_velocity_m_s.copy(),
+            gripper_width_m=episode.gripper_width_m,
+            candidate_positions_m=episode.candidates_m.copy(),
+            target=episode.target,
+            bodies=bodies,
+        )
+
+
+def make_fake_env(settings: EnvSettings) -> FakeEnv:
+    """Make a fake environment; the factory's entry."""
+    return FakeEnv(settings)

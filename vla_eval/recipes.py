@@ -1,0 +1,276 @@
+"""Find, read strictly and hash the YAML recipes; turn them into frozen dataclasses.
+
+A recipe is a file in one of four folders: `configs/`, `policies/`, `prompts/`, `datasets/`. It is
+found by a given path, then in the working directory's folder, then among the ones that come with the
+package. Knows nothing of tasks, policies or simulators: whether a named task exists is not its affair.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from vla_eval.decoding import decode, find_field, load_yaml
+from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
+from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.policies.chunking import ChunkingSpec
+
+Folder = Literal["configs", "policies", "prompts", "datasets"]
+PACKAGE_ROOT = Path(__file__).parent
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe[T]:
+    """A recipe and where it came from.
+
+    Attributes:
+        name: the file's name without `.yaml`.
+        path: the file.
+        sha256: digest of the file's bytes.
+        value: what it says.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+    value: T
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolicyRecipe:
+    """`policies/*.yaml`: which code and which weights, under one name.
+
+    Attributes:
+        version: raised when a change of the recipe moves a success rate.
+        description: one sentence.
+        adapter: a name from the registry (`mikasa-vla list policies`) or `module:attr`.
+        args: keyword arguments of the adapter.
+        default_n_action_steps: actions executed per inference, where the evaluation names none.
+        max_workers: how many workers `workers: auto` may start, since each loads the policy.
+    """
+
+    version: int
+    description: str
+    adapter: str
+    args: dict[str, Any] = field(default_factory=dict)  # Any: whatever the adapter takes
+    default_n_action_steps: int = 1
+    max_workers: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PromptRecipe:
+    """`prompts/*.yaml`: the instructions of the tasks, under one name.
+
+    Attributes:
+        version: raised when a sentence changes.
+        description: one sentence.
+        source: where the sentences come from.
+        instructions: instruction key of a task -> its sentence, then paraphrases of it.
+    """
+
+    version: int
+    description: str
+    source: str
+    instructions: dict[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkingConfig:
+    """How chunks of actions are executed; `vla_eval.policies.chunking` explains it."""
+
+    mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
+    delay_steps: int = 0
+    delay_alignment: Literal["skip", "stale"] = "skip"
+    ensemble_decay: float = 0.01
+
+    def spec(self, n_action_steps: int) -> ChunkingSpec:
+        """Return the chunking of one evaluation."""
+        return ChunkingSpec(n_action_steps=n_action_steps, **dataclasses.asdict(self))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeoutConfig:
+    """Seconds after which a worker that is busy with one thing is killed."""
+
+    setup_seconds: float = 900.0
+    reset_seconds: float = 120.0
+    step_seconds: float = 120.0
+    inference_seconds: float = 300.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvalConfig:
+    """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys.
+
+    Raises:
+        RecipeError: a value out of its range, or something named twice.
+    """
+
+    name: str
+    tasks: tuple[str, ...]
+    policies: tuple[str, ...]
+    description: str = ""
+    n_action_steps: tuple[int, ...] | None = None
+    episodes: int = 100
+    seed_start: int = 1
+    runs: int = 1
+    prompt_set: str = "paper"
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    chunking: ChunkingConfig = field(default_factory=ChunkingConfig)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    simulator: Simulator = "maniskill"
+    sim_backend: SimBackend = "cpu"
+    stop_at_success: bool = False
+    eager_rendering: bool = False
+    workers: int | Literal["auto"] = "auto"
+    timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
+    max_consecutive_errors: int = 10
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        check_run_name(self.name)
+        for name in ("episodes", "runs", "max_consecutive_errors"):
+            _require(getattr(self, name) >= 1, name, getattr(self, name), "a number ≥ 1")
+        _require(self.seed_start >= 0, "seed_start", self.seed_start, "a seed ≥ 0")
+        _require(
+            self.workers == "auto" or self.workers >= 1, "workers", self.workers, "'auto' or a number ≥ 1"
+        )
+        for name in ("tasks", "policies", "n_action_steps"):
+            values = getattr(self, name)
+            _require(values is None or len(values) > 0, name, values, "at least one")
+            _require(
+                values is None or len(set(values)) == len(values), name, list(values or ()), "no doubles"
+            )
+        for name in ("setup_seconds", "reset_seconds", "step_seconds", "inference_seconds"):
+            seconds = getattr(self.timeouts, name)
+            _require(seconds > 0, f"timeouts.{name}", seconds, "a number of seconds > 0")
+        for n_action_steps in self.n_action_steps or (1,):
+            self.chunking.spec(n_action_steps)  # checks the ranges
+
+
+OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors")
+"""Fields of `EvalConfig` that move no result: they may differ when a run is continued."""
+
+
+def _require(condition: bool, name: str, found: object, expected: str) -> None:
+    if not condition:
+        raise RecipeError(f"{name} is {found}, expected {expected}.")
+
+
+def check_run_name(name: str) -> None:
+    """Raise `RecipeError` unless the name can be the name of a folder on any machine."""
+    allowed = name and name[0].isalnum() and all(c.isalnum() or c in "._-" for c in name) and name.isascii()
+    _require(bool(allowed), "name", repr(name), "letters, digits, '.', '_' and '-', a letter or digit first")
+
+
+# ------------------------------------------------------------------------------------------ finding
+
+
+def recipe_folders(folder: Folder) -> tuple[Path, ...]:
+    """Return the folders that recipes of a kind are looked for in, in this order."""
+    packaged = PACKAGE_ROOT / "recipes_data" / folder
+    # An editable checkout has no recipes_data: its recipes lie beside the package.
+    shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / folder
+    return tuple(dict.fromkeys((Path.cwd() / folder, shipped)))
+
+
+def list_recipes(folder: Folder) -> dict[str, Path]:
+    """Return name -> file of all recipes of a kind; the working directory's hide the package's."""
+    found: dict[str, Path] = {}
+    for place in reversed(recipe_folders(folder)):
+        found.update({path.stem: path for path in sorted(place.glob("*.yaml"))})
+    return dict(sorted(found.items()))
+
+
+def find_recipe(folder: Folder, name: str) -> Path:
+    """Return the file of a recipe.
+
+    Args:
+        folder: the kind of recipe.
+        name: a path, or the name of a recipe, with or without `.yaml`.
+
+    Raises:
+        UnknownNameError: there is no such file; the message names what there is.
+    """
+    as_path = Path(name)
+    if as_path.suffix in (".yaml", ".yml") and as_path.is_file():
+        return as_path
+    known = list_recipes(folder)
+    stem = name.removeprefix(f"{folder}/").removesuffix(".yaml")
+    if stem in known:
+        return known[stem]
+    raise unknown_name(f"{folder}/*.yaml", name, known)
+
+
+# ------------------------------------------------------------------------------------------ loading
+
+
+def load_recipe[T](
+    folder: Folder,
+    name: str,
+    cls: type[T],
+    *,
+    edit: Callable[[dict[str, Any]], None] | None = None,
+) -> Recipe[T]:
+    """Find a recipe, read it strictly, and return it as an object of `cls`.
+
+    Args:
+        folder: the kind of recipe.
+        name: see `find_recipe`.
+        cls: the dataclass of that kind.
+        edit: changes what the file says, before it is checked (flags and overrides).
+
+    Raises:
+        UnknownNameError: there is no such recipe.
+        RecipeError: it cannot be read, has unknown or missing fields, or values of a wrong type.
+    """
+    path = find_recipe(folder, name)
+    where = f"{folder}/{path.name}" if path.parent in recipe_folders(folder) else str(path)
+    try:
+        content = path.read_bytes()
+        text = content.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise RecipeError(f"{where}: cannot be read as a text file in UTF-8 ({exc}).") from exc
+    data = load_yaml(text, where=where)
+    if not isinstance(data, dict):
+        raise RecipeError(f"{where}: expected fields with values (`name: …`), found {data!r:.60}.")
+    if edit is not None:
+        edit(data)
+    value = decode(cls, data, where=where)
+    return Recipe(name=path.stem, path=path, sha256=hashlib.sha256(content).hexdigest(), value=value)
+
+
+def apply_overrides(data: dict[str, Any], overrides: Sequence[str], *, cls: type) -> None:
+    """Change `data` in place by `a.b=c` each; the value is read as YAML.
+
+    Raises:
+        RecipeError: no `=`, no YAML, or no such field.
+    """
+    for override in overrides:
+        path, equals, text = override.partition("=")
+        if not equals or not path:
+            raise RecipeError(
+                f"--set {override}: expected FIELD=VALUE, for example --set chunking.delay_steps=2."
+            )
+        find_field(cls, path, where=f"--set {override}")
+        *parents, last = path.split(".")
+        target = data
+        for parent in parents:
+            child = target.setdefault(parent, {})
+            if not isinstance(child, dict):
+                raise RecipeError(f"--set {override}: '{parent}' is {child!r}, which has no fields.")
+            target = child
+        target[last] = load_yaml(text, where=f"--set {override}")
+
+
+def to_data(value: Any) -> Any:  # Any: plain data of whatever the recipe holds
+    """Return a recipe's value as plain data: mappings, lists, strings, numbers, booleans, None."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_data(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_data(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_data(item) for item in value]
+    return value

@@ -1,0 +1,102 @@
+"""Find the code behind a name: policy adapters, ours and other people's.
+
+A name is looked up among ours, then among installed packages that declare the entry point group
+`vla_eval.policies`; a name with a colon is `module:attr`. Nothing is imported before it is asked for.
+"""
+
+import importlib
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from typing import Any
+
+from vla_eval.core import Policy
+from vla_eval.errors import MissingDependencyError, UnknownNameError, did_you_mean, unknown_name
+
+PolicyFactory = Callable[..., Policy]
+"""`make_x(context: PolicyContext, **args) -> Policy`; `args` come from the policy's recipe."""
+
+POLICY_GROUP = "vla_eval.policies"
+TASK_GROUP = "vla_eval.tasks"  # reserved: tasks of other packages
+
+POLICIES = {
+    "random": "vla_eval.policies.scripted:make_random",
+    "hold": "vla_eval.policies.scripted:make_hold",
+    "oracle": "vla_eval.policies.scripted:make_oracle",
+    "cue_blind": "vla_eval.policies.scripted:make_cue_blind",
+    "tour": "vla_eval.policies.scripted:make_tour",
+}
+
+
+def policy_adapters() -> dict[str, str]:
+    """Return name -> `module:attr` of all adapters; ours win over another package's of the same name."""
+    others: dict[str, str] = {point.name: point.value for point in _points(POLICY_GROUP)}
+    return {**others, **POLICIES}
+
+
+def check_adapter(adapter: str) -> None:
+    """Raise what `policy_factory` would raise for a mistyped name, without importing the adapter."""
+    module_name, _ = _target(adapter)
+    root = module_name.partition(".")[0]
+    if find_spec(root) is None:
+        raise _no_module(adapter, module_name)
+
+
+def policy_factory(adapter: str) -> PolicyFactory:
+    """Return the function that makes policies of this adapter.
+
+    Args:
+        adapter: a name from the registry, or `module:attr`.
+
+    Raises:
+        UnknownNameError: there is no such adapter, module or attribute.
+        MissingDependencyError: the adapter's module needs a package that is not installed.
+    """
+    module_name, attribute = _target(adapter)
+    try:
+        found: Any = importlib.import_module(module_name)  # Any: whatever the module holds
+    except ModuleNotFoundError as exc:
+        if exc.name and (module_name == exc.name or module_name.startswith(f"{exc.name}.")):
+            raise _no_module(adapter, module_name) from exc
+        raise MissingDependencyError(
+            f"policy adapter '{adapter}' needs the package '{exc.name}', which is not installed. "
+            f"Install what {module_name} needs; `mikasa-vla doctor` lists the extras of this package."
+        ) from exc
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            known = [name for name in dir(found) if not name.startswith("_")]
+            raise UnknownNameError(
+                f"policy adapter '{adapter}': {module_name} has no '{attribute}'.{did_you_mean(part, known)}"
+            )
+        found = getattr(found, part)
+    if not callable(found):
+        raise UnknownNameError(
+            f"policy adapter '{adapter}': {found!r:.60} is not a function that makes a policy."
+        )
+    factory: PolicyFactory = found
+    return factory
+
+
+def _target(adapter: str) -> tuple[str, str]:
+    """Return module and attribute of an adapter."""
+    known = policy_adapters()
+    target = adapter if ":" in adapter else known.get(adapter)
+    if target is None:
+        raise unknown_name("policy adapter", adapter, known)
+    module_name, _, attribute = target.partition(":")
+    if not module_name or not attribute:
+        raise UnknownNameError(
+            f"policy adapter '{adapter}': expected 'module:attribute', for example 'my_pkg.policy:make'."
+        )
+    return module_name, attribute
+
+
+def _no_module(adapter: str, module_name: str) -> UnknownNameError:
+    return UnknownNameError(
+        f"policy adapter '{adapter}': there is no module '{module_name}'. Install the package that holds it, "
+        f"or put its folder on PYTHONPATH."
+    )
+
+
+def _points(group: str) -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=group))
