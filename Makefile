@@ -1,0 +1,31 @@
+# The verbs a person types. Paths are relative, so that the folder may have spaces in its name.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all lint bench clean
+
+BIN := .venv/bin
+
+help:  ## list these verbs
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+
+setup:  ## make .venv and, where there is none, a Vulkan driver
+	@bash scripts/setup.sh
+
+demo: setup  ## evaluate scripted policies on one task and print the table
+	$(BIN)/mikasa-vla eval configs/demo.yaml
+
+test: setup  ## run the tests that need neither GPU, network nor much time
+	$(BIN)/python -m pytest
+
+test-all: setup  ## run every test this machine can run
+	$(BIN)/python -m pytest -m "not network and not parity"
+
+lint: setup  ## ruff and mypy --strict
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+
+bench: setup  ## measure the speed of this machine
+	$(BIN)/mikasa-vla bench
+
+clean:  ## remove .venv and caches; results in runs/ stay
+	rm -rf .venv dist build .mypy_cache .ruff_cache .pytest_cache
