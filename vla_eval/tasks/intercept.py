@@ -138,6 +138,14 @@ class InterceptEnv(MemoryTableEnv):
             "is_robot_static": self.is_static(),
         }
 
+    def moving_bodies(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return position and velocity of `ball` and `goal`."""
+        goal = self.goal.pose.p
+        return {
+            "ball": (self.ball.pose.p, self.ball.linear_velocity),
+            "goal": (goal, torch.zeros_like(goal)),
+        }
+
     def oracle_info(self) -> torch.Tensor:
         """Return (B, 3): the ball's initial velocity, m/s, world frame."""
         return self._initial_velocity

@@ -267,6 +267,10 @@ class MemoryTableEnv(BaseEnv):
             return success
         return success & (self._elapsed_steps >= self._response_step)
 
+    def moving_bodies(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return name -> (B, 3) position in m and (B, 3) velocity in m/s of bodies an expert may see."""
+        return {}
+
     def oracle_info(self) -> torch.Tensor:
         """Return what only an oracle may know, (B, …)."""
         raise NotImplementedError

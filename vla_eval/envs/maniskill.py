@@ -1,0 +1,309 @@
+"""The ManiSkill adapter: torch ends here, numpy begins. Knows nothing of policies or records.
+
+On the CPU simulator every slot is an environment of its own; on the GPU simulator all slots are one
+vectorised environment in which slots that are not asked to act hold still. ManiSkill itself runs with
+`obs_mode="none"`: pictures are taken only where the caller asks for them.
+"""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any  # ManiSkill is untyped: its environments and infos are Any here
+
+import numpy as np
+import sapien
+import torch
+
+from vla_eval.core import (
+    BodyState,
+    FloatArray,
+    ImageArray,
+    Observation,
+    PrivilegedState,
+    StepResult,
+    TaskStatus,
+)
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
+from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
+from vla_eval.tasks.memory_env import CAMERA_FOV_RAD, CAMERA_SIZE_PX, PHASES, MemoryTableEnv
+from vla_eval.tasks.register import env_class
+from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
+
+
+CONTROL_MODE = "pd_ee_delta_pose"
+ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
+FINGERS = ("finger1", "finger2")
+STATES = (
+    StateSpec(
+        name="tcp_pose", dims=("x", "y", "z", "qw", "qx", "qy", "qz"), unit="m, wxyz quaternion", frame="world"
+    ),
+    StateSpec(name="qpos", dims=ARM_JOINTS + FINGERS, unit="rad, m", frame="joint"),
+    StateSpec(name="qvel", dims=ARM_JOINTS + FINGERS, unit="rad/s, m/s", frame="joint"),
+)
+CAMERAS = tuple(
+    CameraSpec(name=name, height_px=CAMERA_SIZE_PX, width_px=CAMERA_SIZE_PX, fov_rad=CAMERA_FOV_RAD)
+    for name in ("base_camera", "hand_camera")
+)
+ACTION = ActionSpec(
+    dims=("dx", "dy", "dz", "drx", "dry", "drz", "gripper"),
+    low=-1.0,
+    high=1.0,
+    control_mode=CONTROL_MODE,
+    gripper_open=1.0,
+)
+CONTROL_HZ = 20.0
+RENDERING_ADVICE = (
+    "Run `mikasa-vla doctor`; on a machine without GPU, SAPIEN needs Mesa's lavapipe ≥ 24.3, which "
+    "`make setup` installs."
+)
+
+
+def make_maniskill_env(settings: EnvSettings) -> "ManiSkillEnv":
+    """Make the environment of a task.
+
+    Raises:
+        UnknownNameError: no such task, argument or camera.
+        TaskArgumentError: arguments that are impossible.
+        RenderingError: cameras are wanted and the renderer does not start.
+    """
+    return ManiSkillEnv(settings)
+
+
+class ManiSkillEnv:
+    """`SimEnv` on ManiSkill; see the module's text."""
+
+    def __init__(self, settings: EnvSettings) -> None:
+        """Build the scenes."""
+        row = task_spec(settings.task)
+        kwargs = {**row.kwargs, **settings.kwargs}
+        horizon_steps = kwargs.pop("horizon_steps", row.horizon_steps)
+        if not isinstance(horizon_steps, int) or horizon_steps < 1:
+            raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
+        _check_arguments(env_class(row), kwargs, row.id)
+        for camera in settings.cameras:
+            if camera not in {known.name for known in CAMERAS}:
+                raise unknown_name("camera", camera, [c.name for c in CAMERAS], where=row.id)
+        self.spec = EnvSpec(
+            task=row.id,
+            cameras=CAMERAS,
+            states=STATES,
+            action=ACTION,
+            horizon_steps=horizon_steps,
+            control_hz=CONTROL_HZ,
+        )
+        self._settings = settings
+        self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
+        batched = settings.sim_backend == "gpu"
+        n_envs = 1 if batched else settings.n_slots
+        self._envs: list[Any] = [
+            _build(env_class(row), settings, kwargs, settings.n_slots if batched else 1) for _ in range(n_envs)
+        ]
+        self._slots_per_env = settings.n_slots if batched else 1
+        _check_phases(self._envs[0], row.id, horizon_steps)
+        self.n_candidates = len(self._envs[0].candidates) if isinstance(self._envs[0], ChoiceEnv) else 0
+        self.device = _describe(self._envs[0], settings)
+
+    def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
+        """Begin an episode in each of the given slots; see `SimEnv.reset`."""
+        results: dict[int, StepResult] = {}
+        for index, slots in self._by_env(seeds):
+            first = index * self._slots_per_env
+            for slot in slots:
+                self._seeds[slot] = seeds[slot]
+            block = self._seeds[first : first + self._slots_per_env].tolist()
+            env_idx = torch.tensor([slot - first for slot in slots], device=self._envs[index].device)
+            _, info = self._envs[index].reset(seed=block, options={"env_idx": env_idx})
+            results |= self._results(index, slots, info, None, frozenset(slots) if render else frozenset())
+        return results
+
+    def step(
+        self, actions: Mapping[int, FloatArray], *, render: frozenset[int]
+    ) -> dict[int, StepResult]:
+        """Execute one control step in each of the given slots; see `SimEnv.step`."""
+        results: dict[int, StepResult] = {}
+        for index, slots in self._by_env(actions):
+            first = index * self._slots_per_env
+            rows = [
+                actions[slot] if slot in actions else self.hold_action(slot)
+                for slot in range(first, first + self._slots_per_env)
+            ]
+            batch = torch.as_tensor(np.stack(rows), device=self._envs[index].device)
+            _, reward, _, _, info = self._envs[index].step(batch)
+            results |= self._results(index, slots, info, reward, render)
+        return results
+
+    def hold_action(self, slot: int) -> FloatArray:
+        """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
+        index, row = divmod(slot, self._slots_per_env)
+        return _array(self._envs[index].hold_action()[row])
+
+    def close(self) -> None:
+        """Release the simulator."""
+        for env in self._envs:
+            env.close()
+        self._envs = []
+
+    def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
+        """Return (environment index, its slots that are meant), in order."""
+        grouped: dict[int, list[int]] = {}
+        for slot in sorted(slots):
+            grouped.setdefault(slot // self._slots_per_env, []).append(slot)
+        return sorted(grouped.items())
+
+    def _results(
+        self, index: int, slots: list[int], info: Any, reward: Any, render: frozenset[int]
+    ) -> dict[int, StepResult]:
+        env = self._envs[index]
+        images = _take_pictures(env, self._settings.cameras) if render.intersection(slots) else {}
+        state = {
+            "tcp_pose": env.agent.tcp.pose.raw_pose,
+            "qpos": env.agent.robot.get_qpos(),
+            "qvel": env.agent.robot.get_qvel(),
+        }
+        results = {}
+        for slot in slots:
+            row = slot % self._slots_per_env
+            observation = Observation(
+                step=int(info["elapsed_steps"][row]),
+                images={name: batch[row].copy() for name, batch in images.items()} if slot in render else {},
+                state={name: _array(batch[row]) for name, batch in state.items()},
+                privileged=_privileged(env, info, row) if self._settings.privileged else None,
+            )
+            results[slot] = StepResult(
+                observation=observation,
+                status=_status(env, info, row),
+                reward=0.0 if reward is None else float(reward[row]),
+            )
+        return results
+
+
+def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
+    backend = _render_backend(settings)
+    try:
+        return cls(
+            num_envs=num_envs,
+            obs_mode="none",
+            reward_mode="normalized_dense",
+            control_mode=CONTROL_MODE,
+            robot_uids=WRIST_MESH_ROBOTS[settings.render.wrist_mesh],
+            sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
+            render_backend=backend,
+            **kwargs,
+        )
+    except RuntimeError as exc:
+        if backend == "none" or settings.sim_backend == "gpu":
+            raise
+        raise RenderingError(
+            f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
+        ) from exc
+
+
+def _render_backend(settings: EnvSettings) -> str:
+    """Return the name ManiSkill uses; without cameras no renderer is started at all."""
+    if not settings.cameras:
+        return "none"
+    if settings.render.backend == "auto":
+        return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
+    return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
+
+
+def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
+    """Raise unless every argument is one of the task's own (not of ManiSkill's base class)."""
+    known: set[str] = {"horizon_steps"}
+    for ancestor in cls.__mro__:
+        if issubclass(ancestor, MemoryTableEnv):
+            parameters = inspect.signature(ancestor.__init__).parameters.values()
+            known |= {p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
+    known.discard("robot_uids")  # chosen by the render option `wrist_mesh`
+    for name in kwargs:
+        if name not in known:
+            raise unknown_name("argument", name, known, where=task)
+
+
+def _check_phases(env: Any, task: str, horizon_steps: int) -> None:
+    longest = env.cue_steps_range[1] + env.delay_steps_range[1]
+    if longest >= horizon_steps:
+        raise TaskArgumentError(
+            f"{task}: cue_steps + delay_steps can be {longest}, but the episode ends after horizon_steps="
+            f"{horizon_steps}: no step is left for the choice. Raise horizon_steps or shorten the phases."
+        )
+
+
+def _describe(env: Any, settings: EnvSettings) -> dict[str, str]:
+    device = {"simulator": str(env.backend.sim_backend)}
+    if settings.cameras:
+        device["render_backend"] = str(env.backend.render_backend)
+        device["render_device"] = _render_device_name()
+    return device
+
+
+def _render_device_name() -> str:
+    """Return the first device's name in SAPIEN's own list, such as `llvmpipe (LLVM 15.0.6, 256 bits)`."""
+    for line in sapien.render.get_device_summary().splitlines():
+        if line.startswith("GPU:"):
+            return str(line.removeprefix("GPU:").strip())
+    return "unknown to SAPIEN"
+
+
+def _take_pictures(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
+    """Return camera name -> (B, H, W, 3) uint8.
+
+    Raises:
+        RenderingError: no camera was declared when the environment was made.
+    """
+    if not cameras:
+        raise RenderingError(
+            "Images were asked for, but this environment was made without cameras, hence without a renderer. "
+            "Name the cameras in EnvSettings.cameras."
+        )
+    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    images = {}
+    for name in cameras:
+        sensor = env.scene.sensors[name]
+        sensor.capture()
+        textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+        images[name] = textures["rgb"].cpu().numpy()
+    return images
+
+
+def _status(env: Any, info: Any, row: int) -> TaskStatus:
+    is_choice = isinstance(env, ChoiceEnv)
+    first = int(info["first_choice"][row]) if is_choice else NO_CHOICE
+    return TaskStatus(
+        phase=PHASES[int(info["phase"][row])],
+        success=bool(info["success"][row]),
+        fail=bool(info["fail"][row]) if "fail" in info else False,
+        target=int(env.target_index()[row]) if is_choice else None,
+        n_candidates=len(env.candidates) if is_choice else 0,
+        first_choice=None if first == NO_CHOICE else first,
+        n_wrong_choices=int(info["n_wrong_choices"][row]) if is_choice else 0,
+    )
+
+
+def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
+    is_choice = isinstance(env, ChoiceEnv)
+    positions = _vector(env.final_positions_m()[row]) if is_choice else np.zeros((0, 3))
+    return PrivilegedState(
+        phase=PHASES[int(info["phase"][row])],
+        response_step=int(info["cue_steps"][row] + info["delay_steps"][row]),
+        tcp_position_m=_vector(env.agent.tcp.pose.p[row]),
+        tcp_velocity_m_s=_vector(env.agent.tcp.linear_velocity[row]),
+        gripper_width_m=float(env.agent.robot.get_qpos()[row, -2:].sum()),
+        candidate_positions_m=positions,
+        target=int(env.target_index()[row]) if is_choice else None,
+        bodies={
+            name: BodyState(position_m=_vector(position[row]), velocity_m_s=_vector(velocity[row]))
+            for name, (position, velocity) in env.moving_bodies().items()
+        },
+    )
+
+
+def _array(tensor: Any) -> FloatArray:
+    copied: FloatArray = tensor.detach().cpu().numpy().astype(np.float32, copy=True)
+    return copied
+
+
+def _vector(tensor: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()
