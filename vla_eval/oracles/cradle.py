@@ -1,0 +1,206 @@
+"""Expert for Intercept: wait beside the ball's lane, let the ball into the fingers, push it to the goal.
+
+The gripper is left 3 cm open: both fingers stand in a row along y and hold the 4 cm ball like a cradle
+while it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
+
+The law is applied to a model of arm and ball that is advanced step by step, so that it gives one action
+(closed loop) or many (open loop) in the same way; and, for the blind control, to a ball that exists in
+the model only.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import PrivilegedState
+from vla_eval.oracles.arm_model import (
+    FULL_SPEED_M_S,
+    GRIPPER_CRADLE,
+    STEP_SECONDS,
+    ArmState,
+    Vector,
+    action_row,
+    advance,
+    arm_state,
+)
+
+HEIGHT_M = 0.022  # of the tool centre point while waiting and pushing: the ball's centre is at 0.02
+BASE_X_M = -0.615
+MIN_REACH_M = 0.30  # nearer to the base the inverse kinematics finds no pose at this height
+LANE_OFFSET_M = 0.065  # distance to the lane while waiting
+FOLLOW_GAP_M = 0.05
+CONTACT_GAP_M = 0.03
+MEET_Y_MIN_M = -0.5
+MEET_Y_EXTRA_M = 0.03
+PUSH_SPEED_M_S = 0.47
+PUSH_SPEED_RANGE_M_S = (0.2, 0.6)
+ALIGNED_M = 0.006
+TRACK_GAIN_PER_S = 6.0
+SIDE_SPEED_CHANGE_M_S = 0.04  # per control step; a faster change lets the ball slip past a finger
+FOLLOW_LEAD_S = 0.10
+POSITION_GAIN_PER_M = 13.0
+UNSEEN_STEPS = 6  # so long the ball is outside the base camera's view: a nominal one is assumed
+GOAL_OFFSET_X_M = 0.2
+NOMINAL_VELOCITY_M_S = (0.018, 0.446)
+ROLLING_SHARE = 5 / 7  # of the initial speed that is left once a solid ball rolls without slipping
+IMAGINED_Y_M = (-0.9, -0.65)
+IMAGINED_VELOCITY_X_M_S = (0.0, 0.05)
+IMAGINED_VELOCITY_Y_M_S = (0.5, 0.75)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Play:
+    """The model's world: arm, ball in the plane of the table, and what the law has to remember.
+
+    Attributes:
+        stage: `wait` beside the lane, `follow` the ball, `close` the gap, `push`.
+        side_speed_m_s: the speed along y that is being commanded while pushing.
+    """
+
+    arm: ArmState
+    ball_m: Vector
+    ball_velocity_m_s: Vector
+    goal_m: Vector
+    stage: str = "wait"
+    side_speed_m_s: float = 0.0
+
+    @property
+    def gap_m(self) -> float:
+        """How far the ball's centre is in front of the tool centre point."""
+        return float(self.ball_m[0] - self.arm.position_m[0])
+
+
+class CradleExpert:
+    """One episode's expert; `imagined` makes it play a ball of its own invention, not the real one."""
+
+    def __init__(self, *, rng: np.random.Generator, imagined: bool) -> None:
+        """Draw the imagined ball now, before anything is seen."""
+        self._imagined = imagined
+        self._stage = "wait"
+        self._side_speed_m_s = 0.0
+        self._drawn_y_m = rng.uniform(*IMAGINED_Y_M)
+        self._drawn_velocity_m_s = np.array(
+            [rng.uniform(*IMAGINED_VELOCITY_X_M_S), rng.uniform(*IMAGINED_VELOCITY_Y_M_S)]
+        )
+        self._imagined_play: _Play | None = None
+
+    def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7), planned from this state alone (and, blind, from the imagined ball)."""
+        play = self._present(state, step)
+        rows = []
+        for _ in range(n_actions):
+            play = _decide(play)
+            velocity = _command(play)
+            rows.append(action_row(velocity / FULL_SPEED_M_S, GRIPPER_CRADLE))
+            play = _advance(play, np.clip(velocity / FULL_SPEED_M_S, -1, 1))
+        self._stage, self._side_speed_m_s = play.stage, play.side_speed_m_s
+        self._imagined_play = play
+        return np.stack(rows)
+
+    def _present(self, state: PrivilegedState, step: int) -> _Play:
+        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+        goal = state.bodies["goal"].position_m[:2]
+        if self._imagined:
+            ball, velocity = self._imagined_ball(goal)
+        elif step < UNSEEN_STEPS:
+            velocity = np.array(NOMINAL_VELOCITY_M_S)
+            ball = np.array([goal[0] - GOAL_OFFSET_X_M, np.mean(IMAGINED_Y_M)])
+            ball = ball + velocity * step * STEP_SECONDS
+        else:
+            body = state.bodies["ball"]
+            ball, velocity = body.position_m[:2], body.velocity_m_s[:2]
+        return _Play(
+            arm=arm,
+            ball_m=ball,
+            ball_velocity_m_s=velocity,
+            goal_m=goal,
+            stage=self._stage,
+            side_speed_m_s=self._side_speed_m_s,
+        )
+
+    def _imagined_ball(self, goal_m: Vector) -> tuple[Vector, Vector]:
+        """Return position and velocity of the imagined ball: the drawn one, or where the model has it."""
+        if self._imagined_play is None:
+            start = np.array([goal_m[0] - GOAL_OFFSET_X_M, self._drawn_y_m])
+            return start, self._drawn_velocity_m_s * ROLLING_SHARE
+        return self._imagined_play.ball_m, self._imagined_play.ball_velocity_m_s
+
+
+def _decide(play: _Play) -> _Play:
+    """Go on to the next stage where it is time."""
+    tcp = play.arm.position_m
+    behind_m = float(play.ball_m[1] - tcp[1])
+    stage = play.stage
+    if stage == "wait" and behind_m > -FOLLOW_LEAD_S * play.ball_velocity_m_s[1]:
+        stage = "follow"
+    if stage == "follow" and abs(behind_m) < ALIGNED_M:
+        stage = "close"
+    if stage in ("follow", "close") and play.gap_m < CONTACT_GAP_M:
+        return replace(play, stage="push", side_speed_m_s=float(play.ball_velocity_m_s[1]))
+    return replace(play, stage=stage)
+
+
+def _command(play: _Play) -> Vector:
+    """Return the (3,) velocity in m/s that the law asks for in this stage."""
+    tcp = play.arm.position_m
+    height = POSITION_GAIN_PER_M * (HEIGHT_M - tcp[2]) * FULL_SPEED_M_S
+    if play.stage == "wait":
+        place = np.array([*_waiting_place_m(play), HEIGHT_M])
+        velocity: Vector = POSITION_GAIN_PER_M * (place - tcp) * FULL_SPEED_M_S
+        return np.clip(velocity, -FULL_SPEED_M_S, FULL_SPEED_M_S)
+    tracking = TRACK_GAIN_PER_S * float(play.ball_m[1] - tcp[1])
+    ball_v_x, ball_v_y = (float(v) for v in play.ball_velocity_m_s)
+    if play.stage == "follow":
+        return np.array([ball_v_x + TRACK_GAIN_PER_S * (play.gap_m - FOLLOW_GAP_M), ball_v_y + tracking, height])
+    if play.stage == "close":
+        return np.array([PUSH_SPEED_M_S, ball_v_y + tracking, height])
+    forward, _ = _push_speeds_m_s(play)
+    return np.array([forward, _next_side_speed_m_s(play) + tracking, height])
+
+
+def _waiting_place_m(play: _Play) -> Vector:
+    """Return (x, y) beside the lane from which a push carries the ball to the goal."""
+    lane_x = float(play.ball_m[0])
+    v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
+    run_up_y = float(play.goal_m[0] - lane_x) * v_y / PUSH_SPEED_M_S + MEET_Y_EXTRA_M
+    meet_y = max(float(play.goal_m[1]) - run_up_y, MEET_Y_MIN_M)
+    x = lane_x + v_x * (meet_y - float(play.ball_m[1])) / v_y - LANE_OFFSET_M
+    from_base_x = x - BASE_X_M
+    if np.hypot(from_base_x, meet_y) < MIN_REACH_M:
+        meet_y = -np.sqrt(max(MIN_REACH_M**2 - from_base_x**2, 0.0))
+    return np.array([x, meet_y])
+
+
+def _push_speeds_m_s(play: _Play) -> tuple[float, float]:
+    """Return forward and sideways speed that bring the ball to the goal at the same time."""
+    to_goal_x, to_goal_y = (float(d) for d in play.goal_m - play.ball_m)
+    side = play.side_speed_m_s
+    wanted = to_goal_x * side / to_goal_y if abs(to_goal_y) > 1e-6 else PUSH_SPEED_RANGE_M_S[1]
+    least, most = PUSH_SPEED_RANGE_M_S
+    forward = min(max(wanted, least), most) if to_goal_y > 0 else most
+    seconds = max(to_goal_x / forward, STEP_SECONDS)
+    return forward, to_goal_y / seconds
+
+
+def _next_side_speed_m_s(play: _Play) -> float:
+    _, wanted = _push_speeds_m_s(play)
+    change = min(max(wanted - play.side_speed_m_s, -SIDE_SPEED_CHANGE_M_S), SIDE_SPEED_CHANGE_M_S)
+    return play.side_speed_m_s + change
+
+
+def _advance(play: _Play, translation: Vector) -> _Play:
+    """Return the model's world one control step later: the ball rolls, or moves with the cradle."""
+    arm = advance(play.arm, translation)
+    velocity = play.ball_velocity_m_s
+    side_speed = play.side_speed_m_s
+    if play.stage == "push":
+        side_speed = _next_side_speed_m_s(play)
+        velocity = arm.step_m[:2] / STEP_SECONDS
+    return replace(
+        play,
+        arm=arm,
+        ball_m=play.ball_m + velocity * STEP_SECONDS,
+        ball_velocity_m_s=velocity,
+        side_speed_m_s=side_speed,
+    )
