@@ -1,0 +1,114 @@
+#!/usr/bin/env bash
+# Make .venv with the pinned dependencies and, where there is none, a Vulkan driver.
+#
+# Run it as often as you like: what is there already is left as it is. As root it installs missing
+# system packages with apt; otherwise it prints the commands for an administrator and stops.
+#
+#   PYTHON=/path/to/python3.12   the interpreter to use instead of the one that is found
+#   MIKASA_SKIP_SYSTEM=1         do not look at drivers and system libraries at all
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source scripts/system.sh
+source scripts/python.sh
+
+VENV=.venv
+VENV_PYTHON=.venv/bin/python
+LOG=.venv/setup.log
+STAMP=.venv/setup.stamp
+NEEDED_GB=10 # the environment has 7 GB; wheels are unpacked beside it while they are installed
+
+say() { printf 'setup: %s\n' "$*"; }
+die() {
+  printf 'setup: %s\n' "$@" >&2
+  exit 1
+}
+
+# Everything that decides what is in the environment, and where it lies: console scripts hold its path.
+fingerprint() {
+  { cat pyproject.toml constraints.txt scripts/setup.sh scripts/opencv_record.py
+    grep -E '^(version|home)' "$VENV/pyvenv.cfg"
+    pwd; } | sha256sum | cut -d ' ' -f 1
+}
+
+is_up_to_date() {
+  [ -f "$STAMP" ] && [ -x "$VENV_PYTHON" ] && [ "$(cat "$STAMP")" = "$(fingerprint)" ]
+}
+
+# An environment that was moved, or whose interpreter is gone or too old, is made anew.
+is_usable_venv() {
+  [ -f "$VENV/pyvenv.cfg" ] && grep -qF "$PWD/$VENV" "$VENV/pyvenv.cfg" && is_right_python "$VENV_PYTHON"
+}
+
+make_venv() {
+  local free_gb
+  free_gb=$(df -Pk . | awk 'NR == 2 { print int($4 / 1048576) }')
+  if [ "$free_gb" -lt "$NEEDED_GB" ]; then
+    die "$free_gb GB are free on this disk, $NEEDED_GB GB are needed." "Make room, then run 'make setup' again."
+  fi
+  say "making $VENV with $("$PYTHON" --version) ($PYTHON)"
+  "$PYTHON" -m venv --clear "$VENV"
+}
+
+# Tell of large downloads and of the installation, keep the rest for the log.
+show_progress() {
+  awk '
+    /^ *Downloading .*\(.*[MG]B\)/ {
+      size = $0; sub(/^.*\(/, "", size); sub(/\).*$/, "", size)
+      if (size ~ /GB/ || size + 0 >= 50) {
+        name = $2; sub(/^.*\//, "", name); sub(/-(cp|py).*$/, "", name)
+        printf "setup:   downloading %s (%s)\n", name, size; fflush()
+      }
+    }
+    /^Installing collected packages/ { printf "setup:   installing %d packages\n", NF - 3; fflush() }'
+}
+
+pip_install() {
+  if ! "$VENV_PYTHON" -m pip install --prefer-binary --progress-bar off --disable-pip-version-check \
+    --no-compile "$@" 2>&1 | tee -a "$LOG" | show_progress; then
+    tail -n 15 "$LOG" >&2
+    die "pip failed; the lines above are the end of $LOG." \
+      "Run 'make setup' again: what was downloaded is kept. Behind a proxy or offline: docs/install.md."
+  fi
+}
+
+# sapien asks for opencv-python and lerobot for opencv-python-headless; both own the folder cv2, and
+# the former needs a display's libraries. An empty record of the former leaves cv2 to the latter.
+install_opencv_record() {
+  local folder
+  folder=$(mktemp -d)
+  "$VENV_PYTHON" scripts/opencv_record.py constraints.txt "$folder"
+  pip_install --no-deps --no-index "$folder"/*.whl
+  rm -rf "$folder"
+}
+
+is_cv2_headless() {
+  "$VENV_PYTHON" -c 'import re, sys, cv2; sys.exit(not re.search(r"GUI:\s+NONE", cv2.getBuildInformation()))' \
+    2>/dev/null
+}
+
+repair_cv2() {
+  if ! is_cv2_headless; then
+    say "giving cv2 back to opencv-python-headless"
+    pip_install --force-reinstall --no-deps -c constraints.txt opencv-python-headless
+  fi
+}
+
+main() {
+  [ "$(uname -sm)" = "Linux x86_64" ] || die "Linux on x86-64 is needed; this is $(uname -sm)."
+  if [ -z "${MIKASA_SKIP_SYSTEM:-}" ]; then ensure_system; fi
+  if is_up_to_date; then exit 0; fi
+  if ! is_usable_venv; then
+    ensure_python
+    make_venv
+  fi
+  rm -f "$STAMP"
+  : >"$LOG"
+  say "installing the packages of constraints.txt (several GB the first time)"
+  install_opencv_record
+  pip_install -c constraints.txt -e '.[dev]'
+  repair_cv2
+  fingerprint >"$STAMP"
+  say "done. Next: make demo, or $VENV/bin/mikasa-vla doctor"
+}
+
+if [ "${BASH_SOURCE[0]}" = "$0" ]; then main "$@"; fi
