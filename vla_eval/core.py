@@ -173,9 +173,7 @@ class SimEnv(Protocol):
             render: whether the reset observations hold images.
         """
 
-    def step(
-        self, actions: Mapping[int, FloatArray], *, render: frozenset[int]
-    ) -> dict[int, StepResult]:
+    def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         """Execute one control step in each of the given slots.
 
         Args:

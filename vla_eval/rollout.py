@@ -96,7 +96,7 @@ def rollout(
     for episode in episodes:
         if not episode.instruction.strip():
             raise MissingInstructionError(
-                f"{episode.task}, seed {episode.seed}: the instruction is empty. Give the task one in prompts/."
+                f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
             )
     running = _begin(env, policy, episodes, settings, observers, heartbeat)
     while active := [episode for episode in running if not episode.done]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 FULL_SPEED_M_PER_STEP = 0.039
-RESPONSE = 0.7  # share of the gap to the commanded speed that is closed in one control step (fit to the above)
+RESPONSE = 0.7  # share of the gap to the commanded speed closed in one control step (fit to the above)
 STEP_SECONDS = 0.05
 FULL_SPEED_M_S = FULL_SPEED_M_PER_STEP / STEP_SECONDS
 GRIPPER_OPEN = 1.0

@@ -152,7 +152,8 @@ def _command(play: _Play) -> Vector:
     tracking = TRACK_GAIN_PER_S * float(play.ball_m[1] - tcp[1])
     ball_v_x, ball_v_y = (float(v) for v in play.ball_velocity_m_s)
     if play.stage == "follow":
-        return np.array([ball_v_x + TRACK_GAIN_PER_S * (play.gap_m - FOLLOW_GAP_M), ball_v_y + tracking, height])
+        keep_gap = TRACK_GAIN_PER_S * (play.gap_m - FOLLOW_GAP_M)
+        return np.array([ball_v_x + keep_gap, ball_v_y + tracking, height])
     if play.stage == "close":
         return np.array([PUSH_SPEED_M_S, ball_v_y + tracking, height])
     forward, _ = _push_speeds_m_s(play)

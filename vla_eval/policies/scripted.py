@@ -4,7 +4,8 @@
 - `hold`: moves nothing, keeps the gripper's width.
 - `oracle`: the privileged expert: the ceiling at this chunk length.
 - `cue_blind`: the same arm, not knowing the cue: what a perfect arm without memory gets (chance).
-- `tour`: the same arm touches one candidate after another: what can be had by searching.
+- `tour`: the same arm begins with a random candidate and goes on to the nearest that is left, without
+  ever knowing which one is right: what can be had by searching.
 
 The last three see the true state of the world, but not the answer before the choice can be made, and
 plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
@@ -122,7 +123,7 @@ class HoldPolicy(_Scripted):
 
 
 class ChoicePolicy(_Scripted):
-    """Goes to candidates: the right one, one drawn uniformly, or all in random order."""
+    """Goes to candidates: the right one, one drawn uniformly, or one after another."""
 
     privileged = True
     states = ("qvel",)
@@ -137,7 +138,7 @@ class ChoicePolicy(_Scripted):
         self._order: dict[int, list[int]] = {}
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Decide, without looking, in which order a blind arm goes to the candidates."""
+        """Decide, without looking, where a blind arm goes (first)."""
         super().reset(episodes)
         for episode in episodes:
             order = self._rng[episode.slot].permutation(self._context.n_candidates)
@@ -157,7 +158,8 @@ class ChoicePolicy(_Scripted):
             return state.target
         order = self._order[window.slot]
         if self._mode == "tour" and len(order) > 1 and self._touches(window, state, order[0]):
-            order.pop(0)
+            here = state.candidate_positions_m[order.pop(0)]
+            order.sort(key=lambda i: float(np.linalg.norm(state.candidate_positions_m[i] - here)))
         return order[0]
 
     def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:

@@ -58,7 +58,8 @@ class ChoiceEnv(MemoryTableEnv):
     def final_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""
         revealed = (self._elapsed_steps >= self._response_step)[:, None, None]
-        return torch.where(revealed, self.candidate_positions_m(), self._slots)
+        positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
+        return positions
 
     def target_index(self) -> torch.Tensor:
         """Return (B,) the index of the right candidate."""

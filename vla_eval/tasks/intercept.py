@@ -27,7 +27,9 @@ UPWARDS_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # ManiSkill's disc fa
 
 
 class InterceptEnv(MemoryTableEnv):
-    """Description: a red ball rolls along y past the robot; 20 cm beyond its lane lies a disc.
+    """Intercept: deflect the rolling ball so that it passes over the disc.
+
+    Description: a red ball rolls along y past the robot; 20 cm beyond its lane lies a disc.
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
@@ -48,7 +50,7 @@ class InterceptEnv(MemoryTableEnv):
     Chance level: to be measured (`cue_blind`); there are no candidates.
 
     Version history: 1, first version.
-    """  # noqa: D205, D415  # Gymnasium's sections instead of a summary line
+    """
 
     MAX_REWARD = 30.0
 
@@ -118,13 +120,15 @@ class InterceptEnv(MemoryTableEnv):
         return False
 
     def _ball_to_goal_m(self) -> torch.Tensor:
-        return self.goal.pose.p - self.ball.pose.p
+        offset: torch.Tensor = self.goal.pose.p - self.ball.pose.p
+        return offset
 
     def _hit_distance_m(self) -> torch.Tensor:
         away = -self._ball_to_goal_m()
         unit = away / torch.linalg.norm(away, dim=1, keepdim=True)
         hit_point = self.ball.pose.p + HIT_OFFSET_M * unit
-        return torch.linalg.norm(hit_point - self.tcp_position_m(), dim=1)
+        distance: torch.Tensor = torch.linalg.norm(hit_point - self.tcp_position_m(), dim=1)
+        return distance
 
     def _update_latches(self, step: torch.Tensor) -> None:
         self._hit_point_reached |= self._hit_distance_m() < HIT_REACHED_M

@@ -37,6 +37,7 @@ N_ARM_JOINTS = 7
 FLOOR_Z_M = -0.9196429  # ManiSkill's table is as high as this
 PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
+CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
 CAMERA_SIZE_PX = 128
 CAMERA_FOV_RAD = np.pi / 2
 
@@ -57,7 +58,7 @@ def step_range(name: str, value: StepRange) -> tuple[int, int]:
     return int(pair[0]), int(pair[1])
 
 
-class MemoryTableEnv(BaseEnv):
+class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     """A Panda with a wrist camera at a table, and the clock of cue, delay and response.
 
     Args:
@@ -67,6 +68,10 @@ class MemoryTableEnv(BaseEnv):
         phase_gate_success: success counts only in the response phase (the official code has no gate).
         static_threshold_rad_s: the arm is at rest if no joint moves faster.
         instruction: the sentence for `info["language_instruction"]`; the paper's by default.
+        reconfiguration_freq: rebuild the scene every so many resets. None: at every reset on the CPU
+            simulator (20 ms), never on the GPU simulator. In a scene that is used again PhysX keeps
+            contact caches, by which states differ from those of a fresh scene (measured: from 1e-7 to
+            15 rad/s after contact).
         robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh.
     """
 
@@ -86,6 +91,7 @@ class MemoryTableEnv(BaseEnv):
         phase_gate_success: bool = True,
         static_threshold_rad_s: float = 0.2,
         instruction: str | None = None,
+        reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
         """Check the arguments and build the scene."""
@@ -99,7 +105,10 @@ class MemoryTableEnv(BaseEnv):
             raise TaskArgumentError(f"static_threshold_rad_s={static_threshold_rad_s}: expected > 0.")
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
         kwargs.setdefault("enhanced_determinism", True)
-        super().__init__(*args, robot_uids=robot_uids, **kwargs)
+        if reconfiguration_freq is None:
+            on_cpu = kwargs.get("sim_backend", "auto") in CPU_BACKENDS and kwargs.get("num_envs", 1) == 1
+            reconfiguration_freq = 1 if on_cpu else 0
+        super().__init__(*args, robot_uids=robot_uids, reconfiguration_freq=reconfiguration_freq, **kwargs)
 
     # ---------------------------------------------------------------- scene
 
@@ -259,13 +268,15 @@ class MemoryTableEnv(BaseEnv):
 
     def arm_speed(self) -> torch.Tensor:
         """Return the (B,) Euclidean norm of the seven arm joint velocities, rad/s."""
-        return torch.linalg.norm(self.agent.robot.get_qvel()[:, :N_ARM_JOINTS], dim=1)
+        speed: torch.Tensor = torch.linalg.norm(self.agent.robot.get_qvel()[:, :N_ARM_JOINTS], dim=1)
+        return speed
 
     def gated(self, success: torch.Tensor) -> torch.Tensor:
         """Return success where it may count: in the response phase, or always if the gate is open."""
         if not self.phase_gate_success:
             return success
-        return success & (self._elapsed_steps >= self._response_step)
+        begun: torch.Tensor = self._elapsed_steps >= self._response_step
+        return success & begun
 
     def moving_bodies(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return name -> (B, 3) position in m and (B, 3) velocity in m/s of bodies an expert may see."""

@@ -7,9 +7,11 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.utils.building import actors
+from numpy.typing import NDArray
 
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.choice import ChoiceEnv, nearness
+from vla_eval.tasks.choice import ChoiceEnv
+from vla_eval.tasks.memory_env import nearness
 from vla_eval.tasks.streams import Stream
 
 CUBE_HALF_SIZE_M = 0.02
@@ -17,6 +19,9 @@ CUE_POSITION_M = (0.0, 0.0, CUBE_HALF_SIZE_M)
 JITTER_STD_M = 0.01
 MIN_DISTANCE_M = 0.06
 MAX_JITTER_TRIES = 50
+
+Plane = NDArray[np.float64]
+"""Positions in the table's plane, (…, 2), m."""
 
 
 class NamedColor(NamedTuple):
@@ -40,7 +45,7 @@ COLORS = (
 )
 
 
-def slot_centres_m(n_items: int) -> np.ndarray:
+def slot_centres_m(n_items: int) -> Plane:
     """Return (N, 2) xy of the places on the table, world frame, before jitter.
 
     A row for three items, otherwise an arc around the robot. Source: official task code, constants as
@@ -58,12 +63,12 @@ def slot_centres_m(n_items: int) -> np.ndarray:
     )
 
 
-def jittered(centres_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def jittered(centres_m: Plane, rng: np.random.Generator) -> Plane:
     """Shift each place by N(0, 1 cm) in x and y, one after another, at least 6 cm from those before.
 
     A place for which `MAX_JITTER_TRIES` draws fail stays where it is, as in the official code.
     """
-    placed: list[np.ndarray] = []
+    placed: list[Plane] = []
     for centre in centres_m:
         for _ in range(MAX_JITTER_TRIES):
             draft = centre + rng.normal(0, JITTER_STD_M, 2)
@@ -76,7 +81,9 @@ def jittered(centres_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class RememberColorEnv(ChoiceEnv):
-    """Description: a cube of one colour lies in the middle of the table (cue), then the table is empty
+    """RememberColor: find the cube that has the colour shown before.
+
+    Description: a cube of one colour lies in the middle of the table (cue), then the table is empty
     (delay), then N cubes of different colours lie at N places in random order (response).
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
@@ -95,16 +102,14 @@ class RememberColorEnv(ChoiceEnv):
     Chance level: 1 / `n_items` for a perfect arm that ignores the cue.
 
     Version history: 1, first version.
-    """  # noqa: D205, D415  # Gymnasium's sections instead of a summary line
+    """
 
     MAX_REWARD = 3.0
     REACH_SCALE_PER_M = 10.0
     SLOWING_WEIGHT = 0.5
     RESTING_WEIGHT = 0.5
 
-    def __init__(
-        self, *args: Any, n_items: int = 3, goal_threshold_m: float = 0.05, **kwargs: Any
-    ) -> None:
+    def __init__(self, *args: Any, n_items: int = 3, goal_threshold_m: float = 0.05, **kwargs: Any) -> None:
         """Check the number of items and build the scene."""
         if not isinstance(n_items, int) or not 2 <= n_items <= len(COLORS):
             raise TaskArgumentError(f"n_items={n_items!r}: expected 2 to {len(COLORS)}, one per colour.")

@@ -17,6 +17,8 @@ from mani_skill import PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 
+from vla_eval.core import FloatArray
+
 GRID_M = 0.0015  # finer than a pixel of the base camera at the arm, about 8 mm
 _PANDA_DIR = Path(PACKAGE_ASSET_DIR) / "robots" / "panda"
 _CAMERA_MESH = "realsense2_description/meshes/d415.stl"
@@ -28,7 +30,7 @@ def cache_dir() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "mikasa-vla-eval"
 
 
-def snap_to_grid(triangles: np.ndarray, grid_m: float) -> np.ndarray:
+def snap_to_grid(triangles: FloatArray, grid_m: float) -> FloatArray:
     """Simplify a triangle soup by moving vertices to the mean of their grid cell.
 
     Args:
@@ -50,20 +52,20 @@ def snap_to_grid(triangles: np.ndarray, grid_m: float) -> np.ndarray:
     first = cells.argmin(axis=1)
     order = (first[:, None] + np.arange(3)) % 3
     cells = np.unique(np.take_along_axis(cells, order, axis=1), axis=0)
-    simplified: np.ndarray = means[cells].astype(np.float32)
+    simplified: FloatArray = means[cells].astype(np.float32)
     return simplified
 
 
-def read_binary_stl(path: Path) -> np.ndarray:
+def read_binary_stl(path: Path) -> FloatArray:
     """Return the (T, 3, 3) float32 corners of a binary STL file."""
     raw = path.read_bytes()
     (count,) = struct.unpack_from("<I", raw, 80)
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    corners: np.ndarray = np.frombuffer(raw, record, count=count, offset=84)["corners"]
+    corners: FloatArray = np.frombuffer(raw, record, count=count, offset=84)["corners"]
     return corners
 
 
-def write_binary_stl(path: Path, triangles: np.ndarray) -> None:
+def write_binary_stl(path: Path, triangles: FloatArray) -> None:
     """Write (T, 3, 3) float32 corners as a binary STL file with face normals."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     out = np.zeros(len(triangles), record)

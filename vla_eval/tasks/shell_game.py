@@ -24,7 +24,9 @@ UPSIDE_DOWN_WXYZ = (0.0, 1 / _NORM, 0.5 / _NORM, 0.0)  # official (0, 1, 0.5, 0)
 
 
 class ShellGameTouchEnv(ChoiceEnv):
-    """Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
+    """ShellGameTouch: find the mug that stands over the ball.
+
+    Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
     stands on each of them, one over the ball (response, without a delay).
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
@@ -43,7 +45,7 @@ class ShellGameTouchEnv(ChoiceEnv):
     Chance level: 1/3 for a perfect arm that ignores the cue.
 
     Version history: 1, first version.
-    """  # noqa: D205, D415  # Gymnasium's sections instead of a summary line
+    """
 
     MAX_REWARD = 3.0
     REACH_SCALE_PER_M = 5.0
