@@ -49,6 +49,7 @@ class PolicyRecipe:
         args: keyword arguments of the adapter.
         default_n_action_steps: actions executed per inference, where the evaluation names none.
         max_workers: how many workers `workers: auto` may start, since each loads the policy.
+        needs_candidates: the policy makes no sense for a task without candidates; such a pair is left out.
     """
 
     version: int
@@ -57,6 +58,14 @@ class PolicyRecipe:
     args: dict[str, Any] = field(default_factory=dict)  # Any: whatever the adapter takes
     default_n_action_steps: int = 1
     max_workers: int | None = None
+    needs_candidates: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require(
+            self.default_n_action_steps >= 1, "default_n_action_steps", self.default_n_action_steps, "≥ 1"
+        )
+        _require(self.max_workers is None or self.max_workers >= 1, "max_workers", self.max_workers, "≥ 1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,7 +22,7 @@ from vla_eval.core import (
     TaskStatus,
 )
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import TaskArgumentError, did_you_mean
+from vla_eval.errors import unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import task_spec
 
@@ -36,8 +36,27 @@ STATIC_ACTION = 0.2  # below it in each dimension the point counts as at rest
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
-CAMERA_NAMES = ("base_camera", "hand_camera")
-ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5}
+BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75)}
+CAMERAS = tuple(
+    CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
+    for name in ("base_camera", "hand_camera")
+)
+STATES = tuple(
+    StateSpec(name=name, dims=tuple(dims.split()), unit=unit, frame=frame)
+    for name, dims, unit, frame in (
+        ("tcp_pose", "x y z qw qx qy qz", "m, wxyz quaternion", "world"),
+        ("qpos", "q1 q2 q3 q4 q5 q6 q7 finger1 finger2", "rad, m", "joint"),
+        ("qvel", "q1 q2 q3 q4 q5 q6 q7 finger1 finger2", "rad/s, m/s", "joint"),
+    )
+)
+ACTION = ActionSpec(
+    dims=("dx", "dy", "dz", "drx", "dry", "drz", "gripper"),
+    low=-1.0,
+    high=1.0,
+    control_mode="pd_ee_delta_pose",
+    gripper_open=1.0,
+)
 
 Vector = NDArray[np.float64]
 
@@ -64,54 +83,33 @@ class FakeEnv:
     """Implements `SimEnv`; `n_renders` counts the observations that were rendered.
 
     Args:
-        settings: `kwargs` may hold `n_items`, `cue_steps`, `delay_steps` for tasks with candidates, and
-            `velocity_range_m_s` for the others.
+        settings: `kwargs` may hold `horizon_steps`; `n_items`, `cue_steps`, `delay_steps` for tasks with
+            candidates; `velocity_range_m_s` for the others.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
         """Check the arguments."""
         task = task_spec(settings.task)
-        defaults: dict[str, Any] = (  # Any: numbers and a pair of numbers
-            {"cue_steps": 5, "delay_steps": 5, "n_items": 3}
-            if task.candidates
-            else {"velocity_range_m_s": (0.5, 0.75)}
-        )
+        known = ("horizon_steps", *(CHOICE_DEFAULTS if task.candidates else BALL_DEFAULTS))
         for name in settings.kwargs:
-            if name not in defaults:
-                raise TaskArgumentError(
-                    f"{task.id} takes no argument '{name}'.{did_you_mean(name, defaults)} "
-                    f"Known: {', '.join(defaults)}."
-                )
-        self._arguments = {**defaults, **task.kwargs, **settings.kwargs}
-        self._n_items: int = self._arguments.get("n_items", 0)
-        self._cue_steps: int = self._arguments.get("cue_steps", 0)
-        self._response_step: int = self._cue_steps + self._arguments.get("delay_steps", 0)
+            if name not in known:
+                raise unknown_name("argument", name, known, where=task.id)
+        defaults: Mapping[str, Any] = CHOICE_DEFAULTS if task.candidates else BALL_DEFAULTS  # Any: numbers
+        arguments = {"horizon_steps": task.horizon_steps, **defaults, **task.kwargs, **settings.kwargs}
+        self._n_items: int = arguments.get("n_items", 0)
+        self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
+        self._cue_steps: int = arguments.get("cue_steps", 0)
+        self._response_step: int = self._cue_steps + arguments.get("delay_steps", 0)
         self._settings = settings
         self._episodes: dict[int, _Episode] = {}
         self.n_renders = 0
-        self.device = {"renderer": "fake"}
+        self.device = {"simulator": "fake"}
         self.spec = EnvSpec(
             task=task.id,
-            cameras=tuple(
-                CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
-                for name in CAMERA_NAMES
-            ),
-            states=(
-                StateSpec(
-                    name="tcp_pose",
-                    dims=("x", "y", "z", "qw", "qx", "qy", "qz"),
-                    unit="m, wxyz",
-                    frame="world",
-                ),
-                StateSpec(name="qpos", dims=tuple(f"q{i}" for i in range(9)), unit="rad, m", frame="joint"),
-                StateSpec(
-                    name="qvel", dims=tuple(f"v{i}" for i in range(9)), unit="rad/s, m/s", frame="joint"
-                ),
-            ),
-            action=ActionSpec(
-                dims=ACTION_DIMS, low=-1.0, high=1.0, control_mode="pd_ee_delta_pose", gripper_open=1.0
-            ),
-            horizon_steps=task.horizon_steps,
+            cameras=CAMERAS,
+            states=STATES,
+            action=ACTION,
+            horizon_steps=arguments["horizon_steps"],
             control_hz=CONTROL_HZ,
         )
 
@@ -128,7 +126,7 @@ class FakeEnv:
 
     def hold_action(self, slot: int) -> FloatArray:
         """Return the action that leaves point and gripper as they are."""
-        action = np.zeros(len(ACTION_DIMS), dtype=np.float32)
+        action = np.zeros(len(ACTION.dims), dtype=np.float32)
         action[-1] = self._episodes[slot].gripper_width_m / GRIPPER_MAX_M * 2 - 1
         return action
 
@@ -142,13 +140,12 @@ class FakeEnv:
         candidates = np.column_stack(
             [np.zeros(self._n_items), places * CANDIDATE_SPACING_M, np.full(self._n_items, CANDIDATE_Z_M)]
         )
-        low, high = self._arguments.get("velocity_range_m_s", (0.0, 0.0))
         return _Episode(
             seed=seed,
             candidates_m=candidates,
             target=int(rng.integers(self._n_items)) if self._n_items else None,
             ball_m=np.array([rng.uniform(-0.1, 0.1), -0.6, CANDIDATE_Z_M]),
-            ball_velocity_m_s=np.array([0.0, rng.uniform(low, high), 0.0]),
+            ball_velocity_m_s=np.array([0.0, rng.uniform(*self._speeds_m_s), 0.0]),
             goal_m=np.array([rng.uniform(0.15, 0.2), 0.3, 0.0]),
         )
 
@@ -217,7 +214,7 @@ class FakeEnv:
 
     def _picture(self, episode: _Episode, camera: str) -> ImageArray:
         """Return a picture that shows the cue in its first rows, and otherwise depends on the state alone."""
-        view = CAMERA_NAMES.index(camera)
+        view = [known.name for known in CAMERAS].index(camera)
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )

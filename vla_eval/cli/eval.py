@@ -1,0 +1,153 @@
+"""`mikasa-vla eval`: run an evaluation, or go on with it, and print its table."""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from vla_eval.decoding import decode
+from vla_eval.errors import RecipeError
+from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
+
+EXIT_EPISODE_ERRORS = 3
+DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
+
+CONFIG is a file, or the name of one in configs/ (`mikasa-vla list configs`). Without it, name at least
+one --task and one --policy. Flags go on top of the file, --set on top of flags. The same command again
+goes on where it stopped, and retries episodes that ended in an error."""
+EPILOG = """exit codes: 0 every episode has a result; 1 a mistake (see the message); 3 some episodes ended in
+an error (the same command retries them); 130, 143 stopped by Ctrl-C, SIGTERM."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "eval",
+        help="run an evaluation, or go on with it, and print its table",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
+    _add_run_arguments(parser)
+    _add_table_arguments(parser)
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    many: dict[str, Any] = {"nargs": "+", "action": "extend"}  # Any: argparse's keyword arguments
+    parser.add_argument(
+        "--task", **many, dest="tasks", metavar="T", help="task ids (`mikasa-vla list tasks`)"
+    )
+    parser.add_argument("--policy", **many, dest="policies", metavar="P", help="names in policies/, or files")
+    parser.add_argument(
+        "--n-action-steps",
+        **many,
+        type=int,
+        metavar="K",
+        help="actions executed per inference; several: one after another",
+    )
+    parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task, policy and run (100)")
+    parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
+    parser.add_argument("--runs", type=int, metavar="R", help="independent runs over the same seeds (1)")
+    parser.add_argument("--workers", type=_workers, metavar="W", help="processes, or 'auto': one per core")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="A.B=C",
+        help="change any field of the configuration",
+    )
+    parser.add_argument(
+        "--allow-environment-change",
+        action="store_true",
+        help="go on although package versions or the machine have changed; the table will say so",
+    )
+
+
+def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--format", choices=("markdown", "csv", "json", "latex"), default="markdown")
+    parser.add_argument("--baseline", metavar="NAME", help="policy that the others are compared with")
+    parser.add_argument("--paper", action="store_true", help="print the paper's figures beside ours")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, then print the table to standard output; everything else goes to standard error."""
+    # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
+    from vla_eval.cli.progress import Progress, stop_on_signals
+    from vla_eval.evaluate import default_run_folder, evaluate
+
+    config = _config(args)
+    out = args.out or default_run_folder(config)
+    with stop_on_signals() as stop:
+        progress = Progress(stop, out=str(out))
+        try:
+            summary = evaluate(
+                config,
+                out=out,
+                command=tuple(sys.argv),
+                allow_environment_change=args.allow_environment_change,
+                observer=progress,
+            )
+        finally:
+            progress.close()
+    if summary.was_stopped:
+        again = shlex.join(["mikasa-vla", *sys.argv[1:]])
+        n_done = summary.n_episodes - summary.n_open
+        print(
+            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To go on: {again}",
+            file=sys.stderr,
+        )
+        return stop.exit_code
+    _print_table(out, args)
+    if summary.n_errors:
+        print(
+            f"{summary.n_errors} episodes ended in an error and are not in the rates; the same command "
+            f"retries them. Causes: {out}/episodes.jsonl, {out}/logs/.",
+            file=sys.stderr,
+        )
+        return EXIT_EPISODE_ERRORS
+    return 0
+
+
+def _print_table(out: Path, args: argparse.Namespace) -> None:
+    from vla_eval.results.report import build_table, render
+    from vla_eval.results.store import read_run
+
+    table = build_table([read_run(out)], baseline=args.baseline)
+    print(render(table, args.format, paper=args.paper))
+
+
+def _config(args: argparse.Namespace) -> EvalConfig:
+    """Return the configuration: the file, flags on top of it, `--set` on top of those."""
+
+    def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        for name in ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers"):
+            value = getattr(args, name)
+            if value is not None:
+                data[name] = value
+        apply_overrides(data, args.overrides, cls=EvalConfig)
+
+    if args.config is not None:
+        return load_recipe("configs", args.config, EvalConfig, edit=edit).value
+    data: dict[str, Any] = {"name": "eval"}
+    edit(data)
+    for flag, field in (("--task", "tasks"), ("--policy", "policies")):
+        if field not in data:
+            raise RecipeError(
+                f"Name a configuration (`mikasa-vla list configs`), or at least one --task and one --policy; "
+                f"{flag} is missing. Example: mikasa-vla eval --task RememberColor3-v0 --policy oracle"
+            )
+    return decode(EvalConfig, data, where="command line")
+
+
+def _workers(text: str) -> int | str:
+    if text == "auto":
+        return text
+    try:
+        return int(text)
+    except ValueError as exc:
+        raise argparse.ArgumentTypeError(f"expected 'auto' or a number, found '{text}'") from exc

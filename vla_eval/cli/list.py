@@ -1,0 +1,86 @@
+"""`mikasa-vla list`: which tasks, policies, configurations and prompts there are."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from vla_eval.errors import RecipeError
+from vla_eval.prompts import load_prompts
+from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
+from vla_eval.registry import policy_adapters
+from vla_eval.tasks.catalog import TASKS
+
+Row = Sequence[str]
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser("list", help="list tasks, policies, configs, prompts", allow_abbrev=False)
+    parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the lists."""
+    kinds = [args.kind] if args.kind else list(_LISTS)
+    for kind in kinds:
+        if len(kinds) > 1:
+            print(f"{kind}:")
+        for line in _aligned(_LISTS[kind]()):
+            print(f"  {line}" if len(kinds) > 1 else line)
+    return 0
+
+
+def _aligned(rows: Sequence[Row]) -> list[str]:
+    """Return lines whose columns stand below each other; the last column is not padded."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def _tasks() -> list[Row]:
+    return [
+        (
+            spec.id,
+            f"{spec.horizon_steps} steps",
+            f"{spec.memory} memory",
+            f"chance {_chance(spec.chance_success)}",
+        )
+        for spec in TASKS.values()
+    ]
+
+
+def _chance(chance: float | None) -> str:
+    return "measured" if chance is None else f"{chance:.2f}"
+
+
+def _policies() -> list[Row]:
+    rows = _recipes("policies", PolicyRecipe)
+    adapters = [name for name in policy_adapters() if name not in {row[0] for row in rows}]
+    return [*rows, *((name, "adapter without a recipe of its own") for name in adapters)]
+
+
+def _configs() -> list[Row]:
+    return _recipes("configs", EvalConfig)
+
+
+def _prompts() -> list[Row]:
+    return [(name, load_prompts(name).value.description) for name in list_recipes("prompts")]
+
+
+def _recipes(folder: Folder, cls: type[PolicyRecipe] | type[EvalConfig]) -> list[Row]:
+    rows: list[Row] = []
+    for name in list_recipes(folder):
+        try:
+            rows.append((name, load_recipe(folder, name, cls).value.description))
+        except RecipeError as exc:  # one broken file of the user's must not hide the others
+            rows.append((name, f"CANNOT BE READ: {exc}"))
+    return rows
+
+
+_LISTS: dict[str, Callable[[], list[Row]]] = {
+    "tasks": _tasks,
+    "policies": _policies,
+    "configs": _configs,
+    "prompts": _prompts,
+}

@@ -1,0 +1,90 @@
+"""The command `mikasa-vla`: find the verb, run it, turn a user's mistake into one message.
+
+Each verb is a module with `add_parser(subparsers)` and `run(args) -> int`, imported when it is needed.
+"""
+
+import argparse
+import contextlib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn, Protocol, cast
+
+from vla_eval import __version__
+from vla_eval.errors import VlaEvalError, did_you_mean
+
+PROGRAM = "mikasa-vla"
+VERBS = ("eval", "report", "list", "show", "doctor", "bench")
+EXIT_USER_MISTAKE = 1
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
+
+
+class Verb(Protocol):
+    """What the module of a verb offers."""
+
+    def add_parser(self, subparsers: "argparse._SubParsersAction[_Parser]") -> None:
+        """Declare the verb's arguments; imports nothing heavy."""
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Do it; returns the exit code."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one message and exits with 1, as all users' mistakes do."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and where to find help."""
+        self.exit(EXIT_USER_MISTAKE, f"{self.prog}: error: {message}\nSee `{self.prog} --help`.\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Args:
+        argv: the arguments without the program's name; by default those of the process.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    first = arguments[0] if arguments else ""
+    if first and not first.startswith("-") and first not in VERBS:
+        return _fail(f"there is no verb '{first}'.{did_you_mean(first, VERBS)} Known: {', '.join(VERBS)}.")
+    parser = _build_parser((first,) if first in VERBS else VERBS)
+    try:
+        args = parser.parse_args(arguments)
+        if args.verb is None:
+            parser.print_help()
+            return 0
+        code = _verb(args.verb).run(args)
+        sys.stdout.flush()
+    except VlaEvalError as exc:
+        return _fail(str(exc))
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output has gone (`| head`). Python would complain again on exit.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return code
+
+
+def _build_parser(verbs: Sequence[str]) -> _Parser:
+    parser = _Parser(
+        prog=PROGRAM,
+        description="Evaluate vision-language-action policies on memory-intensive manipulation tasks.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
+    for verb in verbs:
+        _verb(verb).add_parser(subparsers)
+    return parser
+
+
+def _verb(name: str) -> Verb:
+    return cast(Verb, importlib.import_module(f"vla_eval.cli.{name}"))
+
+
+def _fail(message: str) -> int:
+    print(f"{PROGRAM}: error: {message}", file=sys.stderr)
+    return EXIT_USER_MISTAKE

@@ -1,0 +1,116 @@
+"""`mikasa-vla show TASK`: what a task asks for, how it is scored, which arguments it takes.
+
+The task's source is read, not imported: importing it would start a simulator.
+"""
+
+import argparse
+import ast
+import textwrap
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vla_eval.prompts import DEFAULT_PROMPT_SET, instruction_for
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
+
+WIDTH = 100
+INDENT = 14
+OWN_PACKAGE = "vla_eval."
+NOT_FOR_USERS = ("robot_uids", "instruction")  # render.wrist_mesh and prompt_set choose them
+
+
+class TaskArgument(NamedTuple):
+    """One keyword argument of a task's class, as its source has it."""
+
+    name: str
+    default: str
+    origin: str  # the class that takes it
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser("show", help="explain one task", allow_abbrev=False)
+    parser.add_argument("task", metavar="TASK", help="task id (`mikasa-vla list tasks`)")
+    parser.add_argument(
+        "--prompt-set", default=DEFAULT_PROMPT_SET, metavar="NAME", help="which instructions (paper)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what is known of the task without starting a simulator."""
+    spec = task_spec(args.task)
+    chance = "has to be measured: there is no choice among candidates"
+    if spec.chance_success is not None:
+        chance = f"{spec.chance_success:.3f} for a perfect arm that ignores the cue"
+    _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
+    _print("asks", spec.description)
+    _print("instruction", f"“{instruction_for(spec, args.prompt_set)}” (prompts/{args.prompt_set})")
+    _print("success", spec.success)
+    _print("chance", chance)
+    _print("horizon", f"{spec.horizon_steps} control steps at 20 Hz = {spec.horizon_steps / 20:g} s")
+    arguments = {argument.name: argument for argument in task_arguments(spec)}
+    _print("phases", _phases(spec, arguments))
+    _print("oracle", spec.oracle)
+    _print(
+        "arguments",
+        "set in a configuration's `env:`, or by --set env.NAME=VALUE; `docs/tasks.md` explains them",
+    )
+    print(f"{'':{INDENT}}horizon_steps = {spec.horizon_steps}  (every task)")
+    for argument in arguments.values():
+        default = spec.kwargs.get(argument.name, argument.default)
+        print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
+    return 0
+
+
+def _print(label: str, text: str) -> None:
+    print(textwrap.fill(text, WIDTH, initial_indent=f"{label:{INDENT}}", subsequent_indent=" " * INDENT))
+
+
+def _phases(spec: TaskSpec, arguments: dict[str, TaskArgument]) -> str:
+    if spec.candidates is None:
+        return "none: what matters is in view, but changes"
+    lengths = [
+        f"{name} {arguments[f'{name}_steps'].default} steps"
+        for name in ("cue", "delay")
+        if f"{name}_steps" in arguments
+    ]
+    return ", then ".join([*lengths, f"response: choose among the {spec.candidates} until the horizon"])
+
+
+def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
+    """Yield the keyword arguments of the task's class and of its bases in this package, nearest first."""
+    module_name, _, class_name = spec.entry_point.partition(":")
+    seen: set[str] = set(NOT_FOR_USERS)
+    for origin, node in _classes(module_name, class_name):
+        for init in node.body:
+            if not isinstance(init, ast.FunctionDef) or init.name != "__init__":
+                continue
+            for argument, default in zip(init.args.kwonlyargs, init.args.kw_defaults, strict=True):
+                if argument.arg not in seen:
+                    seen.add(argument.arg)
+                    yield TaskArgument(argument.arg, ast.unparse(default) if default else "required", origin)
+
+
+def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:
+    """Yield a class and its bases in this package, from their source."""
+    found = find_spec(module_name)
+    if found is None or found.origin is None:
+        return
+    tree = ast.parse(Path(found.origin).read_text(encoding="utf-8"))
+    imported = {
+        alias.asname or alias.name: (node.module or "", alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    for node in tree.body:
+        if not isinstance(node, ast.ClassDef) or node.name != class_name:
+            continue
+        yield class_name, node
+        for base in node.bases:
+            name = ast.unparse(base)
+            base_module, base_name = imported.get(name, (module_name, name))
+            if base_module.startswith(OWN_PACKAGE):
+                yield from _classes(base_module, base_name)

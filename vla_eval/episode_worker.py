@@ -1,0 +1,275 @@
+"""The inside of a worker process: keep an environment and a policy at hand, run one episode at a time.
+
+It is told what to run over a pipe, says in shared memory what it is busy with, and writes no file but
+its log. After an error it is replaced by a new process: a native library or a GPU context may be left
+in a state that no rebuilding within the process mends.
+"""
+
+import ctypes
+import dataclasses
+import faulthandler
+import inspect
+import logging
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_eval.core import EpisodeStart, Policy, SimEnv, Stage
+from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
+from vla_eval.plan import EpisodeJob, Group, GroupKey
+from vla_eval.policies.context import PolicyContext
+from vla_eval.registry import policy_factory
+from vla_eval.results.records import EpisodeError, EpisodeRecord, EpisodeTiming
+from vla_eval.rollout import rollout
+from vla_eval.specs import EnvSpec, check_compatible
+
+STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
+MAX_DETAILS = 20_000  # characters of a traceback; the log has it all
+SLOT = 0  # a worker runs one episode at a time
+PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
+
+logger = logging.getLogger(__name__)
+
+SharedStage = ctypes.Array[ctypes.c_double]
+"""(time.monotonic() when the stage began, index of the stage), in memory shared with the parent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finished:
+    """An episode came to its end."""
+
+    record: EpisodeRecord
+    timing: EpisodeTiming
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failed:
+    """An episode could not be run.
+
+    Attributes:
+        error: what happened.
+        refused: environment and policy cannot be made or do not fit, for a reason that this package
+            knows: it will be the same for every episode of the group.
+    """
+
+    error: EpisodeError
+    refused: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceFound:
+    """What the environment says of the device it runs on."""
+
+    device: Mapping[str, str]
+
+
+class EnvFacts(NamedTuple):
+    """What a policy is told of an environment before it is made."""
+
+    spec: EnvSpec
+    n_candidates: int
+
+
+class Heartbeat:
+    """Says in shared memory what the worker is busy with, and adds up the time per stage."""
+
+    def __init__(self, shared: SharedStage) -> None:
+        """Take the memory to write to."""
+        self._shared = shared
+        self._stage: Stage | None = None
+        self._since = 0.0
+        self.seconds: dict[Stage, float] = dict.fromkeys(STAGES, 0.0)
+
+    def __call__(self, stage: Stage) -> None:
+        """Begin a stage."""
+        now = time.monotonic()
+        self._add_up(now)
+        self._stage, self._since = stage, now
+        write_stage(self._shared, stage, now)
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that was begun last."""
+        return self._stage or "setup"
+
+    def _add_up(self, now: float) -> None:
+        if self._stage is not None:
+            self.seconds[self._stage] += now - self._since
+
+    def begin_episode(self) -> None:
+        """Forget the times of the last episode."""
+        self._stage = None
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+
+    def timing(self, job: EpisodeJob) -> EpisodeTiming:
+        """Return the times of the episode that has just ended."""
+        self._add_up(time.monotonic())
+        self._stage = None
+        return EpisodeTiming(
+            key=job.key,
+            total_seconds=sum(self.seconds.values()),
+            reset_seconds=self.seconds["reset"],
+            step_seconds=self.seconds["step"],
+            inference_seconds=self.seconds["inference"],
+        )
+
+
+def write_stage(shared: SharedStage, stage: Stage, now: float) -> None:
+    """Begin a stage; the time first, so that no reader sees a new stage with an old time."""
+    shared[0] = now
+    shared[1] = STAGES.index(stage)
+
+
+class EpisodeRunner:
+    """Runs episodes, keeping environment and policy between those of one group."""
+
+    def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
+        """Start with nothing made."""
+        self._heartbeat = heartbeat
+        self._tell = tell
+        self._env: SimEnv | None = None
+        self._env_settings: EnvSettings | None = None
+        self._policy: Policy | None = None
+        self._loaded: GroupKey | None = None
+        self._facts: dict[str, EnvFacts] = {}  # by task: all else is the same in one run
+
+    def answer(self, job: EpisodeJob) -> Finished | Failed:
+        """Run the episode; whatever goes wrong becomes a `Failed`."""
+        self._heartbeat.begin_episode()
+        refused = False
+        try:
+            self._heartbeat("setup")
+            try:
+                env, policy = self._prepare(job)
+            except VlaEvalError as exc:
+                refused = not isinstance(exc, InvalidActionError)
+                raise
+            return self._run(env, policy, job)
+        except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
+            logger.exception("%s, stage %s", job.key, self._heartbeat.stage)
+            return Failed(error=_describe(exc, self._heartbeat.stage), refused=refused)
+
+    def close(self) -> None:
+        """Release the simulator."""
+        if self._env is not None:
+            self._env.close()
+        self._env = self._env_settings = self._policy = self._loaded = None
+
+    def _run(self, env: SimEnv, policy: Policy, job: EpisodeJob) -> Finished:
+        start = EpisodeStart(
+            slot=SLOT,
+            task=job.group.key.task,
+            seed=job.seed,
+            run=job.run,
+            instruction=job.group.instruction,
+            horizon_steps=env.spec.horizon_steps,
+        )
+        (record,) = rollout(env, policy, [start], job.group.rollout, heartbeat=self._heartbeat)
+        # The recipe's name, whatever the adapter calls itself: records are told apart by it.
+        record = dataclasses.replace(record, policy=job.group.key.policy)
+        return Finished(record=record, timing=self._heartbeat.timing(job))
+
+    def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
+        group = job.group
+        if self._loaded != group.key or self._env is None or self._policy is None:
+            self._loaded = self._policy = None  # first, so that two policies are never loaded at once
+            facts = self._describe_env(job)
+            self._heartbeat("setup")
+            policy = _make_policy(group, facts)
+            check_compatible(policy.spec, facts.spec)
+            group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
+            self._heartbeat("setup")
+            env = self._make_env(
+                dataclasses.replace(group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged)
+            )
+            self._policy, self._loaded = policy, group.key
+            return env, policy
+        return self._env, self._policy
+
+    def _describe_env(self, job: EpisodeJob) -> EnvFacts:
+        """Return what the policy has to know of an environment whose cameras it then decides on."""
+        task = job.group.key.task
+        if task not in self._facts:
+            # Privileged, as scripted controls need it: theirs is then already made.
+            env = self._make_env(dataclasses.replace(job.group.env, privileged=True))
+            self._heartbeat("reset")
+            status = env.reset({SLOT: job.seed}, render=False)[SLOT].status
+            self._facts[task] = EnvFacts(env.spec, status.n_candidates)
+        return self._facts[task]
+
+    def _make_env(self, settings: EnvSettings) -> SimEnv:
+        if self._env is None or self._env_settings != settings:
+            if self._env is not None:
+                self._env.close()
+            self._env = self._env_settings = None
+            self._env = make_env(settings)
+            self._env_settings = settings
+            device = describe_device(self._env)
+            if device is not None:
+                self._tell(DeviceFound(device=device))
+        return self._env
+
+
+def _make_policy(group: Group, facts: EnvFacts) -> Policy:
+    factory = policy_factory(group.adapter)
+    context = PolicyContext(
+        name=group.key.policy,
+        env=facts.spec,
+        chunking=group.rollout.chunking,
+        n_candidates=facts.n_candidates,
+    )
+    try:
+        inspect.signature(factory).bind(context, **group.args)
+    except TypeError as exc:
+        raise RecipeError(
+            f"policy '{group.key.policy}': the adapter '{group.adapter}' does not take the recipe's args "
+            f"{dict(group.args)}: {exc}. It is called as {group.adapter}{inspect.signature(factory)}."
+        ) from exc
+    return factory(context, **group.args)
+
+
+def _describe(exc: BaseException, stage: Stage) -> EpisodeError:
+    return EpisodeError(
+        kind=type(exc).__name__,
+        stage=stage,
+        message=str(exc) or f"{type(exc).__name__} without a message",
+        details="".join(traceback.format_exception(exc))[-MAX_DETAILS:],
+    )
+
+
+def worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+    """Serve the parent until it closes the pipe; the entry point of the worker process."""
+    _detach(log, parent_pid)
+    runner = EpisodeRunner(Heartbeat(shared), connection.send)
+    try:
+        while True:
+            connection.send(runner.answer(connection.recv()))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        runner.close()  # the parent is done with us, or gone
+
+
+def _detach(log: Path, parent_pid: int) -> None:
+    """Send all output to the log, die with the parent, and leave its signals to the parent."""
+    os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    os.dup2(descriptor, sys.__stdout__.fileno() if sys.__stdout__ else 1)
+    os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
+    os.close(descriptor)
+    faulthandler.enable(all_threads=True)
+    faulthandler.register(signal.SIGUSR1, all_threads=True)  # the watchdog asks where it hangs
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    if sys.platform == "linux":
+        # A parent that is killed with -9 cannot end its workers; the kernel does it.
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # it died before the line above
+        os._exit(1)

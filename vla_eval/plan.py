@@ -1,0 +1,225 @@
+"""From a configuration to the list of episodes: task x policy x n_action_steps x run x seed.
+
+Everything that can be wrong with a configuration and can be seen without starting a simulator is
+found here, before the first episode. Knows nothing of processes or files of results.
+"""
+
+import hashlib
+import json
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import RecipeError
+from vla_eval.prompts import instruction_for, load_prompts
+from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, load_recipe, to_data
+from vla_eval.registry import check_adapter
+from vla_eval.results.records import EpisodeKey
+from vla_eval.rollout import RolloutSettings
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
+
+
+class GroupKey(NamedTuple):
+    """What the episodes share that one environment object and one policy object can run."""
+
+    task: str
+    policy: str
+    n_action_steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Group:
+    """Episodes that differ only in run and seed.
+
+    Attributes:
+        key: its identity in the plan.
+        adapter: registry name of the policy's code.
+        args: the adapter's keyword arguments.
+        env: the environment, before it is known which cameras the policy needs.
+        rollout: how the episodes are run.
+        instruction: the language instruction.
+    """
+
+    key: GroupKey
+    adapter: str
+    args: Mapping[str, Any]  # Any: whatever the adapter takes
+    env: EnvSettings
+    rollout: RolloutSettings
+    instruction: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeJob:
+    """One episode to run."""
+
+    group: Group
+    run: int
+    seed: int
+
+    @property
+    def key(self) -> EpisodeKey:
+        """The identity of the episode within its run folder."""
+        return EpisodeKey(*self.group.key, self.run, self.seed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """All that a run needs to know.
+
+    Attributes:
+        jobs: every episode, in a fixed order.
+        recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts.
+        task_versions: task id -> version of the task's rules.
+        left_out: (task, policy) pairs that make no sense together, and why, for a message.
+        max_workers: the most workers that `workers: auto` may start; None: no limit.
+    """
+
+    jobs: tuple[EpisodeJob, ...]
+    recipe_hashes: Mapping[str, str]
+    task_versions: Mapping[str, int]
+    left_out: tuple[str, ...]
+    max_workers: int | None
+
+
+def make_plan(config: EvalConfig) -> Plan:
+    """Plan the episodes of a configuration.
+
+    Raises:
+        UnknownNameError: a task, policy, adapter or prompt set does not exist.
+        RecipeError: a recipe is wrong, or two policies have the same name.
+        MissingInstructionError: a task has no instruction in the prompt set.
+    """
+    if "instruction" in config.env:
+        raise RecipeError(
+            "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
+            "./prompts/ and name that file in prompt_set."
+        )
+    tasks = [task_spec(task) for task in config.tasks]
+    policies = [load_recipe("policies", name, PolicyRecipe) for name in config.policies]
+    _refuse_doubles("tasks", [task.id for task in tasks])
+    _refuse_doubles("policies", [policy.name for policy in policies])
+    for policy in policies:
+        check_adapter(policy.value.adapter)
+    prompts = load_prompts(config.prompt_set)
+    groups: list[Group] = []
+    left_out: list[str] = []
+    for task in tasks:
+        instruction = instruction_for(task, config.prompt_set)
+        for policy in policies:
+            if policy.value.needs_candidates and task.candidates is None:
+                left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
+                continue
+            groups.extend(_groups(config, task, policy, instruction))
+    if not groups:
+        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
+    limits = [policy.value.max_workers for policy in policies if policy.value.max_workers is not None]
+    return Plan(
+        jobs=tuple(
+            EpisodeJob(group=group, run=run, seed=seed)
+            for group in groups
+            for run in range(config.runs)
+            for seed in range(config.seed_start, config.seed_start + config.episodes)
+        ),
+        recipe_hashes={
+            f"prompts/{prompts.name}": prompts.sha256,
+            **{f"policies/{policy.name}": policy.sha256 for policy in policies},
+        },
+        task_versions={task.id: task.version for task in tasks},
+        left_out=tuple(left_out),
+        max_workers=min(limits, default=None),
+    )
+
+
+def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a configuration that results depend on; compared when a run is continued."""
+    data: dict[str, Any] = to_data(config)
+    return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
+
+
+def options_of(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a configuration that moves no result; recorded only."""
+    data: dict[str, Any] = to_data(config)
+    return {name: data[name] for name in OPTION_FIELDS}
+
+
+def fingerprint(config: EvalConfig) -> str:
+    """Return the sha256 of the part of a configuration that results depend on."""
+    text = json.dumps(results_config(config), sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class JobQueue:
+    """Hands out episodes so that mistakes show early and workers seldom have to rebuild.
+
+    The first episode of each group that has no result yet comes before all others: what is wrong with
+    the last policy of the list shows in the first minutes, not at the end of the night. After that a
+    worker stays with the group that it has loaded. The order moves no result.
+    """
+
+    def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
+        """Queue the jobs that are not finished."""
+        begun = {GroupKey(*key[:3]) for key in finished}
+        self._heads: deque[EpisodeJob] = deque()
+        self._rest: dict[GroupKey, deque[EpisodeJob]] = {}
+        for job in jobs:
+            if job.key in finished:
+                continue
+            if job.group.key not in begun:
+                begun.add(job.group.key)
+                self._heads.append(job)
+            else:
+                self._rest.setdefault(job.group.key, deque()).append(job)
+
+    def __len__(self) -> int:
+        """How many jobs have not been handed out."""
+        return len(self._heads) + sum(len(jobs) for jobs in self._rest.values())
+
+    def take(self, loaded: GroupKey | None, *, taken: Collection[GroupKey] = ()) -> EpisodeJob | None:
+        """Return the next job for a worker, or None if there is no more.
+
+        Args:
+            loaded: the group whose environment and policy the worker has at hand.
+            taken: groups that other workers have at hand; avoided while there are others.
+        """
+        if self._heads:
+            return self._heads.popleft()
+        waiting = [key for key, jobs in self._rest.items() if jobs]
+        if not waiting:
+            return None
+        free = [key for key in waiting if key not in taken]
+        chosen = loaded if loaded in waiting else (free or waiting)[0]
+        assert chosen is not None  # `loaded in waiting` holds no None
+        return self._rest[chosen].popleft()
+
+
+def _refuse_doubles(kind: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise RecipeError(f"{kind}: '{name}' is named twice; records tell them apart by name alone.")
+
+
+def _groups(
+    config: EvalConfig, task: TaskSpec, policy: Recipe[PolicyRecipe], instruction: str
+) -> Iterable[Group]:
+    for n_action_steps in config.n_action_steps or (policy.value.default_n_action_steps,):
+        yield Group(
+            key=GroupKey(task.id, policy.name, n_action_steps),
+            adapter=policy.value.adapter,
+            args=policy.value.args,
+            env=EnvSettings(
+                task=task.id,
+                kwargs=config.env,
+                simulator=config.simulator,
+                sim_backend=config.sim_backend,
+                render=config.render,
+            ),
+            rollout=RolloutSettings(
+                chunking=config.chunking.spec(n_action_steps),
+                eager_rendering=config.eager_rendering,
+                stop_at_success=config.stop_at_success,
+            ),
+            instruction=instruction,
+        )
