@@ -1,0 +1,60 @@
+"""The instructions are the paper's, word for word."""
+
+from pathlib import Path
+
+import pytest
+
+from vla_eval.errors import MissingInstructionError, RecipeError
+from vla_eval.prompts import instruction_for, instructions_for
+from vla_eval.tasks.catalog import task_spec
+
+REMEMBER_COLOR = "Remember the color of the cube and then pick the matching one"
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        ("RememberColor3-v0", REMEMBER_COLOR),
+        ("RememberColor5-v0", REMEMBER_COLOR),
+        ("RememberColor9-v0", REMEMBER_COLOR),
+        ("ShellGameTouch-v0", "Memorize the position of the cup covering the ball, then pick that cup"),
+        # The paper's text has the curly apostrophe, U+2019.
+        (
+            "InterceptMedium-v0",
+            "Track the ball\u2019s movement, estimate its velocity, then aim the ball at the target",
+        ),
+    ],
+)
+def test_the_paper_s_sentences(task: str, sentence: str) -> None:
+    assert instruction_for(task_spec(task)) == sentence
+
+
+def write(folder: Path, instructions: str) -> str:
+    path = folder / "own.yaml"
+    path.write_text(f"version: 1\ndescription: d\nsource: s\ninstructions: {instructions}\n")
+    return str(path)
+
+
+def test_paraphrases_follow_the_sentence(tmp_path: Path) -> None:
+    prompts = write(tmp_path, "{RememberColor: [one, two]}")
+    spec = task_spec("RememberColor3-v0")
+
+    assert instruction_for(spec, prompts) == "one"
+    assert instructions_for(spec, prompts) == ("one", "two")
+
+
+@pytest.mark.parametrize(
+    "instructions", ["{RememberColour: [a]}", "{RememberColor: []}", "{RememberColor: [' ']}"]
+)
+def test_a_missing_or_empty_instruction_is_an_error_that_says_what_to_do(
+    tmp_path: Path, instructions: str
+) -> None:
+    with pytest.raises(
+        MissingInstructionError, match=r"own\.yaml: RememberColor3-v0 .*'RememberColor'.*Add the sentence"
+    ):
+        instruction_for(task_spec("RememberColor3-v0"), write(tmp_path, instructions))
+
+
+def test_a_sentence_instead_of_a_list_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"'instructions\.RememberColor': expected a list"):
+        instruction_for(task_spec("RememberColor3-v0"), write(tmp_path, "{RememberColor: go}"))

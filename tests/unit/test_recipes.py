@@ -1,0 +1,322 @@
+"""Recipes are read strictly: what was mistyped is an error that says so."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vla_eval import recipes
+from vla_eval.decoding import decode, load_yaml
+from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
+from vla_eval.plan import JobQueue, fingerprint, make_plan, results_config
+from vla_eval.recipes import (
+    EvalConfig,
+    PolicyRecipe,
+    apply_overrides,
+    find_recipe,
+    list_recipes,
+    load_recipe,
+    to_data,
+)
+from vla_eval.tasks.catalog import TASKS
+
+MINIMAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"
+
+
+def config(text: str = "", **fields: Any) -> EvalConfig:
+    data = load_yaml(MINIMAL + text, where="configs/x.yaml")
+    return decode(EvalConfig, {**data, **fields}, where="configs/x.yaml")
+
+
+class TestStrictness:
+    def test_an_unknown_field_is_refused_with_the_closest_name(self) -> None:
+        with pytest.raises(RecipeError) as caught:
+            config("epsiodes: 5\n")
+
+        message = str(caught.value)
+        assert message.startswith("configs/x.yaml: there is no field 'epsiodes'. Did you mean 'episodes'?")
+        assert "Known: name, tasks, policies" in message
+
+    def test_an_unknown_nested_field_is_named_with_its_path(self) -> None:
+        with pytest.raises(RecipeError, match=r"no field 'chunking\.mod'. Did you mean 'mode'"):
+            config("chunking: {mod: receding_horizon}\n")
+
+    def test_a_field_given_twice_is_refused_with_its_place(self) -> None:
+        with pytest.raises(
+            RecipeError, match=r"configs/x\.yaml: line 4, column 1: the field 'name' is given twice"
+        ):
+            config("name: y\n")
+
+    def test_text_is_not_taken_for_a_list_of_letters(self) -> None:
+        with pytest.raises(
+            RecipeError, match=r"'tasks': expected a list, each entry text, found 'abc' \(text\).*\[abc\]"
+        ):
+            config(tasks="abc")
+
+    @pytest.mark.parametrize(
+        ("field", "value", "expected"),
+        [
+            ("episodes", True, "a whole number, found True"),
+            ("episodes", 1.5, "a whole number, found 1.5"),
+            ("episodes", "5", "a whole number, found '5'"),
+            ("stop_at_success", 1, "true or false, found 1"),
+            ("stop_at_success", "yes", "true or false, found 'yes'"),
+            ("name", 7, "text, found 7"),
+            ("name", None, "text, found None"),
+            ("n_action_steps", [1, "2"], "a whole number, found '2'"),
+            ("n_action_steps", 4, "a list, each entry a whole number or nothing, found 4"),
+            ("env", [], "a mapping, found"),
+            ("workers", "all", "a whole number or 'auto', found 'all'"),
+            ("sim_backend", "cuda", "'cpu' or 'gpu', found 'cuda'"),
+        ],
+    )
+    def test_a_wrong_type_is_refused_with_field_expected_and_found(
+        self, field: str, value: object, expected: str
+    ) -> None:
+        with pytest.raises(RecipeError) as caught:
+            config(**{field: value})
+
+        assert f"'{field}" in str(caught.value)
+        assert f"expected {expected}" in str(caught.value)
+
+    def test_a_number_that_yaml_reads_as_text_gets_a_hint(self) -> None:
+        with pytest.raises(RecipeError, match=r"'chunking\.ensemble_decay'.*found '1e-3' \(text\).*1\.0e-3"):
+            config("chunking: {ensemble_decay: 1e-3}\n")
+
+    def test_a_missing_field_is_named(self) -> None:
+        with pytest.raises(RecipeError, match=r"configs/x\.yaml: the field 'policies' is missing"):
+            decode(EvalConfig, {"name": "x", "tasks": ["a"]}, where="configs/x.yaml")
+
+    def test_what_is_no_yaml_is_refused_with_its_place(self) -> None:
+        with pytest.raises(RecipeError, match=r"configs/x\.yaml: line 5, column 1: expected"):
+            config("tasks: [a\n")
+
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("episodes", 0),
+            ("runs", 0),
+            ("workers", 0),
+            ("seed_start", -1),
+            ("tasks", []),
+            ("tasks", ["a", "a"]),
+            ("n_action_steps", [0]),
+            ("name", "../x"),
+            ("name", ""),
+            ("timeouts", {"step_seconds": 0}),
+            ("chunking", {"delay_steps": -1}),
+        ],
+    )
+    def test_a_value_out_of_its_range_is_refused(self, field: str, value: object) -> None:
+        with pytest.raises(RecipeError, match=field):
+            config(**{field: value})
+
+    def test_a_whole_number_is_a_number(self) -> None:
+        assert config("timeouts: {step_seconds: 3}\n").timeouts.step_seconds == 3.0
+
+    def test_lists_become_tuples_so_that_recipes_cannot_be_changed(self) -> None:
+        assert config(n_action_steps=[4, 8]).n_action_steps == (4, 8)
+
+
+class TestFinding:
+    def test_a_recipe_is_found_by_path_then_working_directory_then_package(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        package = find_recipe("policies", "random")
+        (tmp_path / "policies").mkdir()
+        own = tmp_path / "policies" / "random.yaml"
+        own.write_text("version: 1\ndescription: mine\nadapter: random\n")
+        elsewhere = tmp_path / "random.yaml"
+        elsewhere.write_text(own.read_text())
+
+        assert package.parent != own.parent
+        assert find_recipe("policies", "random") == own
+        assert find_recipe("policies", "random.yaml") == Path("random.yaml")
+        assert list_recipes("policies")["random"] == own
+        assert "oracle" in list_recipes("policies")
+
+    def test_a_name_works_with_and_without_yaml(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+
+        assert find_recipe("configs", "demo") == find_recipe("configs", "demo.yaml")
+        assert find_recipe("configs", "configs/demo.yaml") == find_recipe("configs", "demo")
+
+    def test_the_wheel_s_recipes_are_found_inside_the_package(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        data = tmp_path / "site" / "vla_eval" / "recipes_data" / "prompts"
+        data.mkdir(parents=True)
+        (data / "other.yaml").write_text("")
+        monkeypatch.setattr(recipes, "PACKAGE_ROOT", tmp_path / "site" / "vla_eval")
+        monkeypatch.chdir(tmp_path)
+
+        assert list_recipes("prompts") == {"other": data / "other.yaml"}
+
+    def test_an_unknown_recipe_is_refused_with_the_closest_name(self) -> None:
+        with pytest.raises(UnknownNameError, match=r"no policies/\*\.yaml 'orcale'. Did you mean 'oracle'"):
+            load_recipe("policies", "orcale", PolicyRecipe)
+
+    def test_the_hash_is_that_of_the_file(self) -> None:
+        recipe = load_recipe("policies", "random", PolicyRecipe)
+
+        assert recipe.sha256 == hashlib.sha256(recipe.path.read_bytes()).hexdigest()
+
+    def test_every_recipe_that_is_shipped_can_be_read_and_planned(self) -> None:
+        for name in list_recipes("policies"):
+            assert load_recipe("policies", name, PolicyRecipe).value.description
+        for name in list_recipes("configs"):
+            loaded = load_recipe("configs", name, EvalConfig).value
+            assert loaded.name == name
+            assert make_plan(loaded).jobs
+
+
+class TestOverrides:
+    def override(self, *overrides: str) -> EvalConfig:
+        data = load_yaml(MINIMAL, where="x")
+        apply_overrides(data, overrides, cls=EvalConfig)
+        return decode(EvalConfig, data, where="x")
+
+    def test_values_are_read_as_yaml(self) -> None:
+        changed = self.override(
+            "episodes=7",
+            "chunking.mode=temporal_ensemble",
+            "n_action_steps=[1, 2]",
+            "env.cue_steps=9",
+            "env.a.b=c",
+        )
+
+        assert changed.episodes == 7
+        assert changed.chunking.mode == "temporal_ensemble"
+        assert changed.n_action_steps == (1, 2)
+        assert changed.env == {"cue_steps": 9, "a": {"b": "c"}}
+
+    def test_the_last_one_wins(self) -> None:
+        assert self.override("episodes=7", "episodes=8").episodes == 8
+
+    @pytest.mark.parametrize(
+        ("override", "message"),
+        [
+            (
+                "chunking.mde=x",
+                r"--set chunking\.mde=x: there is no field 'chunking\.mde'. Did you mean 'mode'",
+            ),
+            ("epsiodes=5", "Did you mean 'episodes'"),
+            ("episodes", "expected FIELD=VALUE"),
+            ("episodes.x=1", "'episodes' is a whole number, which has no fields"),
+            ("tasks=abc", "expected a list"),
+        ],
+    )
+    def test_mistakes_are_refused(self, override: str, message: str) -> None:
+        with pytest.raises(RecipeError, match=message):
+            self.override(override)
+
+
+class TestPlan:
+    def test_every_episode_is_planned_once(self) -> None:
+        plan = make_plan(
+            config(
+                tasks=["RememberColor3-v0", "ShellGameTouch-v0"], n_action_steps=[1, 4], episodes=3, runs=2
+            )
+        )
+
+        keys = [job.key for job in plan.jobs]
+        # 2 tasks x 1 policy x 2 K x 2 runs x 3 seeds
+        assert len(keys) == len(set(keys)) == 24
+        assert keys[0] == ("RememberColor3-v0", "random", 1, 0, 1)
+        assert keys[-1] == ("ShellGameTouch-v0", "random", 4, 1, 3)
+
+    def test_a_policy_that_needs_candidates_is_left_out_where_there_are_none(self) -> None:
+        plan = make_plan(
+            config(tasks=["RememberColor3-v0", "InterceptMedium-v0"], policies=["random", "tour"], episodes=1)
+        )
+
+        assert [job.key[:2] for job in plan.jobs] == [
+            ("RememberColor3-v0", "random"),
+            ("RememberColor3-v0", "tour"),
+            ("InterceptMedium-v0", "random"),
+        ]
+        assert plan.left_out == ("tour on InterceptMedium-v0: it needs candidates, and this task has none",)
+
+    def test_a_policy_s_own_n_action_steps_holds_where_none_is_named(self, tmp_path: Path) -> None:
+        recipe = tmp_path / "eight.yaml"
+        recipe.write_text("version: 1\ndescription: d\nadapter: random\ndefault_n_action_steps: 8\n")
+
+        plan = make_plan(config(policies=[str(recipe)], episodes=1))
+
+        assert [job.key.n_action_steps for job in plan.jobs] == [8]
+        assert [job.key.policy for job in plan.jobs] == ["eight"]
+
+    def test_an_unknown_task_is_refused_before_anything_runs(self) -> None:
+        with pytest.raises(UnknownNameError, match="Did you mean 'RememberColor3-v0'"):
+            make_plan(config(tasks=["RememberColour3-v0"]))
+
+    def test_a_task_without_instruction_is_refused_before_anything_runs(self, tmp_path: Path) -> None:
+        prompts = tmp_path / "own.yaml"
+        prompts.write_text("version: 1\ndescription: d\nsource: s\ninstructions: {ShellGameTouch: [go]}\n")
+
+        with pytest.raises(MissingInstructionError, match=r"own\.yaml: RememberColor3-v0 .*'RememberColor'"):
+            make_plan(config(prompt_set=str(prompts)))
+
+    def test_an_instruction_in_env_is_refused_because_no_policy_would_see_it(self) -> None:
+        with pytest.raises(RecipeError, match="prompt_set"):
+            make_plan(config(env={"instruction": "go"}))
+
+    def test_only_what_moves_a_result_is_compared(self) -> None:
+        base = config()
+
+        same = config(workers=3, timeouts={"step_seconds": 1.0}, max_consecutive_errors=2, description="d")
+        assert fingerprint(same) == fingerprint(base)
+        for field, value in {
+            "episodes": 5,
+            "env": {"a": 1},
+            "prompt_set": "p",
+            "render": {"wrist_mesh": "simplified"},
+        }.items():
+            assert fingerprint(config(**{field: value})) != fingerprint(base), field
+        assert {"workers", "timeouts", "name"}.isdisjoint(results_config(base))
+
+    def test_plain_data_can_be_decoded_again(self) -> None:
+        original = config(n_action_steps=[1, 2], env={"velocity_range_m_s": [0.1, 0.2]})
+
+        assert decode(EvalConfig, to_data(original), where="x") == original
+
+
+class TestQueue:
+    def test_the_first_episode_of_each_group_comes_first(self) -> None:
+        plan = make_plan(config(policies=["random", "hold"], episodes=3))
+        queue = JobQueue(plan.jobs, finished=())
+
+        order = []
+        loaded = None
+        while job := queue.take(loaded):
+            loaded = job.group.key
+            order.append((job.key.policy, job.key.seed))
+
+        assert order == [("random", 1), ("hold", 1), ("hold", 2), ("hold", 3), ("random", 2), ("random", 3)]
+
+    def test_a_worker_takes_a_group_that_nobody_has_loaded(self) -> None:
+        plan = make_plan(config(policies=["random", "hold"], episodes=3))
+        first, _, _, other, *_ = plan.jobs
+        queue = JobQueue(plan.jobs, finished={first.key, other.key})
+
+        job = queue.take(None, taken={first.group.key})
+
+        assert job is not None
+        assert job.group.key == other.group.key
+
+    def test_finished_episodes_are_not_handed_out(self) -> None:
+        plan = make_plan(config(episodes=3))
+        queue = JobQueue(plan.jobs, finished={plan.jobs[1].key})
+
+        assert len(queue) == 2
+        assert [job.seed for job in iter(lambda: queue.take(None), None) if job] == [1, 3]
+
+
+def test_every_task_has_its_instruction_in_the_paper_s_prompts() -> None:
+    plan = make_plan(config(tasks=list(TASKS), episodes=1))
+
+    assert all(job.group.instruction for job in plan.jobs)
