@@ -59,7 +59,7 @@ python_package() {
 fetch_python() {
   say "no Python 3.12 or 3.13 on this machine: fetching one with uv"
   python3 -m venv --clear .venv-uv && .venv-uv/bin/python -m pip install --quiet uv &&
-    .venv-uv/bin/uv python install --quiet 3.12
+    .venv-uv/bin/uv python install 3.12
   local status=$?
   rm -rf .venv-uv
   return "$status"

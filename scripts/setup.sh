@@ -51,19 +51,13 @@ make_venv() {
 
 # Tell of large downloads and of the installation, keep the rest for the log.
 show_progress() {
-  awk '
-    /^ *Downloading .*\(.*[MG]B\)/ {
-      size = $0; sub(/^.*\(/, "", size); sub(/\).*$/, "", size)
-      if (size ~ /GB/ || size + 0 >= 50) {
-        name = $2; sub(/^.*\//, "", name); sub(/-(cp|py).*$/, "", name)
-        printf "setup:   downloading %s (%s)\n", name, size; fflush()
-      }
-    }
-    /^Installing collected packages/ { printf "setup:   installing %d packages\n", NF - 3; fflush() }'
+  sed -u -nE \
+    -e 's/^ *Downloading (.*\/)?([^-/]+-[^-]+)-.*\(([0-9.]+ GB|[0-9]{3,}\.[0-9] MB)\).*/setup:   downloading \2 (\3)/p' \
+    -e 's/^Installing collected packages:.*,.*/setup:   installing/p'
 }
 
 pip_install() {
-  if ! "$VENV_PYTHON" -m pip install --prefer-binary --progress-bar off --disable-pip-version-check \
+  if ! "$VENV_PYTHON" -u -m pip install --prefer-binary --progress-bar off --disable-pip-version-check \
     --no-compile "$@" 2>&1 | tee -a "$LOG" | show_progress; then
     tail -n 15 "$LOG" >&2
     die "pip failed; the lines above are the end of $LOG." \

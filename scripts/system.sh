@@ -162,12 +162,13 @@ ensure_system() {
   plan_commands "${packages[@]}"
   if [ "$(id -u)" != 0 ]; then
     say "missing: ${packages[*]}. An administrator has to run:" >&2
-    printf '\n%s\n' "${COMMANDS[@]}" >&2
-    die "" "Then run 'make setup' again."
+    { echo; printf '%s\n' "${COMMANDS[@]}"; echo; } >&2
+    die "then run 'make setup' again."
   fi
   say "installing ${packages[*]}"
   run_commands
   if [[ " ${packages[*]} " == *" mesa-vulkan-drivers "* ]] && ! has_vulkan_driver; then
-    die "the installed Mesa is $(installed_mesa), $MINIMAL_MESA is needed." "Run 'apt-cache policy mesa-vulkan-drivers' to see what apt prefers, and why."
+    die "the installed Mesa is $(installed_mesa), $MINIMAL_MESA is needed." \
+      "Run 'apt-cache policy mesa-vulkan-drivers' to see what apt prefers, and why."
   fi
 }
