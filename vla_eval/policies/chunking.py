@@ -60,7 +60,7 @@ class ChunkingSpec:
             raise SpecMismatchError(
                 f"policy '{policy}' predicts chunks of {chunk_size} actions, but n_action_steps="
                 f"{self.n_action_steps} with delay_steps={self.delay_steps} ({self.delay_alignment}) needs "
-                f"{self.min_chunk_size}. Lower n_action_steps or the delay, or take a policy with longer chunks."
+                f"{self.min_chunk_size}. Lower n_action_steps or the delay, or use a policy of longer chunks."
             )
 
 

@@ -67,7 +67,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         freeze_until_choice: hold arm and gripper width until the response phase, whatever the action.
         phase_gate_success: success counts only in the response phase (the official code has no gate).
         static_threshold_rad_s: the arm is at rest if no joint moves faster.
-        instruction: the sentence for `info["language_instruction"]`; the paper's by default.
+        instruction: the sentence for `info["language_instruction"]`; `gymnasium.make` gives the paper's.
         reconfiguration_freq: rebuild the scene every so many resets. None: at every reset on the CPU
             simulator (20 ms), never on the GPU simulator. In a scene that is used again PhysX keeps
             contact caches, by which states differ from those of a fresh scene (measured: from 1e-7 to

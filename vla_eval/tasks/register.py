@@ -8,6 +8,7 @@ from typing import Any
 
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
+from vla_eval.prompts import instruction_for
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.tasks.spec import TaskSpec
 
@@ -23,6 +24,7 @@ def register_all() -> None:
     for spec in TASKS.values():
         if spec.gym_id not in REGISTERED_ENVS:
             kwargs = {key: list(v) if isinstance(v, tuple) else v for key, v in spec.kwargs.items()}
+            kwargs["instruction"] = instruction_for(spec)
             register_env(spec.gym_id, max_episode_steps=spec.horizon_steps, **kwargs)(env_class(spec))
 
 

@@ -1,0 +1,300 @@
+"""What the tasks promise, on the CPU simulator and without a renderer."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import vla_eval.tasks.register  # noqa: F401  # registers the gym ids
+from vla_eval.errors import MissingDependencyError, TaskArgumentError
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.memory_env import PARK_X_M
+from vla_eval.tasks.register import env_class
+
+CHOICE_TASKS = [task for task, spec in TASKS.items() if spec.candidates]
+CUBE_REST_Z_M = 0.02  # half the edge of a cube that lies on the table, z = 0
+
+
+def make(task: str, **kwargs: Any) -> Any:
+    spec = task_spec(task)
+    settings = {
+        "obs_mode": "none",
+        "reward_mode": "none",
+        "control_mode": "pd_ee_delta_pose",
+        "render_backend": "none",
+        **spec.kwargs,
+        **kwargs,
+    }
+    return env_class(spec)(**settings)
+
+
+def pressing_actions(seed: int, n_steps: int) -> Iterator[np.ndarray]:
+    """Actions that press the closed gripper onto the table and whatever lies there."""
+    rng = np.random.default_rng(seed)
+    for _ in range(n_steps):
+        yield np.array(
+            [rng.uniform(-0.3, 0.6), rng.uniform(-0.6, 0.6), -0.6, 0, 0, 0, -1], dtype=np.float32
+        )
+
+
+def trajectory(env: Any, seed: int, n_steps: int = 40) -> np.ndarray:
+    """The full simulator state at each step of an episode with much contact."""
+    env.reset(seed=[seed])
+    states = [env.get_state()[0].numpy().copy()]
+    for action in pressing_actions(seed, n_steps):
+        env.step(action)
+        states.append(env.get_state()[0].numpy().copy())
+    return np.stack(states)
+
+
+def visible(env: Any) -> list[int]:
+    """Indices of the candidates that are not parked."""
+    x = env.candidate_positions_m()[0, :, 0]
+    return [int(i) for i in torch.nonzero(x < PARK_X_M - 1)[:, 0]]
+
+
+@pytest.mark.parametrize(
+    ("task", "n_numbers"),
+    # qpos 9 + qvel 9 + tcp 7 = 25, and: oracle 1 + 3 per cube; mug 7 + ball 7 + oracle 1; see docs/tasks.md.
+    [
+        ("RememberColor3-v0", 25 + 1 + 3 * 3),
+        ("RememberColor5-v0", 25 + 1 + 3 * 5),
+        ("RememberColor9-v0", 25 + 1 + 3 * 9),
+        ("ShellGameTouch-v0", 25 + 7 + 7 + 1),
+        ("InterceptMedium-v0", 25 + 3 + 7 + 3 + 3 + 3 + 3 + 3),
+    ],
+)
+def test_state_observation_has_the_official_size(task: str, n_numbers: int) -> None:
+    obs, _ = make(task, obs_mode="state").reset(seed=[1])
+    assert tuple(obs.shape) == (1, n_numbers)
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_gym_make_gives_the_task_with_horizon_instruction_and_info(task: str) -> None:
+    env = gymnasium.make(
+        f"vla_eval/{task}", obs_mode="state", control_mode="pd_ee_delta_pose", render_backend="none"
+    )
+    _, info = env.reset(seed=1)
+    assert {"success", "elapsed_steps", "oracle_info", "phase", "cue_steps", "delay_steps"} <= set(info)
+    assert len(info["language_instruction"][0]) > 20
+    if task in CHOICE_TASKS:
+        assert {"first_choice", "n_wrong_choices", "fail", "is_obj_placed", "obj_to_goal_pos"} <= set(info)
+    for step in range(1, task_spec(task).horizon_steps + 1):
+        *_, truncated, info = env.step(env.unwrapped.hold_action())
+        assert bool(truncated) == (step == task_spec(task).horizon_steps)
+
+
+@pytest.mark.parametrize("task", [t for t in CHOICE_TASKS if t.startswith("RememberColor")])
+def test_cube_is_shown_hidden_and_then_all_cubes_lie_on_the_table(task: str) -> None:
+    env = make(task)
+    for seed in (1, 2, 3):
+        env.reset(seed=[seed])
+        target = int(env.target_index()[0])
+        for step in range(15):
+            positions = env.candidate_positions_m()[0]
+            if step < 5:
+                assert visible(env) == [target], f"step {step}"
+                assert torch.allclose(positions[target], torch.tensor([0, 0, CUBE_REST_Z_M]), atol=2e-4)
+            elif step < 10:
+                assert visible(env) == [], f"step {step}"
+            else:
+                assert len(visible(env)) == env.n_items, f"step {step}"
+                assert torch.allclose(positions, env._slots[0], atol=2e-4)
+                assert torch.allclose(positions[:, 2], torch.tensor(CUBE_REST_Z_M), atol=2e-4)
+            env.step(env.hold_action())
+
+
+def test_ball_is_shown_and_then_mugs_stand_upright_on_the_table_one_over_the_ball() -> None:
+    env = make("ShellGameTouch-v0")
+    for seed in range(1, 6):
+        env.reset(seed=[seed])
+        target = int(env.target_index()[0])
+        for step in range(30):
+            ball = env.ball.pose.p[0]
+            assert torch.allclose(ball[:2], env._slots[0, target, :2], atol=1e-3)
+            assert visible(env) == ([] if step < 5 else [0, 1, 2]), f"step {step}"
+            if step >= 5:
+                mugs = env.candidate_positions_m()[0]
+                # Half of the mug's height: nothing is ejected, tilted or sunk, as in the official code.
+                assert torch.allclose(mugs[:, 2], torch.tensor(0.0405), atol=5e-4), f"step {step}"
+                assert torch.allclose(mugs[:, :2], env._slots[0, :, :2], atol=1e-3), f"step {step}"
+            env.step(env.hold_action())
+
+
+@pytest.mark.parametrize("task", ["RememberColor9-v0", "ShellGameTouch-v0", "InterceptMedium-v0"])
+def test_an_episode_has_no_past(task: str) -> None:
+    """Bit-equal states in a fresh environment, and in one used for other episodes, in any order."""
+    env = make(task)
+    first = {seed: trajectory(env, seed) for seed in (5, 6)}
+    torch.manual_seed(999)
+    np.random.seed(999)  # noqa: TID251, NPY002  # global state must not matter
+    again = {seed: trajectory(env, seed) for seed in (6, 5)}
+    fresh = trajectory(make(task), 6)
+    assert np.array_equal(first[5], again[5])
+    assert np.array_equal(first[6], again[6])
+    assert np.array_equal(first[6], fresh)
+    assert not np.array_equal(first[5], first[6])
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_evaluate_changes_nothing(task: str) -> None:
+    env = make(task)
+    env.reset(seed=[3])
+    for action in pressing_actions(3, 12):
+        env.step(action)
+        before = env.get_state().clone()
+        first, second = env.evaluate(), env.evaluate()
+        assert torch.equal(before, env.get_state())
+        assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_doing_nothing_never_succeeds(task: str) -> None:
+    env = make(task)
+    for seed in range(1, 6):
+        _, info = env.reset(seed=[seed])
+        for _ in range(task_spec(task).horizon_steps):
+            assert not bool(info["success"][0])
+            *_, info = env.step(env.hold_action())
+
+
+def test_unseeded_resets_give_different_episodes() -> None:
+    env = make("RememberColor9-v0")
+    env.reset(seed=[1])
+    layouts = []
+    for _ in range(3):
+        env.reset()
+        layouts.append(env._slots.clone())
+    assert not torch.equal(layouts[0], layouts[1])
+    assert not torch.equal(layouts[1], layouts[2])
+
+
+def test_infos_of_earlier_steps_keep_their_values() -> None:
+    env = make("RememberColor3-v0")
+    _, early = env.reset(seed=[1])
+    env.step(env.hold_action())
+    assert int(early["elapsed_steps"][0]) == 0
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_success_and_states_do_not_depend_on_the_reward_mode(task: str) -> None:
+    outcomes = []
+    for mode in ("dense", "normalized_dense", "sparse", "none"):
+        env = make(task, reward_mode=mode)
+        env.reset(seed=[4])
+        rows = []
+        for action in pressing_actions(4, 15):
+            _, reward, *_, info = env.step(action)
+            assert torch.isfinite(reward).all()
+            rows.append((bool(info["success"][0]), env.get_state()[0].numpy().tobytes()))
+        outcomes.append(rows)
+    assert all(rows == outcomes[0] for rows in outcomes)
+
+
+def go_to(env: Any, goal: torch.Tensor, n_steps: int) -> Any:
+    """Move the tool centre point to (3,) and return the last info."""
+    info = None
+    for _ in range(n_steps):
+        action = torch.zeros(1, 7)
+        action[0, :3] = (13 * (goal - env.tcp_position_m()[0])).clamp(-1, 1)
+        action[0, 6] = 1
+        *_, info = env.step(action)
+    return info
+
+
+def test_touching_the_cue_counts_only_without_the_phase_gate() -> None:
+    above_cue = torch.tensor([0.0, 0.0, 0.06])
+    gated = make("RememberColor3-v0", cue_steps=30)
+    gated.reset(seed=[1])
+    assert not bool(go_to(gated, above_cue, 25)["success"][0])
+    official = make("RememberColor3-v0", cue_steps=30, phase_gate_success=False)
+    official.reset(seed=[1])
+    assert bool(go_to(official, above_cue, 25)["success"][0])
+
+
+def test_first_choice_is_latched_and_wrong_ones_are_counted() -> None:
+    env = make("RememberColor3-v0", cue_steps=1, delay_steps=0)
+    env.reset(seed=[2])
+    target = int(env.target_index()[0])
+    wrong = (target + 1) % 3
+    lift = torch.tensor([0.0, 0.0, 0.04])
+    info = go_to(env, env._slots[0, wrong] + lift, 25)
+    assert (int(info["first_choice"][0]), int(info["n_wrong_choices"][0])) == (wrong, 1)
+    assert not bool(info["success"][0])
+    info = go_to(env, env._slots[0, target] + lift, 25)
+    assert (int(info["first_choice"][0]), int(info["n_wrong_choices"][0])) == (wrong, 1)
+    assert bool(info["success"][0])
+
+
+def test_strict_choice_makes_the_first_wrong_touch_a_failure_for_good() -> None:
+    env = make("RememberColor3-v0", cue_steps=1, delay_steps=0, strict_choice=True)
+    env.reset(seed=[2])
+    target = int(env.target_index()[0])
+    lift = torch.tensor([0.0, 0.0, 0.04])
+    assert bool(go_to(env, env._slots[0, (target + 1) % 3] + lift, 25)["fail"][0])
+    info = go_to(env, env._slots[0, target] + lift, 25)
+    assert bool(info["fail"][0])
+    assert not bool(info["success"][0])
+
+
+def test_freeze_until_choice_holds_arm_and_gripper() -> None:
+    env = make("RememberColor3-v0", freeze_until_choice=True)
+    env.reset(seed=[1])
+    start = env.agent.robot.get_qpos().clone()
+    moved = np.ones(7, dtype=np.float32)
+    moved[6] = -1  # close the gripper: must not be carried out either
+    for _ in range(9):
+        env.step(moved)
+    assert torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-3)
+    for _ in range(5):
+        env.step(moved)
+    assert not torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-2)
+
+
+def test_phase_lengths_are_drawn_from_their_ranges_by_the_seed_alone() -> None:
+    env = make("RememberColor3-v0", cue_steps=(1, 5), delay_steps=(0, 3))
+    drawn = {}
+    for seed in range(1, 60):
+        _, info = env.reset(seed=[seed])
+        drawn[seed] = (int(info["cue_steps"][0]), int(info["delay_steps"][0]))
+    assert {cue for cue, _ in drawn.values()} == {1, 2, 3, 4, 5}
+    assert {delay for _, delay in drawn.values()} == {0, 1, 2, 3}
+    _, info = env.reset(seed=[7])
+    assert (int(info["cue_steps"][0]), int(info["delay_steps"][0])) == drawn[7]
+
+
+@pytest.mark.parametrize(
+    ("task", "kwargs", "message"),
+    [
+        ("RememberColor3-v0", {"n_items": 10}, "n_items=10: expected 2 to 9"),
+        ("RememberColor3-v0", {"n_items": 1}, "n_items=1: expected 2 to 9"),
+        ("RememberColor3-v0", {"cue_steps": -1}, "cue_steps=-1: expected a number of control steps"),
+        ("RememberColor3-v0", {"delay_steps": (5, 2)}, "delay_steps="),
+        ("RememberColor3-v0", {"goal_threshold_m": 0}, "goal_threshold_m=0: expected > 0"),
+        ("ShellGameTouch-v0", {"mug": "cup"}, "expected 'primitive' or 'ycb'"),
+        ("InterceptMedium-v0", {"velocity_range_m_s": (2, 1)}, "0 < least ≤ most"),
+        ("InterceptMedium-v0", {"delay_steps": 5}, "this task has no phases"),
+    ],
+)
+def test_impossible_arguments_are_refused_with_a_reason(
+    task: str, kwargs: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(TaskArgumentError, match=message):
+        make(task, **kwargs)
+
+
+def test_a_missing_ycb_mug_is_an_error_and_never_a_question(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vla_eval.tasks.mug.ASSET_DIR", "nowhere")
+    monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked for a download"))
+    with pytest.raises(MissingDependencyError, match="download_asset ycb"):
+        make("ShellGameTouch-v0", mug="ycb")
+
+
+def test_official_shell_state_keeps_a_unit_quaternion() -> None:
+    env = make("ShellGameTouch-v0")
+    env.reset(seed=[1])
+    quaternion = env.candidates[0].pose.q[0]
+    assert float(torch.linalg.norm(quaternion)) == pytest.approx(1, abs=1e-5)
