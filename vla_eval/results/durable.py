@@ -1,0 +1,159 @@
+"""Write files so that a killed process, a full disk or a power cut loses nothing that was promised.
+
+Knows nothing of episodes: it deals in lines and whole files.
+"""
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+from pathlib import Path
+
+from vla_eval.errors import RunFolderError, StorageFullError
+
+logger = logging.getLogger(__name__)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names of a folder's files durable: without this a new file may be gone after a power cut."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a file so that at any moment either the old content or the new one is there, never a part.
+
+    Args:
+        path: the file; `<name>.tmp` beside it is used on the way.
+        text: the new content.
+
+    Raises:
+        StorageFullError: it could not be written; the old content is still there.
+    """
+    temporary = path.with_name(f"{path.name}.tmp")
+    data = text.encode("utf-8", errors="backslashreplace")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        sync_folder(path.parent)
+    except OSError as exc:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise storage_full(path, exc) from exc
+
+
+class LineFile:
+    """A file that lines are appended to, each of them whole or not at all.
+
+    Args:
+        path: the file; it is made if it is not there. It must be empty or end with a newline.
+        durable: whether a line is on the disk, and not just on its way, when `append` returns.
+    """
+
+    def __init__(self, path: Path, *, durable: bool) -> None:
+        self._path = path
+        self._durable = durable
+        self._is_broken = False
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+
+    def append(self, line: str) -> None:
+        """Append one line.
+
+        Args:
+            line: text without the line's end.
+
+        Raises:
+            StorageFullError: the line could not be written; the file is as it was before.
+            RunFolderError: an earlier failure left the file in a state that must be repaired first.
+        """
+        if self._is_broken:
+            raise RunFolderError(
+                f"{self._path}: an earlier line could neither be written nor taken back. Run the same "
+                f"command again: it repairs the end of the file."
+            )
+        # A lone surrogate (a file name in a traceback, say) has no UTF-8; `\udc80` is the same in JSON.
+        data = f"{line}\n".encode("utf-8", errors="backslashreplace")
+        size_before = os.fstat(self._fd).st_size
+        try:
+            # One write, so that a killed process leaves at most one incomplete line, and at the end.
+            n_written = os.write(self._fd, data)
+            if n_written != len(data):
+                raise OSError(errno.ENOSPC, f"only {n_written} of {len(data)} bytes could be written")
+            if self._durable:
+                os.fsync(self._fd)
+        except BaseException as exc:  # an interrupt too must leave no line that nobody knows of
+            self._cut_back(size_before)
+            if isinstance(exc, OSError):
+                raise storage_full(self._path, exc) from exc
+            raise
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _cut_back(self, size: int) -> None:
+        try:
+            os.ftruncate(self._fd, size)
+            os.fsync(self._fd)
+        except OSError as exc:
+            self._is_broken = True
+            logger.warning("%s: the incomplete last line could not be cut off (%s)", self._path, exc)
+
+
+class FolderLock:
+    """Keeps a second process out of a folder, for as long as this process lives.
+
+    The lock belongs to the open file, so the kernel drops it when the process dies, however it dies;
+    the file itself stays and means nothing.
+
+    Args:
+        path: the lock file; it holds the process id of whoever has the lock.
+
+    Raises:
+        RunFolderError: another process has it, or the file system knows no locks.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as exc:
+            holder = os.pread(self._fd, 32, 0).decode(errors="replace").strip() or "unknown"
+            os.close(self._fd)
+            raise RunFolderError(
+                f"{path.parent}: another process (pid {holder}) is writing into this run folder. Wait for "
+                f"it, stop it, or use another --out."
+            ) from exc
+        except OSError as exc:
+            os.close(self._fd)
+            raise RunFolderError(
+                f"{path.parent}: the file system cannot lock files ({exc.strerror}), so two processes could "
+                f"write at once. Use a --out on a local disk."
+            ) from exc
+        os.ftruncate(self._fd, 0)
+        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Let others in; a second call does nothing."""
+        if self._fd >= 0:
+            # Not just closed: a forked child that still has the descriptor would keep the lock.
+            fcntl.flock(self._fd, fcntl.LOCK_UN)
+            os.close(self._fd)
+            self._fd = -1
+
+
+def storage_full(path: Path, cause: OSError) -> StorageFullError:
+    """Build the error for a file that could not be written, or only in part."""
+    return StorageFullError(
+        f"{path}: could not be written ({cause.strerror or cause}). Nothing that was reported as finished is "
+        f"lost. Free some space and run the same command again."
+    )
