@@ -6,7 +6,6 @@ means, the same call goes on where it stopped.
 """
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -89,7 +88,7 @@ def evaluate(
     config: EvalConfig,
     *,
     out: Path | None = None,
-    command: tuple[str, ...] = (),
+    command: str = "",
     allow_environment_change: bool = False,
     observer: EvaluationObserver | None = None,
 ) -> EvaluationSummary:
@@ -139,7 +138,7 @@ def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int) -> int:
     return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
 
 
-def _describe(config: EvalConfig, plan: Plan, command: tuple[str, ...]) -> RunDescription:
+def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
     return RunDescription(
         name=config.name,
         config={**results_config(config), "task_versions": dict(plan.task_versions)},
@@ -160,7 +159,7 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
             if isinstance(event, Answered):
                 bookkeeper.take(event)
             elif isinstance(event, DeviceFound):
-                bookkeeper.note_device(event.device)
+                bookkeeper.folder.note_device(event.device)
             elif bookkeeper.observer.on_tick():
                 return True
     return False
@@ -178,7 +177,6 @@ class _Bookkeeper:
     n_errors: int = 0
     n_consecutive_errors: int = 0
     proven: set[GroupKey] = field(default_factory=set)  # groups with an episode that ran to its end
-    device: dict[str, str] = field(default_factory=dict)
 
     def take(self, answered: Answered) -> None:
         """Store a result, or the error in its place."""
@@ -194,12 +192,6 @@ class _Bookkeeper:
         self.n_results += 1
         self.n_consecutive_errors = 0
         self.observer.on_record(answer.record)
-
-    def note_device(self, device: Mapping[str, str]) -> None:
-        """Write down the device if anything of it is new."""
-        if not device.items() <= self.device.items():
-            self.device.update(device)
-            self.folder.note_device(dict(self.device))
 
     def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:
         record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)

@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluate import default_run_folder, evaluate
 
     config = _config(args)
+    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     out = args.out or default_run_folder(config)
     with stop_on_signals() as stop:
         progress = Progress(stop, out=str(out))
@@ -88,17 +89,16 @@ def run(args: argparse.Namespace) -> int:
             summary = evaluate(
                 config,
                 out=out,
-                command=tuple(sys.argv),
+                command=command,
                 allow_environment_change=args.allow_environment_change,
                 observer=progress,
             )
         finally:
             progress.close()
     if summary.was_stopped:
-        again = shlex.join(["mikasa-vla", *sys.argv[1:]])
         n_done = summary.n_episodes - summary.n_open
         print(
-            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To go on: {again}",
+            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To go on: {command}",
             file=sys.stderr,
         )
         return stop.exit_code
