@@ -1,0 +1,153 @@
+"""The command line: fast, lazy, and every mistake one message on stderr with exit code 1."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vla_eval.cli.main import main
+from vla_eval.cli.show import task_arguments
+from vla_eval.recipes import list_recipes
+from vla_eval.tasks.catalog import TASKS, task_spec
+
+HEAVY = ("torch", "sapien", "mani_skill", "gymnasium", "lerobot", "cv2", "rerun", "transformers")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    try:
+        code = main(arguments)
+    except SystemExit as exc:  # argparse: --help, and mistakes that it finds
+        code = int(exc.code or 0)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Return the message of what must be a user's mistake."""
+    code, out, err = run(capsys, *arguments)
+    assert code == 1
+    assert out == ""
+    assert "Traceback" not in err
+    assert err.startswith("mikasa-vla")
+    return err
+
+
+class TestMistakes:
+    def test_an_unknown_verb_gets_a_suggestion(self, capsys: pytest.CaptureFixture[str]) -> None:
+        message = mistake(capsys, "evla")
+
+        assert message == (
+            "mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? "
+            "Known: eval, report, list, show, doctor, bench.\n"
+        )
+
+    def test_an_unknown_flag(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "unrecognized arguments: --episods 3" in mistake(capsys, "eval", "demo", "--episods", "3")
+
+    def test_an_unknown_task(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "Did you mean 'ShellGameTouch-v0'" in mistake(capsys, "show", "ShellGame")
+
+    def test_an_unknown_configuration(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "no configs/*.yaml 'dmeo'. Did you mean 'demo'" in mistake(capsys, "eval", "dmeo")
+
+    def test_eval_of_nothing(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "--task is missing. Example: mikasa-vla eval --task" in mistake(capsys, "eval")
+        assert "--policy is missing" in mistake(capsys, "eval", "--task", "RememberColor3-v0")
+
+    def test_an_override_of_a_field_that_is_not_there(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "Did you mean 'delay_steps'" in mistake(
+            capsys, "eval", "demo", "--set", "chunking.delay_step=1"
+        )
+
+    def test_workers_that_are_no_number(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "expected 'auto' or a number, found 'many'" in mistake(
+            capsys, "eval", "demo", "--workers", "many"
+        )
+
+    def test_a_list_of_what_there_is_not(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "invalid choice: 'robots'" in mistake(capsys, "list", "robots")
+
+    def test_an_interrupt_has_the_shell_s_exit_code(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def interrupt(_args: object) -> int:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("vla_eval.cli.list.run", interrupt)
+
+        assert run(capsys, "list") == (130, "", "")
+
+
+class TestList:
+    def test_everything_is_listed(self, capsys: pytest.CaptureFixture[str]) -> None:
+        code, out, _ = run(capsys, "list")
+
+        assert code == 0
+        for name in (*TASKS, *list_recipes("policies"), *list_recipes("configs"), *list_recipes("prompts")):
+            assert f"  {name} " in out
+
+    def test_one_kind_is_listed_alone(self, capsys: pytest.CaptureFixture[str]) -> None:
+        _, out, _ = run(capsys, "list", "tasks")
+
+        assert [line.split()[0] for line in out.splitlines()] == list(TASKS)
+
+    def test_a_broken_recipe_does_not_hide_the_others(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "policies").mkdir()
+        (tmp_path / "policies" / "mine.yaml").write_text("adaptor: random\n")
+        monkeypatch.chdir(tmp_path)
+
+        code, out, _ = run(capsys, "list", "policies")
+
+        assert code == 0
+        assert "CANNOT BE READ: policies/mine.yaml: there is no field 'adaptor'" in out
+        assert "oracle " in out
+
+
+class TestShow:
+    @pytest.mark.parametrize("task", list(TASKS))
+    def test_a_task_is_explained(self, capsys: pytest.CaptureFixture[str], task: str) -> None:
+        code, out, _ = run(capsys, "show", task)
+
+        assert code == 0
+        for label in ("asks", "instruction", "success", "chance", "horizon", "phases", "arguments"):
+            assert f"\n{label} " in out
+
+    def test_arguments_are_those_of_the_row_of_its_class_and_of_its_bases(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        names = [argument.name for argument in task_arguments(task_spec("RememberColor5-v0"))]
+        _, out, _ = run(capsys, "show", "RememberColor5-v0")
+
+        assert {"n_items", "strict_choice", "cue_steps", "freeze_until_choice"} <= set(names)
+        assert len(names) == len(set(names))
+        assert "n_items = 5" in out
+
+
+PROBE = """
+import json, sys
+from vla_eval.cli.main import main
+try:
+    code = main(sys.argv[1:])
+except SystemExit as exc:
+    code = exc.code
+print(json.dumps([code, sorted({name.partition(".")[0] for name in sys.modules})]), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["eval", "--help"], ["list"], ["show", "RememberColor3-v0"]]
+)
+def test_no_simulator_and_no_model_library_is_imported_for_a_look(
+    arguments: list[str], tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    code, modules = json.loads(done.stderr.splitlines()[-1])
+
+    assert code == 0
+    assert not set(HEAVY) & set(modules)
