@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-# Left out: the project itself, the empty opencv-python (see scripts/opencv_record.py), what a person
+# Left out: the project itself, the empty opencv-python (see scripts/empty_wheels.py), what a person
 # added to speed up tests. A local label such as +cpu names a build, not a version: any build may do.
 {
   echo "# The versions this repository was tested with, for Python 3.12. Written by scripts/lock.sh."

@@ -25,7 +25,7 @@ die() {
 
 # Everything that decides what is in the environment, and where it lies: console scripts hold its path.
 fingerprint() {
-  { cat pyproject.toml constraints.txt scripts/setup.sh scripts/opencv_record.py
+  { cat pyproject.toml constraints.txt scripts/setup.sh scripts/empty_wheels.py
     grep -E '^(version|home)' "$VENV/pyvenv.cfg"
     pwd; } | sha256sum | cut -d ' ' -f 1
 }
@@ -65,12 +65,11 @@ pip_install() {
   fi
 }
 
-# sapien asks for opencv-python and lerobot for opencv-python-headless; both own the folder cv2, and
-# the former needs a display's libraries. An empty record of the former leaves cv2 to the latter.
-install_opencv_record() {
+# Stand-ins for packages that would overwrite others, or do not exist for this Python.
+install_empty_wheels() {
   local folder
   folder=$(mktemp -d)
-  "$VENV_PYTHON" scripts/opencv_record.py constraints.txt "$folder"
+  "$VENV_PYTHON" scripts/empty_wheels.py constraints.txt "$folder"
   pip_install --no-deps --no-index "$folder"/*.whl
   rm -rf "$folder"
 }
@@ -98,7 +97,7 @@ main() {
   rm -f "$STAMP"
   : >"$LOG"
   say "installing the packages of constraints.txt (several GB the first time)"
-  install_opencv_record
+  install_empty_wheels
   pip_install -c constraints.txt -e '.[dev]'
   repair_cv2
   fingerprint >"$STAMP"
