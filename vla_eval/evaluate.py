@@ -36,7 +36,7 @@ FINGERPRINT_DIGITS = 8
 class EvaluationObserver(Protocol):
     """Watches a run: progress on a terminal, for example."""
 
-    def on_start(self, *, n_episodes: int, n_finished: int, n_workers: int) -> None:
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Called once, before the first episode."""
 
     def on_record(self, record: EpisodeRecord) -> None:
@@ -49,7 +49,7 @@ class EvaluationObserver(Protocol):
 class _Silence:
     """Watches nothing and never stops the run."""
 
-    def on_start(self, *, n_episodes: int, n_finished: int, n_workers: int) -> None:
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Do nothing."""
 
     def on_record(self, record: EpisodeRecord) -> None:
@@ -114,9 +114,7 @@ def evaluate(
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)
         n_workers = worker_count(config, plan, n_jobs=len(queue))
-        observer.on_start(
-            n_episodes=len(plan.jobs), n_finished=len(plan.jobs) - len(queue), n_workers=n_workers
-        )
+        observer.on_start(plan, n_finished=len(plan.jobs) - len(queue), n_workers=n_workers)
         bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer)
         n_open = len(queue)
         was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers)

@@ -36,6 +36,7 @@ import os, signal, sys, time
 from pathlib import Path
 import numpy as np
 from vla_eval.core import ActionChunk
+from vla_eval.errors import SpecMismatchError
 from vla_eval.specs import PolicySpec
 
 HERE = Path(__file__).parent
@@ -76,6 +77,11 @@ class Policy:
             time.sleep(1000)
         if kind == "sysexit":
             sys.exit("bye")
+        if kind == "refuse once it has run" and (HERE / "ran").exists():
+            raise SpecMismatchError("the GPU is gone")
+        if kind == "refuse once it has run":
+            return
+        (HERE / "ran").touch()
         if kind == "raise":
             raise ZeroDivisionError("a mistake in the policy")
         if kind == "nan":
@@ -135,7 +141,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.syspath_prepend(tmp_path)  # spawned workers get the parent's path
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))  # and so do command lines
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)  # and so do command lines
     monkeypatch.setattr(evaluate_module, "collect_environment", lambda: {"machine": "test"})
     return Bench(tmp_path)
 
@@ -225,6 +231,16 @@ class TestFaults:
         assert summary.n_errors == 1
         assert error is not None
         assert (error.kind, error.stage) == ("SetupTimeout", "setup")
+
+    def test_a_refusal_of_what_has_worked_before_is_an_error_and_no_mistake(self, bench: Bench) -> None:
+        bench.write_policy(faults={"setup": "refuse once it has run", "2": "raise"})
+
+        with pytest.raises(
+            TooManyErrorsError, match="seed 4: SpecMismatchError during setup: the GPU is gone"
+        ):
+            bench.run("out", max_consecutive_errors=3)
+
+        assert bench.records("out")[1].outcome != "error"
 
     def test_no_worker_is_left_behind(self, bench: Bench) -> None:
         bench.write_policy(faults={"2": "hang"})
@@ -363,7 +379,12 @@ class TestKills:
     def start(self, bench: Bench, out: str, *, workers: int = 2) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", TASK, "--policy", "night.yaml"]
         command += ["--episodes", str(self.EPISODES), "--workers", str(workers), "--out", out]
-        command += ["--set", "simulator=fake", *(f"--set=env.{k}={v}" for k, v in SHORT.items())]
+        command += [
+            "--allow-environment-change",
+            "--set",
+            "simulator=fake",
+            *(f"--set=env.{k}={v}" for k, v in SHORT.items()),
+        ]
         return subprocess.Popen(
             command,
             cwd=bench.folder,

@@ -11,6 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from vla_eval.plan import Plan
 from vla_eval.results.records import EpisodeRecord
 
 LINE_EVERY_SECONDS = 60.0
@@ -66,9 +67,12 @@ class Progress:
         self._n_episodes = self._n_done = self._n_errors = self._n_results = self._n_successes = 0
         self._begun = self._last_line = time.monotonic()
 
-    def on_start(self, *, n_episodes: int, n_finished: int, n_workers: int) -> None:
-        """Say how much there is to do."""
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Say how much there is to do, and what is left out."""
+        n_episodes = len(plan.jobs)
         self._n_episodes, self._n_done = n_episodes, n_finished
+        for pair in plan.left_out:
+            self._write(f"left out: {pair}")
         if n_finished == n_episodes:
             self._write(f"{self._out}: all {n_episodes} episodes are there")
             return
