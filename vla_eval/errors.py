@@ -65,6 +65,10 @@ class TooManyErrorsError(VlaEvalError):
     """A run was stopped because episode after episode ended in an error."""
 
 
+class ConformanceError(VlaEvalError):
+    """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `" Did you mean 'x'?"` for the closest known name, or `""` if none is close.
 

@@ -35,9 +35,7 @@ def pressing_actions(seed: int, n_steps: int) -> Iterator[np.ndarray]:
     """Actions that press the closed gripper onto the table and whatever lies there."""
     rng = np.random.default_rng(seed)
     for _ in range(n_steps):
-        yield np.array(
-            [rng.uniform(-0.3, 0.6), rng.uniform(-0.6, 0.6), -0.6, 0, 0, 0, -1], dtype=np.float32
-        )
+        yield np.array([rng.uniform(-0.3, 0.6), rng.uniform(-0.6, 0.6), -0.6, 0, 0, 0, -1], dtype=np.float32)
 
 
 def trajectory(env: Any, seed: int, n_steps: int = 40) -> np.ndarray:
@@ -130,7 +128,7 @@ def test_an_episode_has_no_past(task: str) -> None:
     env = make(task)
     first = {seed: trajectory(env, seed) for seed in (5, 6)}
     torch.manual_seed(999)
-    np.random.seed(999)  # noqa: TID251, NPY002  # global state must not matter
+    np.random.seed(999)  # noqa: TID251  # global state must not matter
     again = {seed: trajectory(env, seed) for seed in (6, 5)}
     fresh = trajectory(make(task), 6)
     assert np.array_equal(first[5], again[5])

@@ -71,7 +71,8 @@ class ChoiceEnv(MemoryTableEnv):
 
     def _distances_m(self) -> torch.Tensor:
         offsets = self.candidate_positions_m() - self.tcp_position_m()[:, None, :]
-        return torch.linalg.norm(offsets, dim=2)
+        distances: torch.Tensor = torch.linalg.norm(offsets, dim=2)
+        return distances
 
     def _of_target(self, per_candidate: torch.Tensor) -> torch.Tensor:
         rows = torch.arange(self.num_envs, device=self.device)

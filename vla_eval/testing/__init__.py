@@ -1,1 +1,17 @@
-"""Conformance checks for environments, policies and tasks, for us and for third parties."""
+"""Conformance checks for environments, policies and tasks, for us and for third parties.
+
+Each check raises `ConformanceError` with a sentence that says which promise was broken; returning means
+that all of them were kept. They need no test framework:
+
+    from vla_eval.testing import check_env, check_policy, check_task
+
+    check_env(lambda: make_my_env())
+    check_policy(lambda: make_my_policy(), env_spec)
+    check_task("RememberColor3-v0")
+"""
+
+from vla_eval.testing.check_env import check_env
+from vla_eval.testing.check_policy import check_policy
+from vla_eval.testing.check_task import check_task
+
+__all__ = ["check_env", "check_policy", "check_task"]

@@ -1,0 +1,125 @@
+"""The kit in `vla_eval.testing`: ours pass it, and it notices each kind of broken promise."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWindow, StepResult
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import ConformanceError
+from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.scripted import make_hold, make_random
+from vla_eval.specs import PolicySpec
+from vla_eval.tasks.catalog import TASKS
+from vla_eval.testing import check_env, check_policy, check_task
+
+FAKE = EnvSettings(task="RememberColor3-v0", simulator="fake", cameras=("base_camera", "hand_camera"))
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_our_tasks_pass(task: str) -> None:
+    check_task(task, n_episodes=5)
+
+
+def test_the_fake_environment_passes() -> None:
+    check_env(lambda: make_env(FAKE))
+
+
+@pytest.mark.parametrize("make", [make_random, make_hold])
+def test_our_policies_pass(make: Any) -> None:
+    env: Any = make_env(FAKE)
+    chunking = ChunkingSpec(n_action_steps=4)
+    context = PolicyContext(name="p", env=env.spec, chunking=chunking, n_candidates=3)
+    check_policy(lambda: make(context), env.spec)
+
+
+class BrokenEnv:
+    """The fake environment with one promise broken."""
+
+    def __init__(self, fault: str) -> None:
+        self._env: Any = make_env(FAKE)
+        self.spec = self._env.spec
+        self.fault = fault
+        self._n_resets = 0
+        self._buffer = np.zeros(9, dtype=np.float32)
+
+    def _break(self, result: StepResult) -> StepResult:
+        state = dict(result.observation.state)
+        images = dict(result.observation.images)
+        if self.fault == "past":
+            state["qpos"] = state["qpos"] + np.float32(1e-6 * self._n_resets)
+        elif self.fault == "buffer":
+            self._buffer[:] = state["qpos"]
+            state["qpos"] = self._buffer
+        elif self.fault == "camera" and images:
+            images["hand_camera"] = images["hand_camera"][:64]
+        return replace(result, observation=replace(result.observation, state=state, images=images))
+
+    def reset(self, seeds: Any, *, render: bool) -> dict[int, StepResult]:
+        self._n_resets += 1
+        used = {slot: 1 for slot in seeds} if self.fault == "seed" else seeds
+        return {k: self._break(r) for k, r in self._env.reset(used, render=render).items()}
+
+    def step(self, actions: Any, *, render: frozenset[int]) -> dict[int, StepResult]:
+        return {k: self._break(r) for k, r in self._env.step(actions, render=render).items()}
+
+    def hold_action(self, slot: int) -> FloatArray:
+        action: FloatArray = self._env.hold_action(slot)
+        return action
+
+    def close(self) -> None:
+        self._env.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        ("past", "bit-equal episodes in a used environment"),
+        ("buffer", "must not share a buffer"),
+        ("camera", "Camera 'hand_camera' gives uint8"),
+        ("seed", "Different seeds must give different episodes"),
+    ],
+)
+def test_a_broken_environment_is_noticed(fault: str, sentence: str) -> None:
+    with pytest.raises(ConformanceError, match=sentence):
+        check_env(lambda: BrokenEnv(fault))
+
+
+class BrokenPolicy:
+    """Draws from a generator that survives a reset, or changes what it is shown, or reuses its buffer."""
+
+    def __init__(self, fault: str) -> None:
+        self.spec = PolicySpec(name="broken", reads="last", cameras=(), states=("qpos",), chunk_size=2)
+        self.fault = fault
+        self._rng = np.random.default_rng(0)
+        self._buffer = np.zeros((2, 7), dtype=np.float32)
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        pass
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        if self.fault == "writes":
+            window.last.state["qpos"][:] = 0
+        if self.fault == "buffer":
+            return ActionChunk(actions=self._buffer)
+        drawn = self._rng.uniform(-1, 1, (2, 7)) if self.fault == "past" else np.zeros((2, 7))
+        return ActionChunk(actions=drawn.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        ("past", "the same actions after another episode"),
+        ("writes", "leaves the observations as they are"),
+        ("buffer", "must not share a buffer"),
+    ],
+)
+def test_a_broken_policy_is_noticed(fault: str, sentence: str) -> None:
+    env: Any = make_env(FAKE)
+    with pytest.raises(ConformanceError, match=sentence):
+        check_policy(lambda: BrokenPolicy(fault), env.spec)

@@ -1,0 +1,27 @@
+"""One way of saying that a promise was broken."""
+
+import numpy as np
+
+from vla_eval.core import Observation
+from vla_eval.errors import ConformanceError
+
+
+def claim(kept: bool, promise: str, found: str = "") -> None:
+    """Raise `ConformanceError` unless the promise was kept.
+
+    Args:
+        kept: whether it was.
+        promise: the promise as a sentence.
+        found: what was found instead.
+    """
+    if not kept:
+        raise ConformanceError(f"{promise}{f' Found: {found}.' if found else ''}")
+
+
+def same_observation(first: Observation, second: Observation) -> bool:
+    """Whether two observations are bit-equal in states and in the images both of them hold."""
+    states = all(np.array_equal(first.state[name], second.state[name]) for name in first.state)
+    images = all(
+        np.array_equal(first.images[name], second.images[name]) for name in first.images if second.images
+    )
+    return first.step == second.step and first.state.keys() == second.state.keys() and states and images
