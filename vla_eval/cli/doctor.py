@@ -1,0 +1,42 @@
+"""`mikasa-vla doctor`: whether this machine can evaluate, and what to do if not."""
+
+import argparse
+import dataclasses
+import json
+from typing import Any
+
+from vla_eval.doctor import CHECKS, Finding, run_probe
+
+EXIT_FAILED = 1
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments of `doctor`."""
+    parser = subparsers.add_parser(
+        "doctor",
+        help="check this machine and say what to do",
+        description="Check Python, packages, drivers and disk, draw a picture and run an episode. "
+        "The exit code is 1 if something is missing that evaluations need.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all checks; return 1 if one has failed."""
+    findings: dict[str, Finding] = {}
+    for name, check in CHECKS.items():
+        findings[name] = check(run_probe)
+        if not args.json:
+            print(describe(name, findings[name]), flush=True)
+    if args.json:
+        rows = [{"check": name, **dataclasses.asdict(finding)} for name, finding in findings.items()]
+        print(json.dumps(rows, indent=2, ensure_ascii=False))
+    return EXIT_FAILED if any(finding.status == "fail" for finding in findings.values()) else 0
+
+
+def describe(name: str, finding: Finding) -> str:
+    """Return the line of a check, and a second one with the advice if there is any."""
+    width = max(map(len, CHECKS))
+    line = f"{finding.status:<4}  {name:<{width}}  {finding.found}"
+    return f"{line}\n{'':{width + 8}}→ {finding.advice}" if finding.advice else line

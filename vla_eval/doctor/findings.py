@@ -1,0 +1,58 @@
+"""What a check answers, and how a risky one is tried in another process."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Status = Literal["ok", "warn", "fail"]
+
+PROBE_TIMEOUT_SECONDS = 300.0  # a first import on a cold disk takes a minute
+SET_UP = "Run `make setup` in the repository."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What a check found.
+
+    Attributes:
+        status: `fail` means that evaluations do not work; `warn`, that something may not.
+        found: what there is.
+        advice: what to do, unless all is well.
+    """
+
+    status: Status
+    found: str
+    advice: str = ""
+
+
+class ProbeFailure(Exception):
+    """A probe ended without an answer; the message is its last word."""
+
+
+type Probe = Callable[[str], Mapping[str, Any]]  # Any: JSON
+"""Name of a function of `doctor.probe` -> its answer; raises `ProbeFailure`."""
+
+
+def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
+    """Call a function of `doctor.probe` in another process.
+
+    Raises:
+        ProbeFailure: it failed, crashed or hung.
+    """
+    command = (sys.executable, "-m", "vla_eval.doctor.probe", name)
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        raise ProbeFailure(f"no answer within {PROBE_TIMEOUT_SECONDS:.0f} s") from None
+    if done.returncode < 0:
+        raise ProbeFailure(f"crashed with {signal.Signals(-done.returncode).name}")
+    if done.returncode > 0:
+        raise ProbeFailure((done.stderr.strip().splitlines() or ["no message"])[-1])
+    answer: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return answer

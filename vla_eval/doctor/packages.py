@@ -1,0 +1,101 @@
+"""Checks of Python and the installed packages."""
+
+import importlib.metadata
+import sys
+
+from packaging.requirements import Requirement
+from packaging.version import InvalidVersion, Version
+
+from vla_eval.doctor.findings import SET_UP, Finding, Probe, ProbeFailure
+from vla_eval.provenance import PACKAGE_FOLDER, package_version
+
+DISTRIBUTION = "mikasa-vla-eval"
+MINIMAL_PYTHON, NEWEST_PYTHON = (3, 12), (3, 13)  # as in pyproject.toml
+
+
+def check_python(_: Probe) -> Finding:
+    """Whether this is a Python that the dependencies exist for."""
+    found = f"{sys.version.split()[0]}"
+    if MINIMAL_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
+        return Finding(status="ok", found=found)
+    return Finding(status="fail", found=found, advice=f"3.12 or 3.13 is needed. {SET_UP}")
+
+
+def check_packages(_: Probe) -> Finding:
+    """Whether what pyproject.toml requires is installed, and in the versions of constraints.txt."""
+    try:
+        lines = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(status="fail", found=f"{DISTRIBUTION} is not installed", advice=SET_UP)
+    requirements = [Requirement(line) for line in lines if "extra ==" not in line]
+    wrong = [text for requirement in requirements if (text := _violation(requirement))]
+    if wrong:
+        return Finding(status="fail", found="; ".join(wrong), advice=SET_UP)
+    untested = _untested_versions()
+    if untested:
+        advice = f"These versions are allowed but were not tested together. {SET_UP}"
+        return Finding(status="warn", found="; ".join(untested), advice=advice)
+    return Finding(status="ok", found=f"all {len(requirements)} required packages are in range")
+
+
+def check_owners(_: Probe) -> Finding:
+    """Whether two distributions put files into the same package."""
+    advice = {
+        "vla_eval": f"Another project has the same import name: pip uninstall vla-eval, then: {SET_UP}",
+        "cv2": f"Whichever was installed last wins: pip uninstall opencv-python, then: {SET_UP}",
+    }
+    shared = {name: owners for name in advice if len(owners := _owners(name)) > 1}
+    if not shared:
+        return Finding(status="ok", found="no package has two owners")
+    return Finding(
+        status="fail" if "vla_eval" in shared else "warn",
+        found="; ".join(f"{name} belongs to {' and '.join(owners)}" for name, owners in shared.items()),
+        advice=" ".join(advice[name] for name in shared),
+    )
+
+
+def check_cv2(probe: Probe) -> Finding:
+    """Which OpenCV is imported."""
+    try:
+        answer = probe("cv2_build")
+    except ProbeFailure as exc:
+        return Finding(status="fail", found=f"cannot be imported: {exc}", advice=SET_UP)
+    found = f"{answer['version']}, user interface: {answer['gui']}"
+    if answer["gui"] == "NONE":
+        return Finding(status="ok", found=found)
+    return Finding(status="warn", found=found, advice=f"The headless one is what was tested. {SET_UP}")
+
+
+def _violation(requirement: Requirement) -> str | None:
+    installed = package_version(requirement.name)
+    if installed is None:
+        return f"{requirement.name} is not installed"
+    if requirement.specifier.contains(installed, prereleases=True):
+        return None
+    return f"{requirement.name} {installed} is not {requirement.specifier}"
+
+
+def _untested_versions() -> list[str]:
+    """Compare with constraints.txt, which only a checkout has."""
+    path = PACKAGE_FOLDER.parent / "constraints.txt"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    untested = []
+    for name, _, tested in (line.partition("==") for line in lines if "==" in line):
+        installed = package_version(name)
+        if installed is not None and _public(installed) != _public(tested):
+            untested.append(f"{name} {installed} (tested: {tested})")
+    return untested
+
+
+def _public(version: str) -> str:
+    """Strip a label such as `+cpu`, which names a build."""
+    try:
+        return Version(version).public
+    except InvalidVersion:
+        return version
+
+
+def _owners(top_level: str) -> list[str]:
+    """Return the distributions that have files in a top-level package."""
+    mapping = importlib.metadata.packages_distributions()
+    return sorted(set(mapping.get(top_level, ())))
