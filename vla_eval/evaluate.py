@@ -105,9 +105,8 @@ def evaluate(
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. What was recorded stays.
     """
-    observer = observer or _Silence()
+    observer, path = observer or _Silence(), out or default_run_folder(config)
     plan = make_plan(config)
-    path = out or default_run_folder(config)
     with RunFolder.open(
         path, _describe(config, plan, command), allow_environment_change=allow_environment_change
     ) as folder:

@@ -92,23 +92,18 @@ def make_plan(config: EvalConfig) -> Plan:
         RecipeError: a recipe is wrong, or two policies have the same name.
         MissingInstructionError: a task has no instruction in the prompt set.
     """
-    if "instruction" in config.env:
-        raise RecipeError(
-            "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
-            "./prompts/ and name that file in prompt_set."
-        )
+    _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
     policies = [load_recipe("policies", name, PolicyRecipe) for name in config.policies]
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
-    for policy in policies:
-        check_adapter(policy.value.adapter)
     prompts = load_prompts(config.prompt_set)
     groups: list[Group] = []
     left_out: list[str] = []
     for task in tasks:
         instruction = instruction_for(task, config.prompt_set)
         for policy in policies:
+            check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and task.candidates is None:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
@@ -193,6 +188,14 @@ class JobQueue:
         chosen = loaded if loaded in waiting else (free or waiting)[0]
         assert chosen is not None  # `loaded in waiting` holds no None
         return self._rest[chosen].popleft()
+
+
+def _refuse_instruction(config: EvalConfig) -> None:
+    if "instruction" in config.env:
+        raise RecipeError(
+            "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
+            "./prompts/ and name that file in prompt_set."
+        )
 
 
 def _refuse_doubles(kind: str, names: list[str]) -> None:

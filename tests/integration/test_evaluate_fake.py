@@ -433,7 +433,7 @@ class TestKills:
         self.finish(bench, "out")
 
     def test_a_worker_that_is_killed_is_replaced(self, bench: Bench) -> None:
-        bench.write_policy(pause=0.05)
+        bench.write_policy(pause=0.02)
         process = self.start(bench, "out", workers=1)
         assert wait_until(lambda: bool(bench.worker_pids()))
         os.kill(next(iter(bench.worker_pids())), signal.SIGKILL)
