@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import pytest
 
 from vla_eval import evaluate as evaluate_module
+from vla_eval.cli.main import main
 from vla_eval.decoding import decode
 from vla_eval.errors import (
     RecipeError,
@@ -445,3 +446,57 @@ class TestKills:
         assert "SIGKILL" in errors[0].message
         assert "--workers" in errors[0].message
         assert len(bench.records("out")) == self.EPISODES
+
+
+class TestCommandLine:
+    def test_standard_output_carries_the_table_alone(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(bench.folder)
+
+        code = main(["eval", "demo", "--episodes", "2", "--set", "simulator=fake", "--format", "json"])
+
+        out, err = capsys.readouterr()
+        assert code == 0
+        # 2 tasks x 3 policies
+        assert len(json.loads(out)["rows"]) == 6
+        assert "12 episodes, 0 of them finished before" in err
+
+    def test_a_second_run_prints_the_same_table_and_runs_nothing(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(bench.folder)
+        command = [
+            "eval",
+            "--task",
+            TASK,
+            "--policy",
+            "night.yaml",
+            "--episodes",
+            "3",
+            "--set",
+            "simulator=fake",
+        ]
+        assert main(command) == 0
+        first = capsys.readouterr()
+
+        assert main(command) == 0
+
+        second = capsys.readouterr()
+        assert second.out == first.out
+        assert "all 3 episodes are there" in second.err
+        assert len(list((bench.folder / "runs").iterdir())) == 1
+
+    def test_episodes_that_ended_in_an_error_have_an_exit_code_of_their_own(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bench.write_policy(faults={"2": "raise"})
+        command = ["eval", "--task", TASK, "--policy", str(bench.folder / "night.yaml"), "--episodes", "3"]
+        command += ["--out", str(bench.folder / "out"), "--set", "simulator=fake"]
+
+        code = main(command)
+
+        err = capsys.readouterr().err
+        assert code == 3
+        assert f"error: night on {TASK}, seed 2, run 0: ZeroDivisionError: a mistake in the policy" in err
+        assert "1 episodes ended in an error" in err

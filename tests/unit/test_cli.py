@@ -61,6 +61,9 @@ class TestMistakes:
             capsys, "eval", "demo", "--set", "chunking.delay_step=1"
         )
 
+    def test_a_baseline_that_is_not_evaluated(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "Did you mean 'random'" in mistake(capsys, "eval", "demo", "--baseline", "randon")
+
     def test_workers_that_are_no_number(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert "expected 'auto' or a number, found 'many'" in mistake(
             capsys, "eval", "demo", "--workers", "many"

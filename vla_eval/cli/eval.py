@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.decoding import decode
-from vla_eval.errors import RecipeError
-from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
+from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.recipes import EvalConfig, apply_overrides, find_recipe, load_recipe
 
 EXIT_EPISODE_ERRORS = 3
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluate import default_run_folder, evaluate
 
     config = _config(args)
+    _check_baseline(args.baseline, config)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     out = args.out or default_run_folder(config)
     with stop_on_signals() as stop:
@@ -119,6 +120,16 @@ def _print_table(out: Path, args: argparse.Namespace) -> None:
 
     table = build_table([read_run(out)], baseline=args.baseline)
     print(render(table, args.format, paper=args.paper))
+    if args.format == "csv":  # has no place for them
+        for note in table.notes:
+            print(f"note: {note}", file=sys.stderr)
+
+
+def _check_baseline(baseline: str | None, config: EvalConfig) -> None:
+    """Refuse a baseline that is not evaluated: now, and not when the night is over."""
+    policies = [find_recipe("policies", policy).stem for policy in config.policies]
+    if baseline is not None and baseline not in policies:
+        raise unknown_name("policy", baseline, policies, where="--baseline")
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:
