@@ -7,7 +7,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # Left out: the project itself, the empty opencv-python (see scripts/empty_wheels.py), what a person
 # added to speed up tests. A local label such as +cpu names a build, not a version: any build may do.
 {
-  echo "# The versions this repository was tested with, for Python 3.12. Written by scripts/lock.sh."
+  echo "# The versions this repository was tested with, with Python 3.12. Written by scripts/lock.sh."
   .venv/bin/python -m pip freeze --exclude-editable --exclude opencv-python --exclude mikasa-vla-eval \
     --exclude pytest-xdist --exclude execnet |
     sed -E 's/^([A-Za-z0-9._-]+==[^+]+)\+.*$/\1/' | grep -E '^[A-Za-z0-9._-]+==' | LC_ALL=C sort -f

@@ -53,7 +53,7 @@ make_venv() {
 show_progress() {
   sed -u -nE \
     -e 's/^ *Downloading (.*\/)?([^-/]+-[^-]+)-.*\(([0-9.]+ GB|[0-9]{3,}\.[0-9] MB)\).*/setup:   downloading \2 (\3)/p' \
-    -e 's/^Installing collected packages:.*,.*/setup:   installing/p'
+    -e 's/^Installing collected packages:(.*,){3}.*/setup:   installing/p'
 }
 
 pip_install() {

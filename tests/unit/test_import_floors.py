@@ -1,0 +1,101 @@
+"""Floors F0 and F1, and the command line's start, import no simulator, no torch and no viewer.
+
+Those cost 5 to 10 s, which `--help`, `list` and `report` must not pay.
+"""
+
+import json
+import pkgutil
+import subprocess
+import sys
+
+import pytest
+
+import vla_eval.results
+import vla_eval.testing
+
+FOREIGN = ("torch", "sapien", "mani_skill", "lerobot", "cv2", "rerun")
+
+CHEAP = (
+    "core",
+    "specs",
+    "errors",
+    "decoding",
+    "recipes",
+    "prompts",
+    "registry",
+    "provenance",
+    "rollout",
+    "plan",
+    "evaluate",
+    "doctor",
+    "tasks.spec",
+    "tasks.catalog",
+    "envs.settings",
+    "envs.factory",
+    "envs.fake",
+    "policies.chunking",
+    "policies.scripted",
+    "cli.main",
+    "cli.eval",
+    "cli.list",
+    "cli.show",
+    "cli.report",
+    "cli.doctor",
+    "cli.bench",
+)
+CHEAP_PACKAGES = (vla_eval.results, vla_eval.testing)
+
+# Imports the modules one after the other and notes which of them brings a foreign package first.
+SCRIPT = """
+import importlib, json, sys
+modules, foreign = json.loads(sys.argv[1])
+guilty = {}
+for module in modules:
+    importlib.import_module(module)
+    for package in foreign:
+        if package in sys.modules:
+            guilty.setdefault(package, module)
+print(json.dumps(guilty))
+"""
+
+
+def import_in_order(modules: list[str]) -> dict[str, str]:
+    """Return foreign package -> the first module that imported it, in a process of its own."""
+    argument = json.dumps([modules, FOREIGN])
+    done = subprocess.run([sys.executable, "-c", SCRIPT, argument], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    guilty: dict[str, str] = json.loads(done.stdout)
+    return guilty
+
+
+def cheap_modules() -> list[str]:
+    listed = [f"vla_eval.{name}" for name in CHEAP]
+    walked = [
+        f"{package.__name__}.{module.name}"
+        for package in CHEAP_PACKAGES
+        for module in pkgutil.iter_modules(package.__path__)
+    ]
+    return listed + walked
+
+
+def test_cheap_modules_import_nothing_heavy() -> None:
+    assert import_in_order(cheap_modules()) == {}
+
+
+@pytest.mark.parametrize("name", ["core", "rollout"])
+def test_what_a_newcomer_reads_first_depends_on_numpy_alone(name: str) -> None:
+    script = f"import sys, vla_eval.{name}; print(*{{m.split('.')[0] for m in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    third_party = set(done.stdout.split()) - set(sys.stdlib_module_names)
+    # What .pth files of the environment load at start is not ours.
+    idle = subprocess.run(
+        [sys.executable, "-c", "import sys; print(*{m.split('.')[0] for m in sys.modules})"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert third_party - set(idle.stdout.split()) <= {"numpy", "vla_eval"}
+
+
+def test_the_check_itself_finds_a_heavy_import() -> None:
+    assert import_in_order(["json", "cv2"]) == {"cv2": "cv2"}
