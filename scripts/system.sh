@@ -42,8 +42,8 @@ has_vulkan_driver() {
 needs_backports() { [ "$(os_field ID):$(os_field VERSION_ID)" = debian:12 ]; }
 
 has_backports() {
-  grep -rhsE "^[^#]*$1-backports" "$APT_ETC/sources.list" "$APT_ETC"/sources.list.d/*.list \
-    "$APT_ETC"/sources.list.d/*.sources >/dev/null
+  grep -qsE "^[^#]*$1-backports" "$APT_ETC/sources.list" "$APT_ETC"/sources.list.d/*.list \
+    "$APT_ETC"/sources.list.d/*.sources
 }
 
 # Print the machine's own entry of the suite in $2, in file $1, with the backports suite in its place:
