@@ -189,6 +189,24 @@ def test_the_cue_is_in_the_picture_and_the_parked_cubes_are_not(env: Any) -> Non
                 assert n_pure(frame.images["base_camera"]) == n_pure(frame.images["hand_camera"]) == 0
 
 
+def test_the_mugs_hide_the_ball_from_both_cameras() -> None:
+    def n_red(image: np.ndarray) -> int:
+        red, green, blue = (image[..., i].astype(int) for i in range(3))
+        return int(((red > 120) & (green < 60) & (blue < 60)).sum())
+
+    env = make_env(
+        EnvSettings(task="ShellGameTouch-v0", cameras=CAMERAS, render=RenderSettings(wrist_mesh="simplified"))
+    )
+    for seed in range(1, 6):
+        frame = env.reset({0: seed}, render=True)[0].observation
+        assert n_red(frame.images["base_camera"]) > 0
+        assert n_red(frame.images["hand_camera"]) > 0
+        for step in range(1, 9):
+            frame = env.step({0: env.hold_action(0)}, render=frozenset({0}))[0].observation
+            if step >= 5:
+                assert n_red(frame.images["base_camera"]) == n_red(frame.images["hand_camera"]) == 0
+
+
 def test_asking_an_environment_without_cameras_for_pictures_is_an_error() -> None:
     blind = make_env(EnvSettings(task="RememberColor3-v0"))
     with pytest.raises(RenderingError, match="made without cameras"):

@@ -1,4 +1,4 @@
-"""The mug of the shell game: built from boxes in code, or the YCB asset where it is installed.
+"""The mug of the shell game: built from primitives in code, or the YCB asset where it is installed.
 
 Dimensions are those of the real object of YCB, `025_mug`: 0.117 x 0.093 x 0.081 m with its handle,
 0.118 kg (YCB object set, table of object sizes). The mug is one hollow body: it can stand over a ball.
@@ -28,7 +28,7 @@ TERRACOTTA_RGBA = (0.76, 0.38, 0.24, 1.0)
 
 
 def _boxes() -> list[tuple[sapien.Pose, list[float]]]:
-    """Return (pose, half sizes) of each box of an upright mug, origin in the middle of its height."""
+    """Return (pose, half sizes) of wall and handle of an upright mug, origin in the middle of its height."""
     boxes = []
     radius = OUTER_RADIUS_M - WALL_M / 2
     half_width = (OUTER_RADIUS_M) * math.tan(math.pi / N_WALL_SEGMENTS)
@@ -37,11 +37,6 @@ def _boxes() -> list[tuple[sapien.Pose, list[float]]]:
         turn = [math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
         centre = [radius * math.cos(angle), radius * math.sin(angle), 0]
         boxes.append((sapien.Pose(centre, turn), [WALL_M / 2, half_width, HEIGHT_M / 2]))
-    bottom_half = (OUTER_RADIUS_M - WALL_M) / math.sqrt(2)
-    bottom_z = -HEIGHT_M / 2 + WALL_M / 2
-    for angle in (0.0, math.pi / 4):  # two squares, turned against each other, make an octagonal bottom
-        turn = [math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
-        boxes.append((sapien.Pose([0, 0, bottom_z], turn), [bottom_half, bottom_half, WALL_M / 2]))
     bar, reach = HANDLE_BAR_M / 2, HANDLE_REACH_M
     for z in (-HANDLE_HEIGHT_M / 2 + bar, HANDLE_HEIGHT_M / 2 - bar):
         boxes.append((sapien.Pose([OUTER_RADIUS_M + reach / 2, 0, z]), [reach / 2, bar, bar]))
@@ -50,18 +45,27 @@ def _boxes() -> list[tuple[sapien.Pose, list[float]]]:
     return boxes
 
 
+# Without a gap: standing upside down, the mug must not show the ball through its bottom.
+BOTTOM_RADIUS_M = OUTER_RADIUS_M - WALL_M / 2
+BOTTOM_POSE = sapien.Pose([0, 0, -HEIGHT_M / 2 + WALL_M / 2], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
+
+
 def _volume_m3() -> float:
-    return float(sum(np.prod([2 * half for half in halves]) for _, halves in _boxes()))
+    walls_and_handle = float(sum(np.prod([2 * half for half in halves]) for _, halves in _boxes()))
+    return walls_and_handle + math.pi * BOTTOM_RADIUS_M**2 * WALL_M
 
 
 def primitive_mug_builder(scene: ManiSkillScene) -> ActorBuilder:
-    """Return a builder for a terracotta mug of boxes with the real mug's size and mass."""
+    """Return a builder for a terracotta mug with the real mug's size and mass."""
     builder = scene.create_actor_builder()
     material = sapien.render.RenderMaterial(base_color=TERRACOTTA_RGBA) if scene.can_render() else None
     density = MASS_KG / _volume_m3()
     for pose, halves in _boxes():
         builder.add_box_collision(pose, halves, density=density)
         builder.add_box_visual(pose, halves, material=material)
+    bottom = {"pose": BOTTOM_POSE, "radius": BOTTOM_RADIUS_M, "half_length": WALL_M / 2}
+    builder.add_cylinder_collision(**bottom, density=density)
+    builder.add_cylinder_visual(**bottom, material=material)
     return builder
 
 
