@@ -222,7 +222,7 @@ class TestProbes:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         noisy = tmp_path / "python"
-        noisy.write_text('#!/bin/sh\necho \'[1mwelcome\'\necho \'{"a": 1}\'\n')
+        noisy.write_text("#!/bin/sh\necho '[1mwelcome'\necho '{\"a\": 1}'\n")
         noisy.chmod(0o755)
         monkeypatch.setattr(sys, "executable", str(noisy))
         assert run_probe("episode") == {"a": 1}
