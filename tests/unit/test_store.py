@@ -170,18 +170,19 @@ def test_a_closed_folder_takes_nothing(tmp_path: Path) -> None:
 
 
 def test_kill_9_at_any_moment_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
-    out, n_keys, n_kills = tmp_path / "r", 400, 6
+    out, n_keys, n_processes = tmp_path / "r", 1500, 8
     moments = random.Random(0)
-    reported: set[int] = set()
-    for _ in range(n_kills):
+    exit_codes = []
+    for n_before in range(n_processes):
         with subprocess.Popen(writer(out, n_keys), stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             first = process.stdout.readline()  # it is in the middle of its work now
-            time.sleep(moments.uniform(0, 0.04))
+            time.sleep(moments.uniform(0, 0.02 * (n_before + 1)))
             process.send_signal(signal.SIGKILL)
-            reported |= {int(line) for line in (first, *process.stdout) if line.endswith("\n")}
-        stored = {record.seed for record in read_run(out).records}
-        assert reported <= stored
+            reported = {int(line) for line in (first, *process.stdout) if line.endswith("\n")}
+        exit_codes.append(process.returncode)
+        assert reported <= {record.seed for record in read_run(out).records}
+    assert -signal.SIGKILL in exit_codes
     subprocess.run(writer(out, n_keys), check=True, stdout=subprocess.DEVNULL)
     lines = (out / "episodes.jsonl").read_text().splitlines()
     assert sorted(json.loads(line)["seed"] for line in lines) == list(range(n_keys))

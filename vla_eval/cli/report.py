@@ -1,0 +1,53 @@
+"""`mikasa-vla report`: print the success table of one or more run folders."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+# Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
+FORMATS = ("markdown", "csv", "json", "latex")
+DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
+
+Each RUN is a folder that `mikasa-vla eval` made; a run may still be going on. Several runs go into one
+table: rows with the same task, policy, n_action_steps and settings are put together."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "report",
+        help="print the success table of run folders",
+        description=DESCRIPTION,
+        epilog="The columns are explained in docs/statistics.md.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
+    parser.add_argument(
+        "--baseline",
+        metavar="NAME",
+        help="policy that the others are compared with (random, if it was run)",
+    )
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    parser.add_argument(
+        "--paper", action="store_true", help="print the paper's figures for the same tasks beside one's own"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the runs and print their table.
+
+    Raises:
+        VlaEvalError: a RUN is no run folder, holds nothing yet, or has no such baseline.
+    """
+    # Here and not above: `mikasa-vla --help` need not wait for statistics.
+    from vla_eval.results.report import build_table, render
+    from vla_eval.results.store import read_run
+
+    table = build_table([read_run(path) for path in args.runs], baseline=args.baseline)
+    print(render(table, args.format, paper=args.paper))
+    if args.format == "csv":  # has no place for them
+        for note in table.notes:
+            print(f"note: {note}", file=sys.stderr)
+    return 0

@@ -1,0 +1,167 @@
+"""What can be said from counts: intervals, paired tests, corrections. Pure functions of numbers.
+
+What is undefined is None, never 0. Knows nothing of episodes, tasks or files.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+class Interval(NamedTuple):
+    """A confidence interval, within [0, 1]."""
+
+    low: float
+    high: float
+
+
+class PairCounts(NamedTuple):
+    """Outcomes of two policies on the same episodes.
+
+    Attributes:
+        both: both succeeded.
+        only_first: the first did, the second did not.
+        only_second: the second did, the first did not.
+        neither: none did.
+    """
+
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+
+    @property
+    def n_pairs(self) -> int:
+        """How many pairs there are."""
+        return sum(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunsEstimate:
+    """A success rate from several runs.
+
+    Attributes:
+        mean: mean of the run means.
+        sem: standard error of that mean, from the spread of the run means; None for a single run.
+        interval: t interval over the run means; None for a single run.
+    """
+
+    mean: float
+    sem: float | None
+    interval: Interval | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairedTest:
+    """How two policies differ on the same episodes: first minus second.
+
+    Attributes:
+        difference: difference of the success rates over the pairs.
+        n_pairs: how many pairs there are.
+        p_value: two-sided exact McNemar test.
+    """
+
+    difference: float
+    n_pairs: int
+    p_value: float
+
+
+def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
+    """Return the Wilson score interval of a proportion, at 95 %.
+
+    Args:
+        n_success: how many succeeded, 0 to `n_episodes`.
+        n_episodes: how many there are; with 0 the interval is undefined.
+
+    Source: Wilson 1927, JASA 22(158):209-212; recommended for small n by Brown, Cai & DasGupta 2001,
+    Statistical Science 16(2):101-133. Computed by scipy.stats.binomtest.
+    """
+    if n_episodes == 0:
+        return None
+    found = stats.binomtest(n_success, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(float(found.low), float(found.high))
+
+
+def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
+    """Return mean, SEM and 95 % t interval over independent runs.
+
+    Args:
+        run_means: success rate of each run, each in [0, 1]; with none the estimate is undefined.
+
+    Source: Student's t with n - 1 degrees of freedom over the run means; SEM as in the paper, section
+    "Experiments Reproducing and Compute Resources". The interval is clipped to [0, 1].
+    """
+    n_runs = len(run_means)
+    if n_runs == 0:
+        return None
+    mean = math.fsum(run_means) / n_runs
+    if n_runs == 1:
+        return RunsEstimate(mean=mean, sem=None, interval=None)
+    if min(run_means) == max(run_means):  # exactly, where rounding would leave a spread of 1e-17
+        return RunsEstimate(mean=run_means[0], sem=0.0, interval=Interval(run_means[0], run_means[0]))
+    sem = float(stats.sem(run_means))
+    half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, n_runs - 1)) * sem
+    interval = Interval(max(0.0, mean - half_width), min(1.0, mean + half_width))
+    return RunsEstimate(mean=mean, sem=sem, interval=interval)
+
+
+def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
+    """Compare two policies on the same episodes.
+
+    Only the pairs in which they differ say anything: if neither policy were better, each of these would
+    be a fair coin. Without any such pair p is 1.
+
+    Args:
+        counts: the pairs; without a pair the test is undefined.
+
+    Source: McNemar 1947, Psychometrika 12:153-157, in its exact form: a two-sided binomial test of
+    `only_first` among `only_first + only_second`. Computed by scipy.stats.binomtest.
+    """
+    if counts.n_pairs == 0:
+        return None
+    n_different = counts.only_first + counts.only_second
+    p_value = float(stats.binomtest(counts.only_first, n_different).pvalue) if n_different else 1.0
+    difference = (counts.only_first - counts.only_second) / counts.n_pairs
+    return PairedTest(difference=difference, n_pairs=counts.n_pairs, p_value=min(1.0, p_value))
+
+
+def holm(p_values: Sequence[float]) -> tuple[float, ...]:
+    """Return p values corrected for how many there are, in the same order.
+
+    Args:
+        p_values: uncorrected p values of all comparisons that are looked at together.
+
+    Source: Holm 1979, Scandinavian Journal of Statistics 6(2):65-70: keeps the chance of any false
+    positive among them below the level, whatever their dependence. Computed by statsmodels.
+    """
+    if len(p_values) < 2:
+        return tuple(p_values)
+    # Not at the top: it pulls in pandas, which a report with nothing to compare need not wait for.
+    from statsmodels.stats.multitest import multipletests
+
+    return tuple(float(p) for p in multipletests(p_values, method="holm")[1])
+
+
+def chance_corrected(score: float | None, *, chance: float | None, ceiling: float | None) -> float | None:
+    """Return where a score lies between chance (0) and ceiling (1); below chance it is negative.
+
+    Args:
+        score: success rate.
+        chance: success rate without memory.
+        ceiling: success rate of the expert that sees everything.
+
+    Returns:
+        `(score - chance) / (ceiling - chance)`, or None if anything is missing or there is no room
+        between chance and ceiling.
+
+    Source: the form of Cohen's kappa (1960, Educational and Psychological Measurement 20:37-46), with
+    the measured ceiling in the place of 1.
+    """
+    if score is None or chance is None or ceiling is None or ceiling <= chance:
+        return None
+    return (score - chance) / (ceiling - chance)

@@ -1,0 +1,239 @@
+"""Sort the episodes of several run folders into the rows of one table.
+
+Nothing that differs in its settings is put together, and no episode is counted twice. Knows nothing of
+statistics.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import PurePath
+from typing import NamedTuple
+
+from vla_eval.results.records import EpisodeRecord
+from vla_eval.results.run_file import leaves
+from vla_eval.results.store import StoredRun
+
+VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", "simulator", "sim_backend")
+"""Fields of a configuration that move success rates and are no part of an episode's key."""
+
+TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
+DEFAULT = "default"
+
+
+class RowKey(NamedTuple):
+    """What the episodes of a row share."""
+
+    task: str
+    policy: str
+    n_action_steps: int
+    variant: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """One independent run of a row.
+
+    Attributes:
+        index: the run index that its records carry.
+        copy: 0, or 1, 2 … where further run folders hold the same episodes with other trajectories.
+        records: seed -> record.
+    """
+
+    index: int
+    copy: int
+    records: Mapping[int, EpisodeRecord]
+
+    @property
+    def results(self) -> dict[int, EpisodeRecord]:
+        """Return seed -> record of all episodes that are no error."""
+        return {seed: record for seed, record in self.records.items() if record.outcome != "error"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowGroup:
+    """The episodes of one row."""
+
+    key: RowKey
+    runs: tuple[Run, ...]
+
+    @property
+    def results(self) -> list[EpisodeRecord]:
+        """Return all records that are no error."""
+        return [record for run in self.runs for record in run.results.values()]
+
+    @property
+    def n_errors(self) -> int:
+        """How many episodes have no result."""
+        return sum(len(run.records) - len(run.results) for run in self.runs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grouping:
+    """All rows, in the order of the table.
+
+    Attributes:
+        groups: by key.
+        n_doubles: run folder -> how many of its episodes had been in another folder already.
+        further: run folders that hold the episodes of another folder with other trajectories.
+    """
+
+    groups: Mapping[RowKey, RowGroup]
+    n_doubles: Mapping[str, int]
+    further: tuple[str, ...]
+
+
+def group_runs(runs: Sequence[StoredRun]) -> Grouping:
+    """Sort the episodes of all runs into rows.
+
+    Args:
+        runs: what the run folders hold.
+
+    Returns:
+        Rows in the order of tasks and policies in the configurations, then by `n_action_steps`.
+    """
+    labels = variant_labels(runs)
+    runs_of: dict[RowKey, dict[int, list[dict[int, EpisodeRecord]]]] = defaultdict(lambda: defaultdict(list))
+    n_doubles: dict[str, int] = defaultdict(int)
+    further: dict[str, None] = {}
+    for stored, label_of in zip(runs, labels, strict=True):
+        own: dict[tuple[RowKey, int], dict[int, EpisodeRecord]] = defaultdict(dict)
+        for record in stored.records:
+            key = RowKey(record.task, record.policy, record.n_action_steps, label_of[record.task])
+            own[key, record.run][record.seed] = record
+        for (key, index), records in own.items():
+            copies = runs_of[key][index]
+            n_copies = len(copies)
+            n_new = _place(copies, records)
+            if n_new < len(records):
+                n_doubles[str(stored.path)] += len(records) - n_new
+            if len(copies) > max(n_copies, 1):
+                further[str(stored.path)] = None
+    groups = [
+        RowGroup(
+            key=key,
+            runs=tuple(
+                Run(index=index, copy=copy, records=records)
+                for index, copies in sorted(by_index.items())
+                for copy, records in enumerate(copies)
+            ),
+        )
+        for key, by_index in runs_of.items()
+    ]
+    return Grouping(
+        groups={group.key: group for group in _in_order(groups, runs)},
+        n_doubles=dict(n_doubles),
+        further=tuple(further),
+    )
+
+
+def _place(copies: list[dict[int, EpisodeRecord]], own: Mapping[int, EpisodeRecord]) -> int:
+    """Put one folder's episodes of one run where they belong; return how many were new.
+
+    They belong to a run that is known already if they do not contradict it (the seeds of one run may
+    be spread over folders, and one folder may be a copy of another); else they are a further run.
+    """
+    for known in copies:
+        if _belongs(known, own):
+            fresh = {
+                seed: record
+                for seed, record in own.items()
+                if seed not in known or (known[seed].outcome == "error" and record != known[seed])
+            }
+            known.update(fresh)
+            return len(fresh)
+    fresh = {
+        seed: record
+        for seed, record in own.items()
+        if not any(seed in known and _is_same(known[seed], record) for known in copies)
+    }
+    copies.append(fresh)
+    return len(fresh)
+
+
+def _belongs(known: Mapping[int, EpisodeRecord], own: Mapping[int, EpisodeRecord]) -> bool:
+    shared = known.keys() & own.keys()
+    same = [seed for seed in shared if _is_same(known[seed], own[seed])]
+    if len(same) == len(shared):
+        return True
+    # A copy of a folder that was continued has results where the other one has errors. Without any
+    # result in common it is another run, whose errors must not vanish behind this one's results.
+    one_is_error = all(
+        "error" in (known[seed].outcome, own[seed].outcome) for seed in shared if seed not in same
+    )
+    return one_is_error and any(known[seed].outcome != "error" for seed in same)
+
+
+def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
+    """Whether two records with the same key are one episode seen twice."""
+    if "error" in (one.outcome, other.outcome):
+        return one == other
+    return one.trajectory_sha256 is not None and one.trajectory_sha256 == other.trajectory_sha256
+
+
+def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
+    """Return for each run: task -> what sets its settings apart, None if nothing does.
+
+    Args:
+        runs: all runs of the table; only values that are not the same in all of them are named.
+    """
+    settings = [_settings(run) for run in runs]
+    names = sorted({name for values in settings for name in values})
+    differing = [name for name in names if len({values.get(name) for values in settings}) > 1]
+    versions: dict[str, set[object]] = defaultdict(set)
+    for run in runs:
+        for task in {record.task for record in run.records}:
+            versions[task].add(_task_version(run, task))
+    labels = []
+    for run, values in zip(runs, settings, strict=True):
+        parts = [f"{name}={values.get(name, DEFAULT)}" for name in differing]
+        label_of: dict[str, str | None] = {}
+        for task in {record.task for record in run.records}:
+            version = [f"task version {_task_version(run, task)}"] if len(versions[task]) > 1 else []
+            label_of[task] = ", ".join((*parts, *version)) or None
+        labels.append(label_of)
+    return labels
+
+
+def _settings(run: StoredRun) -> dict[str, str]:
+    chosen = {name: run.description.config[name] for name in VARIANT_FIELDS if name in run.description.config}
+    return {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
+
+
+def _task_version(run: StoredRun, task: str) -> object:
+    versions = run.description.config.get(TASK_VERSIONS)
+    return versions.get(task) if isinstance(versions, Mapping) else None
+
+
+def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
+    """Return the tasks or policies of a run's configuration, as its records name them."""
+    names = run.description.config.get(field)
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        return ()
+    # A policy may be given as a file, a task with its namespace; records carry the bare name.
+    return tuple(PurePath(str(name)).name.removesuffix(".yaml").removesuffix(".yml") for name in names)
+
+
+def _in_order(groups: Iterable[RowGroup], runs: Sequence[StoredRun]) -> list[RowGroup]:
+    tasks = _ranks(
+        *(config_names(run, "tasks") for run in runs), (r.task for run in runs for r in run.records)
+    )
+    policies = _ranks(
+        *(config_names(run, "policies") for run in runs), (r.policy for run in runs for r in run.records)
+    )
+    groups = list(groups)
+    variants = _ranks(group.key.variant or "" for group in groups)  # in the order of the run folders
+    return sorted(
+        groups,
+        key=lambda group: (
+            tasks[group.key.task],
+            policies[group.key.policy],
+            group.key.n_action_steps,
+            variants[group.key.variant or ""],
+        ),
+    )
+
+
+def _ranks(*names: Iterable[str]) -> dict[str, int]:
+    return {name: rank for rank, name in enumerate(dict.fromkeys(chain(*names)))}

@@ -1,0 +1,248 @@
+"""The footnotes of a table: what its figures are, and what a reader could otherwise be misled by."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
+from vla_eval.results.grouping import Grouping, RowKey, config_names
+from vla_eval.results.run_file import leaves
+from vla_eval.results.store import StoredRun
+from vla_eval.results.table import Row
+from vla_eval.tasks.catalog import TASKS
+
+MAX_NAMED = 6
+
+
+class Group(NamedTuple):
+    """What a configuration asks for episodes of; without `n_action_steps`: the policy's default."""
+
+    task: str
+    policy: str
+    n_action_steps: int | None
+
+    def __str__(self) -> str:
+        """Return `oracle on RememberColor3-v0 K=4`."""
+        k = "" if self.n_action_steps is None else f" K={self.n_action_steps}"
+        return f"{self.policy} on {self.task}{k}"
+
+
+def interval_notes(rows: Sequence[Row]) -> list[str]:
+    """Say which interval is used where."""
+    notes = []
+    if any(row.interval == "wilson" and row.n_runs == 1 for row in rows):
+        notes.append("success once, one run: 95 % Wilson interval over its episodes.")
+    if any(row.interval == "t_over_runs" for row in rows):
+        notes.append(
+            "success once, several runs: mean of the run means ± SEM over the runs, 95 % t interval over the "
+            "run means."
+        )
+    without_spread = [row for row in rows if row.n_runs > 1 and row.sem == 0]
+    if without_spread:
+        notes.append(
+            f"SEM is exactly 0 for {_names(_shown(row) for row in without_spread)}: all runs have the same "
+            "rate. Scripted deterministic controls have no spread over runs, and more runs of them add "
+            "nothing. The interval there is Wilson's over the episodes of one run."
+        )
+    return notes
+
+
+def comparison_notes(
+    rows: Sequence[Row], comparisons: Mapping[RowKey, Comparison], baseline: str
+) -> list[str]:
+    """Say what the comparison with the baseline is."""
+    if not comparisons:
+        return []
+    notes = [
+        f"vs {baseline}: difference of success once over the same episodes (run, seed); p of the exact "
+        f"McNemar test, Holm-corrected over {_number(len(comparisons), 'comparison')} in this table."
+    ]
+    if any(row.n_runs > 1 and row.n_pairs for row in rows):
+        notes.append(
+            "p takes pairs of several runs as independent: it speaks of these trained policies, not of "
+            "training them again; for that, look at the interval over the runs."
+        )
+    other_k = [
+        f"{_shown(row)} against K={row.baseline_n_action_steps}"
+        for row in rows
+        if row.baseline_n_action_steps not in (None, row.n_action_steps)
+    ]
+    if other_k:
+        notes.append(f"compared with {baseline} at another n_action_steps: {_names(other_k)}.")
+    return notes
+
+
+def chance_notes(rows: Sequence[Row]) -> list[str]:
+    """Say where the chance figures are from."""
+    notes = []
+    if any(row.chance_source == "cue_blind" for row in rows):
+        notes.append("chance: `cue_blind` as measured on the same task at the same n_action_steps.")
+    if any(row.chance_source in ("1/N", "catalogue") for row in rows):
+        notes.append(
+            "† chance is 1/N for N candidates, not measured: `cue_blind` has no result there at this "
+            "n_action_steps."
+        )
+    missing = _unique(
+        f"{row.task} K={row.n_action_steps}" for row in rows if row.chance is None and row.n_episodes
+    )
+    if missing:
+        notes.append(
+            f"chance is unknown for {_names(missing)}: there it has to be measured; run `cue_blind` at the "
+            "same n_action_steps."
+        )
+    return notes
+
+
+def tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
+    """Warn where success can be reached by searching instead of remembering."""
+    notes = []
+    for row in rows:
+        chance = chances[RowKey(row.task, row.policy, row.n_action_steps, row.variant)]
+        if row.policy != TOUR_POLICY or row.ci_low is None or chance is None:
+            continue
+        highest = chance.interval.high if chance.interval is not None else chance.rate
+        if row.ci_low > highest:
+            notes.append(
+                f"{_place(row)}: `tour` reaches {row.success_once:.2f} where chance is {chance.rate:.2f}. "
+                "Success there can be reached by touching one candidate after another and is not by itself "
+                "evidence of memory; look at the first choice."
+            )
+    return notes
+
+
+def error_notes(rows: Sequence[Row]) -> list[str]:
+    """Say what an error is, if there are any."""
+    n_errors = sum(row.n_errors for row in rows)
+    if not n_errors:
+        return []
+    return [
+        f"errors: {_number(n_errors, 'episode')} without a result, in no rate, neither as success nor as "
+        "failure; the same `mikasa-vla eval` command runs such episodes again."
+    ]
+
+
+def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
+    """Say what is particular about the run folders."""
+    notes = [
+        note for run in runs for note in (*_no_evidence(run), *_incomplete(run), *_continued_elsewhere(run))
+    ]
+    notes += [
+        f"{path}: {_number(n, 'episode')} with the same trajectory as in another run folder; each is counted "
+        "once."
+        for path, n in grouping.n_doubles.items()
+    ]
+    notes += [
+        f"{path}: repeats episodes of another run folder (same run and seed) with other trajectories; they "
+        "count as further runs."
+        for path in grouping.further
+    ]
+    return notes + _environment_differences(runs) + _recipe_differences(runs)
+
+
+def _no_evidence(run: StoredRun) -> list[str]:
+    """Name what makes the figures of a run worthless, or impossible to make again."""
+    notes = []
+    if run.description.config.get("simulator") == "fake":
+        notes.append(
+            f"{run.path}: made with the fake simulator, which has no physics; its rates mean nothing."
+        )
+    source = run.description.environment.get("vla_eval")
+    if isinstance(source, Mapping) and source.get("changes") is not None:
+        notes.append(
+            f"{run.path}: made with uncommitted changes to the package; the commit does not tell them."
+        )
+    return notes
+
+
+def _incomplete(run: StoredRun) -> list[str]:
+    config = run.description.config
+    n_episodes, n_runs = config.get("episodes"), config.get("runs", 1)
+    if not isinstance(n_episodes, int) or not isinstance(n_runs, int):
+        return []
+    there: Counter[Group] = Counter(Group(r.task, r.policy, r.n_action_steps) for r in run.records)
+    expected = n_episodes * n_runs
+    missing = {group: there[group] for group in _planned(run, there) if there[group] < expected}
+    if not missing:
+        return []
+    parts = (f"{group}: {n} of {expected}" for group, n in missing.items())
+    return [
+        f"{run.path} is incomplete (episodes there, of how many): {_names(parts)}. Run the same command "
+        "again to go on."
+    ]
+
+
+def _planned(run: StoredRun, there: Mapping[Group, int]) -> list[Group]:
+    """Return all groups that have episodes, and those that the configuration names and that have none."""
+    steps = run.description.config.get("n_action_steps")
+    begun_pairs = {(group.task, group.policy) for group in there}
+    begun_policies = {group.policy for group in there}
+    named: list[Group] = []
+    for task, policy in product(config_names(run, "tasks"), config_names(run, "policies")):
+        if (task, policy) not in begun_pairs and policy in begun_policies and _has_no_candidates(task):
+            continue  # a policy that needs candidates is left out there; nothing is missing
+        if isinstance(steps, Sequence) and not isinstance(steps, str):
+            named += [Group(task, policy, k) for k in steps if isinstance(k, int)]
+        elif (task, policy) not in begun_pairs:
+            named.append(Group(task, policy, None))
+    return list(dict.fromkeys((*named, *there)))
+
+
+def _has_no_candidates(task: str) -> bool:
+    return task in TASKS and TASKS[task].candidates is None
+
+
+def _continued_elsewhere(run: StoredRun) -> list[str]:
+    changed = _unique(change.path for session in run.sessions for change in session.environment_changes)
+    if not changed:
+        return []
+    return [
+        f"{run.path} was continued in another environment (--allow-environment-change); what changed: "
+        f"{_names(changed)}."
+    ]
+
+
+def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
+    texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
+    names = _unique(name for text in texts for name in text)
+    differing = [name for name in names if len({text.get(name) for text in texts}) > 1]
+    if not differing:
+        return []
+    return [f"the run folders were made in different environments; what differs: {_names(differing)}."]
+
+
+def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
+    digests: dict[str, set[str]] = defaultdict(set)
+    for run in runs:
+        for recipe, digest in run.description.recipes.items():
+            digests[recipe].add(digest)
+    differing = [recipe for recipe, found in digests.items() if len(found) > 1]
+    if not differing:
+        return []
+    return [
+        f"the run folders were made with different contents of {_names(differing)}; rows of the same name "
+        "are put together all the same."
+    ]
+
+
+def _number(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _shown(row: Row) -> str:
+    return f"{row.policy} on {_place(row)}"
+
+
+def _place(row: Row) -> str:
+    variant = f" ({row.variant})" if row.variant else ""
+    return f"{row.task} K={row.n_action_steps}{variant}"
+
+
+def _names(items: Iterable[str]) -> str:
+    names = list(items)
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
+
+
+def _unique(items: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(items))

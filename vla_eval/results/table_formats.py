@@ -1,0 +1,260 @@
+"""Write a table as Markdown, CSV, JSON or LaTeX. Knows nothing of episodes."""
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from typing import Literal, NamedTuple, get_args
+
+from vla_eval.results import paper_table
+from vla_eval.results.estimates import CONFIDENCE
+from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
+from vla_eval.results.table import Row, Table
+
+Format = Literal["markdown", "csv", "json", "latex"]
+FORMATS: tuple[str, ...] = get_args(Format)
+
+JSON_VERSION = 1
+UNDEFINED = "—"
+SMALLEST_SHOWN_P = 0.001
+PAPER_TITLE = f"The paper's figures, not measured here ({paper_table.PROTOCOL})"
+
+
+class Column(NamedTuple):
+    """One column of the printed table."""
+
+    title: str
+    cell: Callable[[Row], str]
+    is_number: bool = True
+
+
+def render(table: Table, fmt: Format, *, paper: bool = False) -> str:
+    """Write the table.
+
+    Args:
+        table: what `build_table` returned.
+        fmt: `markdown` and `latex` are to be read, `csv` and `json` hold every column in full precision.
+        paper: add the paper's figures for the same tasks, marked as such and apart from one's own.
+
+    Returns:
+        The text, without a newline at its end.
+    """
+    figures = _paper_figures(table) if paper else None
+    writers: dict[Format, Callable[[Table, Sequence[PaperFigure] | None], str]] = {
+        "markdown": _markdown,
+        "csv": _csv,
+        "json": _json,
+        "latex": _latex,
+    }
+    return writers[fmt](table, figures)
+
+
+def _paper_figures(table: Table) -> list[PaperFigure]:
+    tasks = dict.fromkeys(row.task for row in table.rows)
+    return [figure for task in tasks for figure in PAPER_TABLE if figure.task == task]
+
+
+# ------------------------------------------------------------------------------------------ cells
+
+
+def _columns(table: Table) -> list[Column]:
+    variant = [Column("variant", lambda row: row.variant or UNDEFINED, False)]
+    return [
+        Column("task", lambda row: row.task, False),
+        Column("policy", lambda row: row.policy, False),
+        Column("K", lambda row: str(row.n_action_steps)),
+        *(variant if any(row.variant for row in table.rows) else []),
+        Column("episodes", _episodes),
+        Column("errors", lambda row: str(row.n_errors)),
+        Column("success once", _success_once),
+        Column("at end", lambda row: _rate(row.success_at_end)),
+        Column("1st choice", lambda row: _rate(row.first_choice_success)),
+        Column("steps", lambda row: _count(row.mean_success_step)),
+        Column("infer.", lambda row: _count(row.inferences_per_episode)),
+        Column(f"vs {table.baseline}" if table.baseline else "vs baseline", _difference),
+        Column("chance", _chance),
+        Column("ceiling", lambda row: _rate(row.ceiling)),
+        Column("corrected", lambda row: _rate(row.chance_corrected)),
+    ]
+
+
+def _rate(value: float | None) -> str:
+    return UNDEFINED if value is None else f"{value + 0.0:.2f}".replace("-0.00", "0.00")
+
+
+def _count(value: float | None) -> str:
+    return UNDEFINED if value is None else f"{value:.1f}"
+
+
+def _episodes(row: Row) -> str:
+    return f"{row.n_episodes} ({row.n_runs} runs)" if row.n_runs > 1 else str(row.n_episodes)
+
+
+def _success_once(row: Row) -> str:
+    if row.success_once is None:
+        return UNDEFINED
+    sem = "" if row.sem is None else f" ± {row.sem:.2f}"
+    return f"{row.success_once:.2f}{sem} [{_rate(row.ci_low)}, {_rate(row.ci_high)}]"
+
+
+def _difference(row: Row) -> str:
+    if row.paired_difference is None or row.paired_p is None:
+        return UNDEFINED
+    p = f"p<{SMALLEST_SHOWN_P}" if row.paired_p < SMALLEST_SHOWN_P else f"p={row.paired_p:.3f}"
+    return f"{row.paired_difference:+.2f}".replace("-0.00", "+0.00") + f" ({p})"
+
+
+def _chance(row: Row) -> str:
+    return _rate(row.chance) + ("†" if row.chance_source in ("1/N", "catalogue") else "")
+
+
+def _paper_cells(figure: PaperFigure) -> list[str]:
+    return [
+        figure.task,
+        figure.model,
+        str(figure.n_action_steps),
+        f"{figure.success_once:.2f} ± {figure.sem:.2f}",
+    ]
+
+
+PAPER_TITLES = ["task", "model (paper)", "K", "success once (paper)"]
+PAPER_IS_NUMBER = [False, False, True, True]
+NOT_IN_PAPER = "The paper's table of VLA models has none of these tasks."
+
+
+# ------------------------------------------------------------------------------------------ formats
+
+
+def _markdown(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+    columns = _columns(table)
+    parts = [
+        _markdown_table(
+            [column.title for column in columns],
+            [[column.cell(row) for column in columns] for row in table.rows],
+            [column.is_number for column in columns],
+        )
+    ]
+    if table.notes:
+        parts.append("\n".join(f"- {note}" for note in table.notes))
+    if figures:
+        parts.append(f"**{PAPER_TITLE}**")
+        parts.append(_markdown_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER))
+        parts.append(f"- Source: {paper_table.SOURCE}.")
+    elif figures is not None:
+        parts.append(NOT_IN_PAPER)
+    return "\n\n".join(parts)
+
+
+def _markdown_table(titles: list[str], rows: list[list[str]], is_number: list[bool]) -> str:
+    escaped = [[cell.replace("|", "\\|") for cell in row] for row in (titles, *rows)]
+    widths = [max(2, *(len(row[i]) for row in escaped)) for i in range(len(titles))]
+
+    def line(cells: list[str]) -> str:
+        padded = (
+            cell.rjust(width) if number else cell.ljust(width)
+            for cell, width, number in zip(cells, widths, is_number, strict=True)
+        )
+        return f"| {' | '.join(padded)} |"
+
+    rule = [
+        "-" * (width - 1) + (":" if number else "-") for width, number in zip(widths, is_number, strict=True)
+    ]
+    return "\n".join(line(cells) for cells in (escaped[0], rule, *escaped[1:]))
+
+
+def _csv(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+    names = [field.name for field in fields(Row)]
+    source = ["source"] if figures is not None else []  # a column, so that the two are never taken for one
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*source, *names], restval="", extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for row in table.rows:
+        writer.writerow({"source": "measured", **row.to_dict()})
+    for figure in figures or ():
+        writer.writerow({"source": "paper", "policy": figure.model, **asdict(figure)})
+    return text.getvalue().rstrip("\n")
+
+
+def _json(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+    data: dict[str, object] = {
+        "format_version": JSON_VERSION,
+        "confidence": CONFIDENCE,
+        "baseline": table.baseline,
+        "n_comparisons": table.n_comparisons,
+        "runs": dict(table.runs),
+        "rows": [row.to_dict() for row in table.rows],
+        "notes": list(table.notes),
+    }
+    if figures is not None:
+        data["paper"] = {
+            "source": paper_table.SOURCE,
+            "protocol": paper_table.PROTOCOL,
+            "rows": [asdict(figure) for figure in figures],
+        }
+    return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+# ------------------------------------------------------------------------------------------ LaTeX
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "{": r"\{",
+        "}": r"\}",
+        "_": r"\_",
+        "%": r"\%",
+        "&": r"\&",
+        "#": r"\#",
+        "$": r"\$",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"$<$",
+        ">": r"$>$",
+        "±": r"$\pm$",
+        "×": r"$\times$",
+        "†": r"$^\dagger$",
+        "π": r"$\pi$",
+        "—": "---",
+        "“": "``",
+        "”": "''",
+    }
+)
+
+
+def _latex(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+    columns = _columns(table)
+    lines = ["% needs \\usepackage{booktabs}"]
+    lines += _latex_table(
+        [column.title for column in columns],
+        [[column.cell(row) for column in columns] for row in table.rows],
+        [column.is_number for column in columns],
+    )
+    lines += [f"\\par\\smallskip{{\\footnotesize {_escaped(note)}\\par}}" for note in table.notes]
+    if figures:
+        lines += ["", f"\\par\\medskip\\textbf{{{_escaped(PAPER_TITLE)}}}\\par\\smallskip"]
+        lines += _latex_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER)
+        lines.append(f"\\par\\smallskip{{\\footnotesize Source: {_escaped(paper_table.SOURCE)}.\\par}}")
+    elif figures is not None:
+        lines.append(f"\\par\\smallskip{{\\footnotesize {NOT_IN_PAPER}\\par}}")
+    return "\n".join(lines)
+
+
+def _latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]) -> list[str]:
+    lines = [f"\\begin{{tabular}}{{{''.join('r' if number else 'l' for number in is_number)}}}", "\\toprule"]
+    lines += [_latex_row(titles), "\\midrule"]
+    for above, row in zip((None, *rows), rows, strict=False):
+        if above is not None and above[0] != row[0]:
+            lines.append("\\midrule")  # a rule between tasks
+        lines.append(_latex_row(row))
+    return [*lines, "\\bottomrule", "\\end{tabular}"]
+
+
+def _latex_row(cells: list[str]) -> str:
+    return f"{' & '.join(re.sub('^-(?=[0-9])', '$-$', _escaped(cell)) for cell in cells)} \\\\"
+
+
+def _escaped(text: str) -> str:
+    parts = [part.translate(_LATEX) for part in re.split("`([^`]*)`", text)]  # every second one was code
+    return "".join(f"\\texttt{{{part}}}" if i % 2 else part for i, part in enumerate(parts))
