@@ -4,10 +4,13 @@
 OS_RELEASE=${OS_RELEASE:-/etc/os-release}
 
 # A pyenv shim may exist and refuse, and a Python built without its libraries breaks pandas: run it.
-is_right_python() {
-  "$1" -c 'import bz2, ctypes, lzma, sqlite3, ssl, sys
-sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
+try_python() {
+  "$1" -c 'import sys
+(3, 12) <= sys.version_info[:2] <= (3, 13) or sys.exit("it is Python %d.%d" % sys.version_info[:2])
+import bz2, ctypes, lzma, sqlite3, ssl' 2>&1
 }
+
+is_right_python() { try_python "$1" >/dev/null; }
 
 can_make_venv() { "$1" -c 'import ensurepip, venv' >/dev/null 2>&1; }
 
@@ -68,7 +71,8 @@ fetch_python() {
 # Set PYTHON, or stop.
 ensure_python() {
   if [ -n "${PYTHON:-}" ] && ! is_right_python "$PYTHON"; then
-    die "PYTHON=$PYTHON is not a complete Python 3.12 or 3.13." "Unset it, or name another one."
+    die "PYTHON=$PYTHON is not a complete Python 3.12 or 3.13: $(try_python "$PYTHON" | tail -n 1)" \
+      "Unset it, or name another one."
   fi
   PYTHON=$(find_python can_make_venv) && return
   if fetch_python; then PYTHON=$(find_python can_make_venv) && return; fi

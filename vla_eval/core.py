@@ -151,11 +151,20 @@ class TaskStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
-    """What comes back from a reset or a control step of one slot."""
+    """What comes back from a reset or a control step of one slot.
+
+    Attributes:
+        observation: what can be observed now.
+        status: what the task says of the episode so far.
+        reward: the reward of the step; 0 for a reset.
+        executed_action: (A,) the action as it was carried out: clipped to the action space, and replaced
+            by holding still while the task freezes the arm. None for a reset.
+    """
 
     observation: Observation
     status: TaskStatus
     reward: float = 0.0
+    executed_action: FloatArray | None = None
 
 
 class SimEnv(Protocol):
@@ -226,4 +235,4 @@ class StepObserver(Protocol):
         """Called with each chunk that the policy returned for the observation at `step`."""
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
-        """Called after each control step with the action that was executed."""
+        """Called after each control step with the action asked for; `result` has the executed one."""

@@ -247,6 +247,8 @@ def test_freeze_until_choice_holds_arm_and_gripper() -> None:
     for _ in range(9):
         env.step(moved)
     assert torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-3)
+    # What is recorded is what was carried out: no motion, fingers 4 cm from the middle, fully open.
+    assert torch.allclose(env.executed_action[0], torch.tensor([0.0] * 6 + [1.0]), atol=1e-2)
     for _ in range(5):
         env.step(moved)
     assert not torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-2)

@@ -244,9 +244,10 @@ class TestPython:
         assert shell("find_python can_make_venv", PYTHON=str(good)).stdout.strip() == str(good)
 
     def test_a_named_python_that_is_wrong_stops_set_up(self) -> None:
-        done = shell("ensure_python", PYTHON="/bin/true-python")
+        done = shell("ensure_python", PYTHON="/bin/no-python")
         assert done.returncode == 1
-        assert "PYTHON=/bin/true-python is not a complete Python 3.12 or 3.13." in done.stderr
+        assert "PYTHON=/bin/no-python is not a complete Python 3.12 or 3.13: " in done.stderr
+        assert "No such file" in done.stderr
 
     @pytest.mark.parametrize(
         ("release", "package"),

@@ -5,7 +5,7 @@ Intercept tasks rolls straight and is carried along once the point reaches it. N
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -122,7 +122,13 @@ class FakeEnv:
         """Execute one control step in each of the given slots; see `SimEnv`."""
         for slot, action in actions.items():
             self._advance(self._episodes[slot], np.clip(action.astype(np.float64), -1, 1))
-        return {slot: self._result(slot, render=slot in render) for slot in actions}
+        return {
+            slot: replace(
+                self._result(slot, render=slot in render),
+                executed_action=np.clip(action, -1, 1).astype(np.float32),
+            )
+            for slot, action in actions.items()
+        }
 
     def hold_action(self, slot: int) -> FloatArray:
         """Return the action that leaves point and gripper as they are."""

@@ -161,6 +161,7 @@ class ManiSkillEnv:
         self, index: int, slots: list[int], info: Any, reward: Any, render: frozenset[int]
     ) -> dict[int, StepResult]:
         env = self._envs[index]
+        executed = None if reward is None else env.executed_action
         images = _take_pictures(env, self._settings.cameras) if render.intersection(slots) else {}
         state = {
             "tcp_pose": env.agent.tcp.pose.raw_pose,
@@ -180,6 +181,7 @@ class ManiSkillEnv:
                 observation=observation,
                 status=_status(env, info, row),
                 reward=0.0 if reward is None else float(reward[row]),
+                executed_action=None if executed is None else _array(executed[row]),
             )
         return results
 

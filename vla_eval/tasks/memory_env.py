@@ -252,7 +252,9 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             given = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.device)
             frozen = self._elapsed_steps < self._response_step
             action = torch.where(frozen[:, None], self.hold_action(), given.reshape(self.num_envs, -1))
-        return super()._step_action(action)
+        executed = super()._step_action(action)
+        self.executed_action = None if executed is None else executed.clamp(-1, 1)
+        return executed
 
     # ---------------------------------------------------------------- reading
 
