@@ -3,6 +3,7 @@
 import getpass
 import json
 import platform
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -20,6 +21,8 @@ def git(folder: Path, *arguments: str) -> None:
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """A package of one committed module, in a checkout of its own."""
+    if shutil.which("git") is None:
+        pytest.skip("git is not installed")
     folder = tmp_path / "checkout" / "package"
     folder.mkdir(parents=True)
     (folder / "module.py").write_text("x = 1\n")
@@ -94,9 +97,9 @@ class TestCheckout:
 
 class TestEnvironment:
     @pytest.fixture(autouse=True)
-    def _still(self, package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Look at a checkout that nobody edits meanwhile."""
-        monkeypatch.setattr(provenance, "PACKAGE_FOLDER", package)
+    def _still(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Do not look at this checkout, which somebody may be editing."""
+        monkeypatch.setattr(provenance, "PACKAGE_FOLDER", tmp_path)
 
     def test_two_calls_give_the_same(self) -> None:
         assert collect_environment() == collect_environment()
