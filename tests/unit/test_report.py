@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -237,6 +238,21 @@ def test_runs_with_other_settings_are_never_put_together(changed: dict[str, obje
     assert [row.n_episodes for row in table.rows] == [2, 2]
     assert len({row.variant for row in table.rows}) == 2 and None not in {row.variant for row in table.rows}
     assert "| variant" in render(table, "markdown")
+
+
+def test_prompts_of_one_name_but_other_content_are_not_put_together() -> None:
+    runs = [
+        StoredRun(
+            path=run.path,
+            description=replace(run.description, recipes={"prompts/paper": digest, "policies/p": digest}),
+            records=run.records,
+        )
+        for run, digest in (
+            (stored(episodes("p", "+")), "aa"),
+            (stored(episodes("p", "-"), path="runs/b"), "bb"),
+        )
+    ]
+    assert [row.variant for row in build_table(runs).rows] == ["prompts/paper=aa", "prompts/paper=bb"]
 
 
 def test_a_variant_says_what_is_different() -> None:

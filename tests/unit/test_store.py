@@ -10,6 +10,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -424,6 +425,15 @@ def test_a_tuple_is_no_change_against_the_list_that_it_became(tmp_path: Path) ->
         pass
     with RunFolder.open(tmp_path / "r", description):
         pass
+
+
+def test_read_only_mappings_can_be_stored(tmp_path: Path) -> None:
+    frozen = MappingProxyType({"env": MappingProxyType({"delay_steps": 5})})
+    with RunFolder.open(tmp_path / "r", describe(config=frozen)):
+        pass
+    with RunFolder.open(tmp_path / "r", describe(config=frozen)):
+        pass
+    assert read_run(tmp_path / "r").description.config == {"env": {"delay_steps": 5}}
 
 
 def test_a_changed_environment_is_refused_unless_allowed_and_then_recorded(tmp_path: Path) -> None:

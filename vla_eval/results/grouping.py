@@ -19,6 +19,8 @@ VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", 
 """Fields of a configuration that move success rates and are no part of an episode's key."""
 
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
+PROMPTS = "prompts/"  # recipes of which the names begin so hold the instructions
+DIGITS = 8
 DEFAULT = "default"
 
 
@@ -94,37 +96,42 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
         Rows in the order of tasks and policies in the configurations, then by `n_action_steps`.
     """
     labels = variant_labels(runs)
-    runs_of: dict[RowKey, dict[int, list[dict[int, EpisodeRecord]]]] = defaultdict(lambda: defaultdict(list))
+    found: dict[RowKey, dict[int, list[dict[int, EpisodeRecord]]]] = defaultdict(lambda: defaultdict(list))
     n_doubles: dict[str, int] = defaultdict(int)
     further: dict[str, None] = {}
     for stored, label_of in zip(runs, labels, strict=True):
-        own: dict[tuple[RowKey, int], dict[int, EpisodeRecord]] = defaultdict(dict)
-        for record in stored.records:
-            key = RowKey(record.task, record.policy, record.n_action_steps, label_of[record.task])
-            own[key, record.run][record.seed] = record
-        for (key, index), records in own.items():
-            copies = runs_of[key][index]
+        for (key, index), records in _by_run(stored, label_of).items():
+            copies = found[key][index]
             n_copies = len(copies)
             n_new = _place(copies, records)
             if n_new < len(records):
                 n_doubles[str(stored.path)] += len(records) - n_new
-            if len(copies) > max(n_copies, 1):
+            if 0 < n_copies < len(copies):
                 further[str(stored.path)] = None
-    groups = [
-        RowGroup(
-            key=key,
-            runs=tuple(
-                Run(index=index, copy=copy, records=records)
-                for index, copies in sorted(by_index.items())
-                for copy, records in enumerate(copies)
-            ),
-        )
-        for key, by_index in runs_of.items()
-    ]
+    groups = [RowGroup(key=key, runs=_runs(by_index)) for key, by_index in found.items()]
     return Grouping(
         groups={group.key: group for group in _in_order(groups, runs)},
         n_doubles=dict(n_doubles),
         further=tuple(further),
+    )
+
+
+def _by_run(
+    stored: StoredRun, label_of: Mapping[str, str | None]
+) -> dict[tuple[RowKey, int], dict[int, EpisodeRecord]]:
+    """Return one folder's records: (row, run index) -> seed -> record."""
+    found: dict[tuple[RowKey, int], dict[int, EpisodeRecord]] = defaultdict(dict)
+    for record in stored.records:
+        key = RowKey(record.task, record.policy, record.n_action_steps, label_of[record.task])
+        found[key, record.run][record.seed] = record
+    return found
+
+
+def _runs(by_index: Mapping[int, Sequence[Mapping[int, EpisodeRecord]]]) -> tuple[Run, ...]:
+    return tuple(
+        Run(index=index, copy=copy, records=records)
+        for index, copies in sorted(by_index.items())
+        for copy, records in enumerate(copies)
     )
 
 
@@ -198,7 +205,10 @@ def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
 
 def _settings(run: StoredRun) -> dict[str, str]:
     chosen = {name: run.description.config[name] for name in VARIANT_FIELDS if name in run.description.config}
-    return {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
+    settings = {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
+    # A policy with other weights may be one more training run; another sentence is another question.
+    prompts = {name: digest for name, digest in run.description.recipes.items() if name.startswith(PROMPTS)}
+    return settings | {name: digest[:DIGITS] for name, digest in prompts.items()}
 
 
 def _task_version(run: StoredRun, task: str) -> object:

@@ -6,7 +6,7 @@ from itertools import product
 from typing import NamedTuple
 
 from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
-from vla_eval.results.grouping import Grouping, RowKey, config_names
+from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
 from vla_eval.results.run_file import leaves
 from vla_eval.results.store import StoredRun
 from vla_eval.results.table import Row
@@ -28,7 +28,12 @@ class Group(NamedTuple):
         return f"{self.policy} on {self.task}{k}"
 
 
-def interval_notes(rows: Sequence[Row]) -> list[str]:
+def row_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
+    """Say what the rows' own figures are, and where they mislead."""
+    return [*_interval_notes(rows), *_chance_notes(rows), *_tour_notes(rows, chances), *_error_notes(rows)]
+
+
+def _interval_notes(rows: Sequence[Row]) -> list[str]:
     """Say which interval is used where."""
     notes = []
     if any(row.interval == "wilson" and row.n_runs == 1 for row in rows):
@@ -73,7 +78,7 @@ def comparison_notes(
     return notes
 
 
-def chance_notes(rows: Sequence[Row]) -> list[str]:
+def _chance_notes(rows: Sequence[Row]) -> list[str]:
     """Say where the chance figures are from."""
     notes = []
     if any(row.chance_source == "cue_blind" for row in rows):
@@ -94,7 +99,7 @@ def chance_notes(rows: Sequence[Row]) -> list[str]:
     return notes
 
 
-def tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
+def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
     """Warn where success can be reached by searching instead of remembering."""
     notes = []
     for row in rows:
@@ -111,7 +116,7 @@ def tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> 
     return notes
 
 
-def error_notes(rows: Sequence[Row]) -> list[str]:
+def _error_notes(rows: Sequence[Row]) -> list[str]:
     """Say what an error is, if there are any."""
     n_errors = sum(row.n_errors for row in rows)
     if not n_errors:
@@ -216,7 +221,8 @@ def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
     for run in runs:
         for recipe, digest in run.description.recipes.items():
             digests[recipe].add(digest)
-    differing = [recipe for recipe, found in digests.items() if len(found) > 1]
+    # Other prompts are another variant, and the table has a column for that.
+    differing = [name for name, found in digests.items() if len(found) > 1 and not name.startswith(PROMPTS)]
     if not differing:
         return []
     return [

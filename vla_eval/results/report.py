@@ -47,7 +47,7 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     policies = dict.fromkeys(key.policy for key in grouping.groups)
     if baseline is not None and baseline not in policies:
         raise unknown_name("policy", baseline, policies, where="--baseline")
-    name = baseline or DEFAULT_BASELINE
+    name = DEFAULT_BASELINE if baseline is None else baseline
     comparisons = compare_with_baseline(grouping.groups, name)
     measured = {key: measure(group) for key, group in grouping.groups.items()}
     chances = {key: chance_of(key, grouping.groups, measured) for key in grouping.groups}
@@ -55,16 +55,14 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
         _row(group, measured, chance=chances[key], comparison=comparisons.get(key))
         for key, group in grouping.groups.items()
     ]
+    table_notes = (
+        *notes.row_notes(rows, chances),
+        *notes.comparison_notes(rows, comparisons, name),
+        *notes.run_notes(runs, grouping),
+    )
     return Table(
         rows=tuple(rows),
-        notes=(
-            *notes.interval_notes(rows),
-            *notes.comparison_notes(rows, comparisons, name),
-            *notes.chance_notes(rows),
-            *notes.tour_notes(rows, chances),
-            *notes.error_notes(rows),
-            *notes.run_notes(runs, grouping),
-        ),
+        notes=table_notes,
         baseline=name if name in policies else None,
         n_comparisons=len(comparisons),
         runs={str(run.path): run.description.name for run in runs},

@@ -11,7 +11,6 @@ Knows nothing of tasks, policies or statistics.
 import errno
 import json
 import logging
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -19,13 +18,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vla_eval.errors import RunFolderError, did_you_mean
+from vla_eval.errors import RunFolderError
 from vla_eval.results.durable import FolderLock, LineFile, storage_full, sync_folder
 from vla_eval.results.episodes_file import cut_tail, parse_records, repair_records, shown_key
+from vla_eval.results.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, make_folder, not_a_run_folder
 from vla_eval.results.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.results.run_file import (
     DEVICE,
-    RUN_FILE,
     Change,
     JsonValue,
     RunDescription,
@@ -39,11 +38,6 @@ __all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "
 
 logger = logging.getLogger(__name__)
 
-EPISODES_FILE = "episodes.jsonl"
-TIMINGS_FILE = "timings.jsonl"
-LOCK_FILE = "run.lock"
-# What a process that was killed before it wrote run.json may have left behind.
-UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
@@ -100,7 +94,7 @@ class RunFolder:
             StorageFullError: the disk is full.
         """
         try:
-            _make_folder(path)
+            make_folder(path)
             lock = FolderLock(path / LOCK_FILE)
             try:
                 folder = cls(path, description, allow_environment_change=allow_environment_change)
@@ -234,7 +228,7 @@ def read_run(path: Path) -> StoredRun:
         run_file = RunFile.load(path)
         data = (path / EPISODES_FILE).read_bytes() if (path / EPISODES_FILE).exists() else b""
     except (FileNotFoundError, NotADirectoryError) as exc:
-        raise _not_a_run_folder(path) from exc
+        raise not_a_run_folder(path) from exc
     except OSError as exc:
         raise RunFolderError(f"{path}: cannot be read ({exc.strerror or exc}).") from exc
     # What follows the last newline is being written at this moment, or was when its writer was killed.
@@ -249,44 +243,3 @@ def read_run(path: Path) -> StoredRun:
 
 def _without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
     return {name: value for name, value in environment.items() if name != DEVICE}
-
-
-def _make_folder(path: Path) -> None:
-    """Make the folder, or raise `RunFolderError` if it is there and somebody else's."""
-    if path.exists() and not path.is_dir():
-        raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
-    path.mkdir(parents=True, exist_ok=True)
-    names = set(os.listdir(path))
-    if RUN_FILE in names or names <= UNSTARTED:
-        return
-    if EPISODES_FILE in names:
-        raise RunFolderError(
-            f"{path}: holds {EPISODES_FILE} but no {RUN_FILE}, so nobody knows what its episodes are. "
-            f"Restore {RUN_FILE} or use another --out."
-        )
-    others = sorted(names - UNSTARTED)
-    shown = ", ".join(others[:3]) + (", …" if len(others) > 3 else "")
-    raise RunFolderError(
-        f"{path}: holds other files ({shown}) and no {RUN_FILE}: it is not a run folder, and nothing is "
-        f"written into it. Use another --out."
-    )
-
-
-def _not_a_run_folder(path: Path) -> RunFolderError:
-    inside = _run_folders(path)
-    if inside:
-        shown = " ".join(str(path / name) for name in inside[:5])
-        return RunFolderError(f"{path}: is not a run folder, but holds some. Name them: {shown}")
-    what = f"has no {RUN_FILE}" if path.exists() else "does not exist"
-    siblings = _run_folders(path.parent)
-    known = f" Run folders in {path.parent}: {', '.join(siblings[:10])}." if siblings else ""
-    return RunFolderError(
-        f"{path}: is not a run folder: it {what}.{did_you_mean(path.name, siblings)}{known} "
-        f"`mikasa-vla eval` makes one."
-    )
-
-
-def _run_folders(folder: Path) -> list[str]:
-    if not folder.is_dir():
-        return []
-    return sorted(entry.name for entry in folder.iterdir() if (entry / RUN_FILE).is_file())
