@@ -170,6 +170,23 @@ def test_unseeded_resets_give_different_episodes() -> None:
     assert not torch.equal(layouts[1], layouts[2])
 
 
+def test_the_same_seeds_have_independent_answers_in_different_tasks() -> None:
+    """Or the luck of a blind arm would repeat from task to task."""
+
+    def answers(task: str) -> list[int]:
+        env = make(task)
+        found = []
+        for seed in range(1, 41):
+            env.reset(seed=[seed])
+            found.append(int(env.target_index()[0]))
+        return found
+
+    three, shells = answers("RememberColor3-v0"), answers("ShellGameTouch-v0")
+    # Independent uniform answers agree in 40/3 ± 3 of 40 episodes; the bound is five deviations away.
+    assert sum(a == b for a, b in zip(three, shells, strict=True)) < 28
+    assert set(three) == set(shells) == {0, 1, 2}
+
+
 def test_infos_of_earlier_steps_keep_their_values() -> None:
     env = make("RememberColor3-v0")
     _, early = env.reset(seed=[1])

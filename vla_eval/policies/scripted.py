@@ -12,6 +12,7 @@ plan a whole chunk open loop from what they see at one inference. Nothing here i
 """
 
 import importlib
+import zlib
 from collections.abc import Sequence
 from typing import Literal, Protocol, cast
 
@@ -87,9 +88,10 @@ class _Scripted:
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Seed each episode's generator by its seed and run."""
+        """Seed each episode's generator by its task, seed and run."""
         for episode in episodes:
-            self._rng[episode.slot] = generator(episode.seed, Stream.POLICY, episode.run)
+            task_key = zlib.crc32(episode.task.encode())  # else luck would be the same luck in every task
+            self._rng[episode.slot] = generator(episode.seed, Stream.POLICY, task_key, episode.run)
 
     def _privileged(self, window: ObservationWindow) -> PrivilegedState:
         state = window.last.privileged

@@ -53,6 +53,7 @@ class InterceptEnv(MemoryTableEnv):
     """
 
     MAX_REWARD = 30.0
+    FAMILY = 3
 
     def __init__(
         self,

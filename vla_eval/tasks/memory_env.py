@@ -78,6 +78,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     SUPPORTED_ROBOTS = _robots.ROBOT_UIDS
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     MAX_REWARD: float
+    FAMILY: int
+    """Number of the task family in random streams. Part of every result: never renumber, only add."""
     HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
     HUMAN_CAMERA_TARGET: tuple[float, float, float] = (-0.3, 0.0, 0.0)
 
@@ -173,7 +175,15 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
 
     def episode_generator(self, env: int, stream: Stream) -> np.random.Generator:
         """Return the generator of one purpose of the episode that runs in parallel environment `env`."""
-        return generator(int(self._episode_seed[env]), stream)
+        return generator(int(self._episode_seed[env]), stream, *self.stream_key())
+
+    def stream_key(self) -> tuple[int, ...]:
+        """Return numbers that tell this task's draws from another's.
+
+        Without them the same seed would have the same answer in every task with as many candidates, and
+        the luck of a blind arm would be the same luck in all of them.
+        """
+        return (self.FAMILY,)
 
     # ---------------------------------------------------------------- phases
 

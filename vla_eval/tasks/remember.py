@@ -105,6 +105,7 @@ class RememberColorEnv(ChoiceEnv):
     """
 
     MAX_REWARD = 3.0
+    FAMILY = 1
     REACH_SCALE_PER_M = 10.0
     SLOWING_WEIGHT = 0.5
     RESTING_WEIGHT = 0.5
@@ -115,6 +116,10 @@ class RememberColorEnv(ChoiceEnv):
             raise TaskArgumentError(f"n_items={n_items!r}: expected 2 to {len(COLORS)}, one per colour.")
         self.n_items = n_items
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
+
+    def stream_key(self) -> tuple[int, ...]:
+        """Return the family's number and how many items there are."""
+        return (self.FAMILY, self.n_items)
 
     def _load_items(self) -> None:
         self.candidates = [

@@ -48,6 +48,7 @@ class ShellGameTouchEnv(ChoiceEnv):
     """
 
     MAX_REWARD = 3.0
+    FAMILY = 2
     REACH_SCALE_PER_M = 5.0
     HUMAN_CAMERA_EYE = (0.6, 0.7, 0.6)
     HUMAN_CAMERA_TARGET = (0.0, 0.0, 0.15)
