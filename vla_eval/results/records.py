@@ -94,7 +94,8 @@ class EpisodeRecord:
 
     def to_json(self) -> str:
         """Return the record as one line of JSON, without the line's end."""
-        return json.dumps({"record_version": RECORD_VERSION, **asdict(self)}, ensure_ascii=False, allow_nan=False)
+        data = {"record_version": RECORD_VERSION, **asdict(self)}
+        return json.dumps(data, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_json(cls, line: str, *, where: str) -> Self:
