@@ -33,6 +33,10 @@ class InvalidActionError(VlaEvalError):
     """A policy returned actions of a wrong shape or type, or with values that are not finite."""
 
 
+class SimulationError(VlaEvalError):
+    """The simulator gave a state or a reward that is not finite."""
+
+
 class MissingInstructionError(VlaEvalError):
     """A task has no language instruction where one is needed."""
 

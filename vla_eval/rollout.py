@@ -23,7 +23,7 @@ from vla_eval.core import (
     StepObserver,
     StepResult,
 )
-from vla_eval.errors import InvalidActionError, MissingInstructionError
+from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
 from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, PolicySpec, check_compatible
@@ -205,6 +205,7 @@ def _account(
 ) -> None:
     """Take down what one control step brought."""
     episode.n_steps += 1
+    _check_result(episode, result)
     episode.result = result
     episode.window.append(result.observation)
     episode.episode_return += result.reward
@@ -218,6 +219,17 @@ def _account(
         or result.status.fail
         or (settings.stop_at_success and result.status.success)
     )
+
+
+def _check_result(episode: _Episode, result: StepResult) -> None:
+    """Raise `SimulationError` unless reward and states are finite."""
+    values = {"reward": np.asarray(result.reward), **result.observation.state}
+    for name, value in values.items():
+        if not np.isfinite(value).all():
+            raise SimulationError(
+                f"{episode.start.task}, seed {episode.start.seed}, step {episode.n_steps}: expected a finite "
+                f"'{name}', found {value}. The simulation diverged; please report the seed and the policy."
+            )
 
 
 def _digest_state(episode: _Episode, result: StepResult) -> None:

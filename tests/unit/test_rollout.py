@@ -17,7 +17,12 @@ from vla_eval.core import (
 )
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import InvalidActionError, MissingInstructionError, SpecMismatchError
+from vla_eval.errors import (
+    InvalidActionError,
+    MissingInstructionError,
+    SimulationError,
+    SpecMismatchError,
+)
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
@@ -289,6 +294,21 @@ class TestRefusals:
 
         with pytest.raises(MissingInstructionError, match=f"{TASK}, seed 1: the instruction is empty"):
             rollout(env_for(policy), policy, [start(instruction=" ")], settings)
+
+    def test_a_simulation_that_diverged_is_no_failure_of_the_policy(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        policy = Pusher()
+        env = env_for(policy)
+        plain_step = env.step
+
+        def diverging(actions: Any, *, render: frozenset[int]) -> Any:
+            results = plain_step(actions, render=render)
+            return {slot: dataclasses.replace(r, reward=float("nan")) for slot, r in results.items()}
+
+        monkeypatch.setattr(env, "step", diverging)
+        with pytest.raises(SimulationError, match="seed 1, step 1: expected a finite 'reward', found nan"):
+            run(policy, env=env)
 
     def test_a_camera_that_is_not_there_is_refused_with_the_closest_name(self) -> None:
         policy = Pusher(cameras=("wrist_camera",))
