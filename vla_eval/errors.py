@@ -69,6 +69,10 @@ class TooManyErrorsError(VlaEvalError):
     """A run was stopped because episode after episode ended in an error."""
 
 
+class DatasetError(VlaEvalError):
+    """A dataset is damaged, incomplete, or not of a form that is understood."""
+
+
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 

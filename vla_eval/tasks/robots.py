@@ -17,17 +17,12 @@ from mani_skill import PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 
+from vla_eval.cache import cache_dir
 from vla_eval.core import FloatArray
 
 GRID_M = 0.0015  # finer than a pixel of the base camera at the arm, about 8 mm
 _PANDA_DIR = Path(PACKAGE_ASSET_DIR) / "robots" / "panda"
 _CAMERA_MESH = "realsense2_description/meshes/d415.stl"
-
-
-def cache_dir() -> Path:
-    """Return the user's cache folder of this package (`$XDG_CACHE_HOME` or `~/.cache`)."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "mikasa-vla-eval"
 
 
 def snap_to_grid(triangles: FloatArray, grid_m: float) -> FloatArray:

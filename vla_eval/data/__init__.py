@@ -1,0 +1,1 @@
+"""Demonstration datasets: record, replay, convert, describe, share, load."""
