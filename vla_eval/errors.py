@@ -73,6 +73,10 @@ class DatasetError(VlaEvalError):
     """A dataset is damaged, incomplete, or not of a form that is understood."""
 
 
+class RecordingError(VlaEvalError):
+    """Demonstrations could not be recorded: an expert that fails, a worker that dies, states that differ."""
+
+
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 

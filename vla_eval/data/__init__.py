@@ -1,1 +1,1 @@
-"""Demonstration datasets: record, replay, convert, describe, share, load."""
+"""Datasets of demonstrations: record, check, replay. What is on the disk: `features`, `manifest`."""

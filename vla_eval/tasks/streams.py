@@ -20,6 +20,7 @@ class Stream(IntEnum):
     PHASES = 5
     MOTION = 6
     POLICY = 7
+    NOISE = 8
 
 
 def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:

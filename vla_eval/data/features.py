@@ -1,0 +1,143 @@
+"""What a frame of a demonstration holds: names, shapes, dimensions, and how it is computed.
+
+Numpy only: it knows nothing of lerobot, which is handed `dataset_features()` as plain data, nor of
+simulators, whose observation it takes as `core.Observation`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from vla_eval.core import FloatArray, StepResult
+from vla_eval.errors import RecipeError
+
+FPS = 20  # control steps per second; every frame is one control step
+
+CAMERA_KEYS = {"base_camera": "observation.images.base", "hand_camera": "observation.images.wrist"}
+"""Camera of the environment -> field of the dataset."""
+IMAGE_SHAPE = (128, 128, 3)  # height, width, channels
+
+STATE_KEY = "observation.state"
+ACTION_KEY = "action"
+REWARD_KEY, SUCCESS_KEY, DONE_KEY = "next.reward", "next.success", "next.done"
+
+StateKind = Literal["eef", "joints"]
+PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.joints"}
+"""Both kinds are always stored. lerobot takes as inputs only what begins with `observation`."""
+
+ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
+    # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
+    # ±π for a gripper that points down, and unlike a quaternion, which may flip its sign.
+    "eef": ("x", "y", "z", "r11", "r21", "r31", "r12", "r22", "r32", "gripper_width"),
+    # The paper's 25 numbers: pose of the tool centre point, joint positions, joint velocities.
+    "joints": (
+        *("x", "y", "z", "qw", "qx", "qy", "qz"),
+        *(f"joint{i}" for i in range(1, 8)),
+        *("finger1", "finger2"),
+        *(f"joint{i}_velocity" for i in range(1, 8)),
+        *("finger1_velocity", "finger2_velocity"),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderSettings:
+    """How frames become video. Defaults keep colours: no chroma subsampling, about 40 dB.
+
+    Attributes:
+        vcodec: codec as lerobot names it.
+        pix_fmt: `yuv444p` keeps the colour of every pixel; `yuv420p` caps quality at about 34 dB.
+        crf: quality; lower is better and larger.
+        g: a key frame every so many frames; small, since training reads frames at random.
+    """
+
+    vcodec: str = "h264"
+    pix_fmt: str = "yuv444p"
+    crf: int = 12
+    g: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the ranges; whether the codec knows the format is lerobot's to say."""
+        if self.crf < 0 or self.g < 1:
+            raise RecipeError(f"encoder: crf is {self.crf}, g is {self.g}; expected crf ≥ 0 and g ≥ 1.")
+
+
+def dataset_features(state: StateKind) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
+    """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them.
+
+    Args:
+        state: which proprioception `observation.state` is.
+    """
+
+    def vector(names: tuple[str, ...]) -> dict[str, Any]:  # Any: as above
+        return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+
+    def scalar(dtype: str, name: str) -> dict[str, Any]:  # Any: as above
+        return {"dtype": dtype, "shape": (1,), "names": [name]}
+
+    image = {"dtype": "video", "shape": IMAGE_SHAPE, "names": ["height", "width", "channels"]}
+    return {
+        **{key: dict(image) for key in CAMERA_KEYS.values()},
+        STATE_KEY: vector(STATE_NAMES[state]),
+        ACTION_KEY: vector(ACTION_NAMES),
+        **{key: vector(STATE_NAMES[kind]) for kind, key in PROPRIO_KEYS.items()},
+        REWARD_KEY: scalar("float32", "reward"),
+        SUCCESS_KEY: scalar("bool", "success"),
+        DONE_KEY: scalar("bool", "done"),
+    }
+
+
+def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArray]:
+    """Return both kinds of proprioception of an observation.
+
+    Args:
+        state: `tcp_pose` (7,) position in m and wxyz quaternion, world frame; `qpos` (9,), `qvel` (9,).
+
+    Returns:
+        `eef` (10,) and `joints` (25,), float32; see `STATE_NAMES`.
+    """
+    pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
+    columns = rotation_columns(pose[3:])
+    width_m = qpos[-2:].sum(keepdims=True)
+    return {
+        "eef": np.concatenate([pose[:3], columns, width_m]).astype(np.float32),
+        "joints": np.concatenate([pose, qpos, qvel]).astype(np.float32),
+    }
+
+
+def rotation_columns(quaternion_wxyz: FloatArray) -> FloatArray:
+    """Return (6,): the first two columns of the rotation matrix, one after the other.
+
+    Source: Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks".
+    """
+    w, x, y, z = quaternion_wxyz.astype(np.float64) / np.linalg.norm(quaternion_wxyz.astype(np.float64))
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    second = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    return np.array([*first, *second], dtype=np.float32)
+
+
+def frame_values(
+    before: StepResult, after: StepResult, *, action: FloatArray, state: StateKind, is_last: bool
+) -> dict[str, Any]:  # Any: arrays of several types
+    """Return one frame as `LeRobotDataset.add_frame` takes it, without the task string.
+
+    Args:
+        before: what was observed before the action; it has images of all cameras.
+        after: what came of the action.
+        action: (7,) the action to store.
+        state: which proprioception `observation.state` is.
+        is_last: whether this is the last frame of the episode.
+    """
+    kinds = proprioception(before.observation.state)
+    return {
+        **{key: before.observation.images[camera] for camera, key in CAMERA_KEYS.items()},
+        STATE_KEY: kinds[state],
+        ACTION_KEY: action.astype(np.float32),
+        **{key: kinds[kind] for kind, key in PROPRIO_KEYS.items()},
+        REWARD_KEY: np.array([after.reward], dtype=np.float32),
+        SUCCESS_KEY: np.array([after.status.success]),
+        DONE_KEY: np.array([is_last]),
+    }
