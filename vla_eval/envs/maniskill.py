@@ -223,7 +223,9 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
         if issubclass(ancestor, MemoryTableEnv):
             parameters = inspect.signature(ancestor.__init__).parameters.values()
             known |= {p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
-    known.discard("robot_uids")  # chosen by the render option `wrist_mesh`
+    # The arm is chosen by the render option `wrist_mesh`, the sentence by the prompt set; and an episode
+    # that depends on those before it is nothing to ask for.
+    known -= {"robot_uids", "instruction", "reconfiguration_freq"}
     for name in kwargs:
         if name not in known:
             raise unknown_name("argument", name, known, where=task)
