@@ -1,0 +1,33 @@
+"""The example of `docs/policies.md`, word for word."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_example_policy_passes_the_check_and_is_evaluated(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "policies.md").read_text()
+    policy, check = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (recipe,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "my_policy.py").write_text(policy)
+    (tmp_path / "my_policy.yaml").write_text(recipe)
+    (tmp_path / "check.py").write_text(check)
+    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    run("check.py")
+    table = run(
+        "-m", "vla_eval.cli", "eval", "--task", "RememberColor3-v0", "--policy", "my_policy.yaml",
+        "--n-action-steps", "4", "8", "--episodes", "2", "--workers", "1", "--out", str(tmp_path / "run"),
+        "--set", "simulator=fake", "--format", "csv",
+    )  # fmt: skip
+    assert table.count("my_policy") == 2
