@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from vla_eval.core import EpisodeStart, Policy, SimEnv, Stage
 from vla_eval.envs.factory import describe_device, make_env
@@ -129,6 +129,16 @@ def write_stage(shared: SharedStage, stage: Stage, now: float) -> None:
     shared[1] = STAGES.index(stage)
 
 
+class Runner(Protocol):
+    """What answers the jobs of a worker."""
+
+    def answer(self, job: Any) -> object:  # Any: what the parent sends
+        """Do the job; whatever goes wrong becomes a `Failed`."""
+
+    def close(self) -> None:
+        """Release the simulator."""
+
+
 class EpisodeRunner:
     """Runs episodes, keeping environment and policy between those of one group."""
 
@@ -156,7 +166,7 @@ class EpisodeRunner:
             return self._run(env, policy, job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
             logger.exception("%s, stage %s", job.key, self._heartbeat.stage)
-            return Failed(error=_describe(exc, self._heartbeat.stage), refused=refused)
+            return Failed(error=describe_error(exc, self._heartbeat.stage), refused=refused)
 
     def close(self) -> None:
         """Release the simulator."""
@@ -184,7 +194,7 @@ class EpisodeRunner:
             self._loaded = self._policy = None  # first, so that two policies are never loaded at once
             facts = self._describe_env(job)
             self._heartbeat("setup")
-            policy = _make_policy(group, facts)
+            policy = make_policy(group, facts)
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
@@ -219,7 +229,12 @@ class EpisodeRunner:
         return self._env
 
 
-def _make_policy(group: Group, facts: EnvFacts) -> Policy:
+def make_policy(group: Group, facts: EnvFacts) -> Policy:
+    """Make the policy of a group.
+
+    Raises:
+        RecipeError: the adapter does not take the recipe's arguments.
+    """
     factory = policy_factory(group.adapter)
     context = PolicyContext(
         name=group.key.policy,
@@ -237,7 +252,8 @@ def _make_policy(group: Group, facts: EnvFacts) -> Policy:
     return factory(context, **group.args)
 
 
-def _describe(exc: BaseException, stage: Stage) -> EpisodeError:
+def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
+    """Return what is told of an exception."""
     return EpisodeError(
         kind=type(exc).__name__,
         stage=stage,
@@ -247,9 +263,14 @@ def _describe(exc: BaseException, stage: Stage) -> EpisodeError:
 
 
 def worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
-    """Serve the parent until it closes the pipe; the entry point of the worker process."""
-    _detach(log, parent_pid)
+    """Run episodes for the parent until it closes the pipe; the entry point of the worker process."""
+    detach(log, parent_pid)
     runner = EpisodeRunner(Heartbeat(shared), connection.send)
+    serve(connection, runner)
+
+
+def serve(connection: Connection, runner: Runner) -> None:
+    """Answer one job after the other until the parent closes the pipe."""
     try:
         while True:
             connection.send(runner.answer(connection.recv()))
@@ -257,7 +278,7 @@ def worker_main(connection: Connection, shared: SharedStage, log: Path, parent_p
         runner.close()  # the parent is done with us, or gone
 
 
-def _detach(log: Path, parent_pid: int) -> None:
+def detach(log: Path, parent_pid: int) -> None:
     """Send all output to the log, die with the parent, and leave its signals to the parent."""
     os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
     signal.signal(signal.SIGINT, signal.SIG_IGN)

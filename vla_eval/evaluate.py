@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vla_eval import errors
-from vla_eval.episode_worker import DeviceFound, Failed
+from vla_eval.episode_worker import DeviceFound, Failed, Finished, worker_main
 from vla_eval.errors import TooManyErrorsError, VlaEvalError
 from vla_eval.plan import (
     EpisodeJob,
@@ -151,7 +151,8 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
     logs = bookkeeper.path / "logs"
     logs.mkdir(exist_ok=True)
     config = bookkeeper.config
-    with WorkerPool(size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
+    new_pool = WorkerPool[EpisodeJob, Finished]
+    with new_pool(worker_main, size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
         for event in pool.run(queue):
             if isinstance(event, Answered):
                 bookkeeper.take(event)
@@ -175,13 +176,13 @@ class _Bookkeeper:
     n_consecutive_errors: int = 0
     proven: set[GroupKey] = field(default_factory=set)  # groups with an episode that ran to its end
 
-    def take(self, answered: Answered) -> None:
+    def take(self, answered: Answered[EpisodeJob, Finished]) -> None:
         """Store a result, or the error in its place."""
         job, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
             # What has worked before and now does not is no mistake of the user's: a GPU was lost, say.
             if answer.refused and job.group.key not in self.proven:
-                raise _as_exception(answer.error)
+                raise as_exception(answer.error)
             self._take_error(job, answer.error)
             return
         self.folder.append(answer.record, answer.timing)
@@ -205,7 +206,7 @@ class _Bookkeeper:
             )
 
 
-def _as_exception(error: EpisodeError) -> VlaEvalError:
+def as_exception(error: EpisodeError) -> VlaEvalError:
     """Return the worker's exception again; a class of another package becomes its nearest one of ours."""
     cls = getattr(errors, error.kind, VlaEvalError)
     return (

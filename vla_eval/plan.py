@@ -7,7 +7,7 @@ found here, before the first episode. Knows nothing of processes or files of res
 import hashlib
 import json
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -63,6 +63,11 @@ class EpisodeJob:
     def key(self) -> EpisodeKey:
         """The identity of the episode within its run folder."""
         return EpisodeKey(*self.group.key, self.run, self.seed)
+
+    @property
+    def setup_key(self) -> GroupKey:
+        """Jobs with the same one can be run with the same environment and policy."""
+        return self.group.key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +177,7 @@ class JobQueue:
         """How many jobs have not been handed out."""
         return len(self._heads) + sum(len(jobs) for jobs in self._rest.values())
 
-    def take(self, loaded: GroupKey | None, *, taken: Collection[GroupKey] = ()) -> EpisodeJob | None:
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> EpisodeJob | None:
         """Return the next job for a worker, or None if there is no more.
 
         Args:
@@ -185,8 +190,7 @@ class JobQueue:
         if not waiting:
             return None
         free = [key for key in waiting if key not in taken]
-        chosen = loaded if loaded in waiting else (free or waiting)[0]
-        assert chosen is not None  # `loaded in waiting` holds no None
+        chosen = next((key for key in waiting if key == loaded), (free or waiting)[0])
         return self._rest[chosen].popleft()
 
 

@@ -38,11 +38,13 @@ class RolloutSettings:
         eager_rendering: render every frame also for a policy that reads only the last one. Changes no
             result; for checking exactly that.
         stop_at_success: end an episode at its first success; success_at_end is then unknown.
+        steps_after_success: with `stop_at_success`, go on for so many control steps.
     """
 
     chunking: ChunkingSpec
     eager_rendering: bool = False
     stop_at_success: bool = False
+    steps_after_success: int = 0
 
 
 @dataclass(slots=True, kw_only=True)
@@ -214,10 +216,12 @@ def _account(
     _digest_state(episode, result)
     if result.status.success and episode.success_step is None:
         episode.success_step = episode.n_steps
+    stops = settings.stop_at_success and episode.success_step is not None
+    since_success = episode.n_steps - (episode.success_step or 0)
     episode.done = (
         episode.n_steps >= episode.start.horizon_steps
         or result.status.fail
-        or (settings.stop_at_success and result.status.success)
+        or (stops and since_success >= settings.steps_after_success)
     )
 
 

@@ -2,7 +2,8 @@
 
 A worker that is busy with one thing for too long is asked where it hangs and then killed; one that
 dies is replaced; both give an `EpisodeError` with the cause. Knows nothing of environments, policies
-or files of results: the inside of a worker is `vla_eval.episode_worker`.
+or files of results, nor of what a job is: the inside of a worker is `vla_eval.episode_worker`, or
+`vla_eval.data.recording_worker`.
 """
 
 import contextlib
@@ -11,13 +12,13 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from vla_eval.core import Stage
 from vla_eval.episode_worker import (
@@ -25,12 +26,9 @@ from vla_eval.episode_worker import (
     STAGES,
     DeviceFound,
     Failed,
-    Finished,
     SharedStage,
-    worker_main,
     write_stage,
 )
-from vla_eval.plan import EpisodeJob, GroupKey, JobQueue
 from vla_eval.recipes import TimeoutConfig
 from vla_eval.results.records import EpisodeError
 
@@ -45,16 +43,38 @@ WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 logger = logging.getLogger(__name__)
 
 
+class Job(Protocol):
+    """What a worker can be told to do; it is sent to it by pickle."""
+
+    @property
+    def setup_key(self) -> Hashable:
+        """Jobs with the same one need the same preparation, which a worker keeps."""
+
+
+class JobSource[J: Job](Protocol):
+    """Where jobs come from; `JobQueue` is one."""
+
+    def __len__(self) -> int:
+        """How many jobs can be handed out now."""
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
+        """Return the next job for a worker that has `loaded` at hand, while others have `taken`."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answered:
+class Answered[J: Job, A]:
     """What came of one job."""
 
-    job: EpisodeJob
-    answer: Finished | Failed
+    job: J
+    answer: A | Failed
+
+
+WorkerMain = Callable[[Connection, SharedStage, Path, int], None]
+"""Entry point of a worker process: pipe, shared memory for its stage, its log, process id of the parent."""
 
 
 @dataclass(slots=True, kw_only=True)
-class _Worker:
+class _Worker[J: Job]:
     """One process and what it was given to do."""
 
     index: int
@@ -62,22 +82,24 @@ class _Worker:
     connection: Connection
     shared: SharedStage
     log: Path
-    job: EpisodeJob | None = None
-    loaded: GroupKey | None = None
+    job: J | None = None
+    loaded: Hashable | None = None
     log_offset: int = 0  # where the log of the present job begins
 
 
-class WorkerPool:
+class WorkerPool[J: Job, A]:
     """Some worker processes; a context manager that leaves none behind.
 
     Args:
+        main: what a process runs: it answers each job `J` by an `A` or a `Failed`.
         size: how many processes at most.
         timeouts: how long a worker may be busy with one thing.
         logs: folder for what the workers write to standard output and error.
     """
 
-    def __init__(self, *, size: int, timeouts: TimeoutConfig, logs: Path) -> None:
+    def __init__(self, main: WorkerMain, *, size: int, timeouts: TimeoutConfig, logs: Path) -> None:
         """Start nothing yet: processes start when there is work for them."""
+        self._main = main
         self._size = size
         self._limits: dict[Stage, float] = {
             "setup": timeouts.setup_seconds,
@@ -87,7 +109,7 @@ class WorkerPool:
         }
         self._logs = logs
         self._context = multiprocessing.get_context("spawn")
-        self._workers: dict[int, _Worker] = {}
+        self._workers: dict[int, _Worker[J]] = {}
 
     def __enter__(self) -> Self:
         """Return the pool."""
@@ -106,7 +128,7 @@ class WorkerPool:
         for worker in list(self._workers.values()):
             self._end(worker)
 
-    def run(self, queue: JobQueue) -> Iterator[Answered | DeviceFound | None]:
+    def run(self, queue: JobSource[J]) -> Iterator[Answered[J, A] | DeviceFound | None]:
         """Run all jobs of the queue; yields answers as they come, and None on every tick."""
         while True:
             self._hand_out(queue)
@@ -118,7 +140,7 @@ class WorkerPool:
                 yield from self._look_at(worker)
             yield None
 
-    def _hand_out(self, queue: JobQueue) -> None:
+    def _hand_out(self, queue: JobSource[J]) -> None:
         for index in range(self._size):
             worker = self._workers.get(index)
             if (worker is not None and worker.job is not None) or not len(queue):
@@ -130,34 +152,34 @@ class WorkerPool:
             job = queue.take(worker.loaded if worker else None, taken=taken)
             assert job is not None  # the queue was not empty
             worker = worker or self._start(index)
-            worker.job, worker.loaded = job, job.group.key
+            worker.job, worker.loaded = job, job.setup_key
             worker.log_offset = worker.log.stat().st_size if worker.log.exists() else 0
             write_stage(worker.shared, "setup", time.monotonic())
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it died: `_look_at` says so
                 worker.connection.send(job)
 
-    def _start(self, index: int) -> _Worker:
+    def _start(self, index: int) -> _Worker[J]:
         ours, theirs = self._context.Pipe()
         shared: SharedStage = self._context.RawArray("d", 2)
         log = self._logs / f"worker-{index}.log"
         process = self._context.Process(
-            target=worker_main, args=(theirs, shared, log, os.getpid()), name=f"mikasa-vla worker {index}"
+            target=self._main, args=(theirs, shared, log, os.getpid()), name=f"mikasa-vla worker {index}"
         )
         with _worker_environment():
             process.start()
         theirs.close()  # else its end would not be seen as an end of file
-        worker = _Worker(index=index, process=process, connection=ours, shared=shared, log=log)
+        worker = _Worker[J](index=index, process=process, connection=ours, shared=shared, log=log)
         self._workers[index] = worker
         return worker
 
-    def _look_at(self, worker: _Worker) -> Iterator[Answered | DeviceFound]:
+    def _look_at(self, worker: _Worker[J]) -> Iterator[Answered[J, A] | DeviceFound]:
         """Take what a busy worker has said; then see whether it is alive, and in time."""
         job = worker.job
         assert job is not None  # only busy ones are looked at
         is_alive = worker.process.is_alive()  # before reading: what a dead one has said is then all there
         try:
             while worker.job is not None and worker.connection.poll():
-                message: Finished | Failed | DeviceFound = worker.connection.recv()
+                message: A | Failed | DeviceFound = worker.connection.recv()
                 if isinstance(message, DeviceFound):
                     yield message
                     continue
@@ -174,7 +196,7 @@ class WorkerPool:
             worker.job = None
             yield Answered(job=job, answer=Failed(error=error, refused=False))
 
-    def _crash(self, worker: _Worker) -> EpisodeError:
+    def _crash(self, worker: _Worker[J]) -> EpisodeError:
         stage = _stage(worker.shared).stage
         worker.process.join(REAP_SECONDS)  # the pipe may close a moment before the process is gone
         cause = _cause_of_death(worker.process.exitcode)
@@ -187,7 +209,7 @@ class WorkerPool:
             details=_tail(worker),
         )
 
-    def _overtime(self, worker: _Worker) -> EpisodeError | None:
+    def _overtime(self, worker: _Worker[J]) -> EpisodeError | None:
         """Return the error if the worker has been busy with one thing for too long, and kill it."""
         busy = _stage(worker.shared)
         limit_seconds = self._limits[busy.stage]
@@ -206,7 +228,7 @@ class WorkerPool:
             details=_tail(worker),
         )
 
-    def _end(self, worker: _Worker) -> None:
+    def _end(self, worker: _Worker[J]) -> None:
         """Kill the process and whatever it has started."""
         if worker.process.pid is not None:
             # It leads a session of its own as soon as it has started; until then killpg finds nothing.
@@ -234,7 +256,7 @@ def _stage(shared: SharedStage) -> _Busy:
     return _Busy(stage=stage, since=shared[0])
 
 
-def _tail(worker: _Worker) -> str | None:
+def _tail[J: Job](worker: _Worker[J]) -> str | None:
     """Return the end of what the worker has written since it was given its job."""
     try:
         with worker.log.open("rb") as log:

@@ -243,6 +243,12 @@ class TestOutcome:
         assert stopped.n_steps == stopped.success_step == whole.success_step
         assert stopped.success_at_end is None
 
+    def test_steps_after_success_are_executed_before_the_episode_stops(self) -> None:
+        stopped = run(Reacher(privileged=True), stop_at_success=True, steps_after_success=3)
+
+        assert stopped.success_step is not None
+        assert stopped.n_steps == stopped.success_step + 3
+
     def test_a_failure_has_no_success_step_and_no_choice(self) -> None:
         record = run(Fixed(ActionChunk(actions=np.zeros((2, 7), dtype=np.float32))))
 
