@@ -8,8 +8,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # added to speed up tests. A local label such as +cpu names a build, not a version: any build may do.
 {
   echo "# The versions this repository was tested with, with Python 3.12. Written by scripts/lock.sh."
-  .venv/bin/python -m pip freeze --exclude-editable --exclude opencv-python --exclude mikasa-vla-eval \
-    --exclude pytest-xdist --exclude execnet |
+  .venv/bin/python -m pip list --format=freeze --exclude-editable --exclude opencv-python --exclude mikasa-vla-eval \
+    --exclude pip --exclude pytest-xdist --exclude execnet |
     sed -E 's/^([A-Za-z0-9._-]+==[^+]+)\+.*$/\1/' | grep -E '^[A-Za-z0-9._-]+==' | LC_ALL=C sort -f
 } >constraints.txt.tmp
 mv constraints.txt.tmp constraints.txt
