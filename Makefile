@@ -26,6 +26,7 @@ lint: setup  ## ruff and mypy --strict
 
 bench: setup  ## measure the speed of this machine
 	$(BIN)/mikasa-vla bench
+	$(BIN)/mikasa-vla bench --loader
 
 clean:  ## remove .venv and caches; results in runs/ stay
 	rm -rf .venv dist build .mypy_cache .ruff_cache .pytest_cache

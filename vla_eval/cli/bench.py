@@ -1,19 +1,52 @@
-"""`mikasa-vla bench`: lazy against eager rendering, as ratios measured in one run."""
+"""`mikasa-vla bench`: lazy against eager rendering, loader against loader, as ratios from one run."""
 
 import argparse
+from pathlib import Path
+
+SYNTHETIC = "synthetic"
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the verb to the command line."""
-    parser = subparsers.add_parser("bench", help="measure what lazy rendering saves, as ratios from one run")
+    parser = subparsers.add_parser("bench", help="measure rendering or loading, as ratios from one run")
     parser.add_argument("--task", default="RememberColor3-v0", help="task id (default: %(default)s)")
     parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
     parser.add_argument("--wrist-mesh", choices=("shipped", "simplified"), default="shipped")
+    parser.add_argument(
+        "--loader",
+        nargs="?",
+        const=SYNTHETIC,
+        metavar="DATASET",
+        help="instead: samples per second of a dataset (a made-up one if none is named)",
+    )
+    parser.add_argument("--samples", type=int, default=200, help="with --loader (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print the table."""
+    return _loader(args) if args.loader else _rendering(args)
+
+
+def _loader(args: argparse.Namespace) -> int:
+    from vla_eval.data.loader_bench import CHUNK_SIZE, run_loader_bench
+
+    root = None if args.loader == SYNTHETIC else Path(args.loader)
+    report = run_loader_bench(root, n_samples=args.samples, repeats=args.repeats)
+    print(f"{report.dataset}: {report.n_frames} frames, {report.n_cameras} cameras, decoder {report.decoder}")
+    print(f"{report.n_samples} samples at random, chunks of {CHUNK_SIZE} actions, one process")
+    print("| loader | samples/s |")
+    print("|:--|--:|")
+    print(f"| lerobot | {report.lerobot_per_second:.0f} |")
+    print(f"| memory map | {report.memory_per_second:.0f} |")
+    print(
+        f"ratio {report.ratio:.1f}; opening: {report.first_seconds:.2f} s, {report.again_seconds:.2f} s again"
+    )
+    print("The samples of both loaders were bit-equal.")
+    return 0
+
+
+def _rendering(args: argparse.Namespace) -> int:
     from vla_eval.bench import run_bench
     from vla_eval.envs.settings import RenderSettings
 

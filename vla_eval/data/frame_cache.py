@@ -1,0 +1,235 @@
+"""Decoded frames of a dataset in files that can be mapped into memory: made once, found again by digest.
+
+One `<camera>.npy` (N, 3, H, W) uint8 per camera, row i being frame i of the loaded dataset. Frames come
+from lerobot's own decoder, one call per episode and camera, hence are the very bytes that it would serve.
+"""
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import importlib.metadata
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import numpy as np
+from av.error import FFmpegError
+from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
+
+from vla_eval.core import ImageArray
+from vla_eval.errors import DatasetError, StorageFullError
+
+FORMAT_VERSION = 1  # raised when the files' layout changes: old ones are then not found any more
+DIGEST_DIGITS = 24
+MIB = 1024**2
+# Beyond the frames: file headers, and what a file system keeps for itself.
+HEADROOM_BYTES = 16 * MIB
+_MORE_ROOM = "free some space, let XDG_CACHE_HOME name another disk, or select fewer episodes"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeRows:
+    """One episode's frames: rows [first, stop) of the loaded dataset, and when they were taken.
+
+    Attributes:
+        index: the episode's number in the dataset.
+        first: row of its first frame.
+        stop: row after its last frame.
+        timestamps_s: (stop - first) seconds since the episode's beginning.
+    """
+
+    index: int
+    first: int
+    stop: int
+    timestamps_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameSource:
+    """What has to be decoded: a loaded dataset's videos.
+
+    Attributes:
+        dataset: the `LeRobotDataset`.
+        shapes: camera key -> (channels, height, width).
+        episodes: the selected episodes, in the order of their rows.
+    """
+
+    dataset: Any  # LeRobotDataset: untyped
+    shapes: Mapping[str, tuple[int, int, int]]
+    episodes: Sequence[EpisodeRows]
+
+    @property
+    def n_frames(self) -> int:
+        """How many rows there are."""
+        return self.episodes[-1].stop if self.episodes else 0
+
+    @property
+    def n_bytes(self) -> int:
+        """How much the decoded frames take."""
+        return self.n_frames * sum(int(np.prod(shape)) for shape in self.shapes.values())
+
+
+def dataset_digest(source: FrameSource) -> str:
+    """Return a digest of all that the decoded frames depend on: files, selection, decoder."""
+    root = Path(source.dataset.root)
+    digest = hashlib.sha256(f"frames {FORMAT_VERSION}\n".encode())
+    backend = source.dataset._video_backend
+    package = {"pyav": "av"}.get(backend, backend)
+    digest.update(f"{backend} {importlib.metadata.version(package)}\n".encode())
+    digest.update(f"lerobot {importlib.metadata.version('lerobot')}\n".encode())
+    digest.update(f"{[episode.index for episode in source.episodes]}\n".encode())
+    for path in _files(source, root):
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode())
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
+    """Yield the (T, 3, H, W) uint8 frames of each episode in turn.
+
+    Raises:
+        DatasetError: a video cannot be read, or holds no frame at a time where there must be one.
+    """
+    dataset = source.dataset
+    for episode in source.episodes:
+        row = dataset.meta.episodes[episode.index]
+        path = Path(dataset.root) / dataset.meta.get_video_file_path(episode.index, camera)
+        begin_s = row[f"videos/{camera}/from_timestamp"]
+        times_s = [begin_s + timestamp for timestamp in episode.timestamps_s]
+        try:
+            frames = decode_video_frames(
+                path, times_s, dataset.tolerance_s, dataset._video_backend, return_uint8=True
+            )
+        except (OSError, RuntimeError, FFmpegError, FrameTimestampError) as exc:
+            raise DatasetError(
+                f"{path}: episode {episode.index} of camera '{camera}' cannot be decoded "
+                f"({str(exc).splitlines()[0]}). The video is damaged or belongs to another dataset."
+            ) from exc
+        shape = (episode.stop - episode.first, *source.shapes[camera])
+        if tuple(frames.shape) != shape:
+            raise DatasetError(
+                f"{path}: episode {episode.index} has frames {tuple(frames.shape)}, not {shape}."
+            )
+        decoded: ImageArray = frames.numpy()
+        yield decoded
+
+
+def frames_in_memory(source: FrameSource) -> dict[str, ImageArray]:
+    """Decode all frames into this process's memory.
+
+    Raises:
+        DatasetError: they do not fit, or a video cannot be read.
+    """
+    free = available_memory_bytes()
+    if free is not None and source.n_bytes + HEADROOM_BYTES > free:
+        raise DatasetError(
+            f"{_decoded_size(source)}, but {free / MIB:.0f} MiB of memory are free. "
+            f"Use storage='disk' (a memory map), or select fewer episodes."
+        )
+    return {camera: np.concatenate(list(decode_camera(source, camera))) for camera in source.shapes}
+
+
+def frames_on_disk(source: FrameSource, folder: Path) -> dict[str, Path]:
+    """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet.
+
+    The folder appears by a rename, so half a cache is never seen; of several processes that ask at once
+    one decodes and the others wait.
+
+    Args:
+        source: what to decode.
+        folder: the cache; a folder named after the dataset's digest is made in it.
+
+    Raises:
+        DatasetError: there is not enough room, or a video cannot be read.
+        StorageFullError: the disk became full on the way.
+    """
+    final = folder / dataset_digest(source)
+    paths = {camera: final / f"{camera}.npy" for camera in source.shapes}
+    if final.is_dir():
+        return paths
+    folder.mkdir(parents=True, exist_ok=True)
+    with _one_builder(folder / f"{final.name}.lock"):
+        if not final.is_dir():
+            _build(source, final)
+    return paths
+
+
+def available_memory_bytes() -> int | None:
+    """Return how much memory a process may still take without swapping, where Linux says so."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return kib[0] * 1024 if kib else None
+
+
+def _files(source: FrameSource, root: Path) -> list[Path]:
+    """Return the files that say which frames there are, and the videos, in a fixed order."""
+    meta = source.dataset.meta
+    videos = {
+        root / meta.get_video_file_path(episode.index, camera)
+        for camera in source.shapes
+        for episode in source.episodes
+    }
+    tables = [*root.glob("meta/episodes/**/*.parquet"), *root.glob("data/**/*.parquet")]
+    return [root / "meta/info.json", *sorted(tables), *sorted(videos)]
+
+
+def _build(source: FrameSource, final: Path) -> None:
+    free = shutil.disk_usage(final.parent).free
+    if source.n_bytes + HEADROOM_BYTES > free:
+        raise DatasetError(
+            f"{_decoded_size(source)}, but {free / MIB:.0f} MiB are free at {final.parent}: {_MORE_ROOM}."
+        )
+    # Whoever made these was killed: we have the lock.
+    for stale in final.parent.glob(f"{final.name}.*.tmp"):
+        shutil.rmtree(stale, ignore_errors=True)
+    draft = final.with_name(f"{final.name}.{os.getpid()}.tmp")
+    draft.mkdir()
+    try:
+        for camera, shape in source.shapes.items():
+            _write_camera(source, camera, draft / f"{camera}.npy", (source.n_frames, *shape))
+        draft.rename(final)
+    except OSError as exc:
+        # Where files cannot be locked another process may have been faster; its frames are the same.
+        if not final.is_dir():
+            if exc.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise StorageFullError(
+                    f"{final.parent}: the disk became full on the way. {_decoded_size(source)}; {_MORE_ROOM}."
+                ) from exc
+            raise
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    logger.info("decoded %d frames into %s", source.n_frames, final)
+
+
+def _write_camera(source: FrameSource, camera: str, path: Path, shape: tuple[int, ...]) -> None:
+    # Written, not mapped: a full disk is then an error that can be caught instead of a SIGBUS.
+    with open(path, "wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]  # numpy 2.2
+        for frames in decode_camera(source, camera):
+            file.write(np.ascontiguousarray(frames).data)
+
+
+@contextlib.contextmanager
+def _one_builder(path: Path) -> Iterator[None]:
+    """Wait until no other process is in here; a file system without locks lets everybody in."""
+    with open(path, "w", encoding="ascii") as file:
+        with contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _decoded_size(source: FrameSource) -> str:
+    size = f"{source.n_bytes / MIB:.0f} MiB"
+    return f"{source.n_frames} frames of {len(source.shapes)} cameras take {size} decoded"

@@ -1,0 +1,50 @@
+"""Open a dataset on this machine, never the network: lerobot looks on the Hub for whatever is missing."""
+
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from vla_eval.errors import DatasetError
+
+NEEDED = ("meta/info.json", "meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet")
+
+
+def open_dataset(root: Path, **options: Any) -> LeRobotDataset:
+    """Open a dataset that is there in full.
+
+    Args:
+        root: the dataset's folder.
+        options: of `LeRobotDataset`.
+
+    Raises:
+        DatasetError: there is none, or files are missing, or they do not belong together.
+    """
+    for pattern in NEEDED:
+        if next(root.glob(pattern), None) is None:
+            raise DatasetError(
+                f"{root}: there is no complete LeRobotDataset (v3): no {pattern}. Name the folder of one "
+                f"dataset; `mikasa-vla dataset pull` fetches one from the Hub."
+            )
+    repo_id = f"local/{root.resolve().name}"
+    try:
+        meta = LeRobotDatasetMetadata(repo_id, root=root)
+    except (OSError, ValueError, KeyError, TypeError) as exc:
+        raise DatasetError(f"{root}: lerobot cannot read its meta/ ({exc!r:.300}).") from exc
+    for path in _files(meta):
+        if not (root / path).is_file():
+            raise DatasetError(
+                f"{root}: {path} is missing. Fetch the dataset again, or rebuild it from its manifest."
+            )
+    try:
+        return LeRobotDataset(repo_id, root=root, **options)
+    except (OSError, ValueError, KeyError, RuntimeError) as exc:
+        raise DatasetError(f"{root}: lerobot cannot read the dataset ({exc!r:.300}).") from exc
+
+
+def _files(meta: LeRobotDatasetMetadata) -> list[Path]:
+    numbers = range(meta.total_episodes)
+    tables = [meta.get_data_file_path(number) for number in numbers]
+    videos = [meta.get_video_file_path(number, camera) for camera in meta.video_keys for number in numbers]
+    return sorted({Path(path) for path in (*tables, *videos)})
