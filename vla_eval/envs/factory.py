@@ -37,7 +37,7 @@ def make_env(settings: EnvSettings) -> SimEnv:
             raise
         raise MissingDependencyError(
             f"simulator '{settings.simulator}' needs the package '{exc.name}', which is not installed. "
-            f"Install it with: pip install 'mikasa-vla-eval[sim]'. `mikasa-vla doctor` checks the machine."
+            f"Run `make setup`, or install mikasa-vla-eval again; `mikasa-vla doctor` checks the machine."
         ) from exc
     factory = cast("Callable[[EnvSettings], SimEnv]", getattr(module, attribute))
     return factory(settings)
