@@ -16,7 +16,7 @@ import torch
 
 from vla_eval.data.features import ACTION_KEY
 from vla_eval.data.memory_loader import MemoryDataset
-from vla_eval.data.opening import open_dataset
+from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import ConformanceError
 
@@ -78,8 +78,8 @@ def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> Load
 
 
 def _measure(root: Path, scratch: Path, *, n_samples: int, repeats: int) -> LoaderReport:
-    fps = open_dataset(root).fps
-    theirs = open_dataset(root, delta_timestamps={ACTION_KEY: [i / fps for i in range(CHUNK_SIZE)]})
+    fps = open_local_dataset(root).fps
+    theirs = open_local_dataset(root, delta_timestamps={ACTION_KEY: [i / fps for i in range(CHUNK_SIZE)]})
     ours, first_seconds = _timed(lambda: MemoryDataset(theirs, cache=scratch))
     _, again_seconds = _timed(lambda: MemoryDataset(theirs, cache=scratch))
     order = np.random.default_rng(0).integers(len(theirs), size=n_samples).tolist()

@@ -7,7 +7,7 @@ take 470 MiB, which a memory map serves from the page cache to any number of loa
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal  # Any: lerobot and datasets are untyped
+from typing import Any, Literal, NamedTuple  # Any: lerobot and datasets are untyped
 
 import numpy as np
 import torch
@@ -21,6 +21,13 @@ from vla_eval.errors import DatasetError, unknown_name
 Storage = Literal["disk", "memory"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
 MAX_UINT8 = 255
+
+
+class FrameLayout(NamedTuple):
+    """(N, 2) first and stop row of each sample's episode, and what has to be decoded."""
+
+    bounds: torch.Tensor
+    frames: FrameSource
 
 
 class MemoryDataset(torch.utils.data.Dataset[Sample]):
@@ -49,11 +56,11 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
         self._deltas: Mapping[str, list[int]] | None = reader.delta_indices
         self._transforms: Callable[[Any], Any] | None = reader._image_transforms
         self._return_uint8 = bool(reader._return_uint8)
-        self._columns = _read_columns(source)
+        self._columns = read_columns(source)
         for key in self._deltas or ():
             if key not in source.meta.features:
                 raise unknown_name("field", key, source.meta.features, where="delta_timestamps")
-        self._bounds, frame_source = _layout(source, self._columns)
+        self._bounds, frame_source = frame_layout(source, self._columns)
         self._files: dict[str, Path] = {}
         self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share
         if storage == "disk":
@@ -156,7 +163,7 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
         return frames if self._return_uint8 else frames.type(torch.float32) / MAX_UINT8
 
 
-def _read_columns(source: LeRobotDataset) -> dict[str, Any]:
+def read_columns(source: LeRobotDataset) -> dict[str, Any]:
     """Return column -> a tensor with one row per frame, or the list of values if they are no numbers.
 
     `torch.tensor` of Python numbers, as lerobot's own transform does it row by row: same types.
@@ -176,8 +183,16 @@ def _read_columns(source: LeRobotDataset) -> dict[str, Any]:
     return columns
 
 
-def _layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> tuple[torch.Tensor, FrameSource]:
-    """Return (N, 2) first and stop row of each sample's episode, and what has to be decoded."""
+def frame_layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> FrameLayout:
+    """Return where the loaded dataset's frames are.
+
+    Args:
+        source: the dataset.
+        columns: see `read_columns`.
+
+    Raises:
+        DatasetError: the frames of an episode do not follow each other.
+    """
     indices, numbers = columns["index"].tolist(), columns["episode_index"].tolist()
     times_s = columns["timestamp"].tolist()
     bounds = torch.empty((len(indices), 2), dtype=torch.long)
@@ -198,12 +213,14 @@ def _layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> tuple[torch.T
         )
         row = stop
     shapes = {key: _channels_first(source.meta.features[key]) for key in source.meta.video_keys}
-    return bounds, FrameSource(dataset=source, shapes=shapes, episodes=episodes)
+    return FrameLayout(bounds, FrameSource(dataset=source, shapes=shapes, episodes=episodes))
 
 
 def _channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
     """Return (channels, height, width) of a camera, whatever the order of its description."""
-    sizes = dict(zip(feature["names"], feature["shape"], strict=True))
+    # lerobot's own data sets call the last one `channel` as well as `channels`.
+    names = [{"channel": "channels"}.get(name, name) for name in feature["names"]]
+    sizes = dict(zip(names, feature["shape"], strict=True))
     if "channels" not in sizes or not math.prod(sizes.values()):
         raise DatasetError(f"a camera is described by {dict(feature)}: expected height, width and channels.")
     return int(sizes["channels"]), int(sizes["height"]), int(sizes["width"])

@@ -11,7 +11,7 @@ from vla_eval.errors import DatasetError
 NEEDED = ("meta/info.json", "meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet")
 
 
-def open_dataset(root: Path, **options: Any) -> LeRobotDataset:
+def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
     """Open a dataset that is there in full.
 
     Args:

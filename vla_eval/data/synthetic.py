@@ -49,6 +49,7 @@ def write_synthetic_dataset(
         features=features,
         root=root,
         streaming_encoding=True,
+        encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames where its queue is full
         rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
     )
     for episode in range(n_episodes):
