@@ -130,9 +130,13 @@ def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int) -> int:
     """Return how many workers to start."""
     if config.workers != "auto":
         return max(1, min(config.workers, n_jobs))
-    # Cores this process may use, not cores of the machine: clusters hand out a part of them.
-    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    n_cores = available_cores()
     return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.cli.main import main
+from vla_eval.cli.main import VERBS, main
 from vla_eval.cli.show import task_arguments
 from vla_eval.recipes import list_recipes
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -40,7 +40,7 @@ class TestMistakes:
 
         assert message == (
             "mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? "
-            "Known: eval, report, list, show, doctor, bench.\n"
+            f"Known: {', '.join(VERBS)}.\n"
         )
 
     def test_an_unknown_flag(self, capsys: pytest.CaptureFixture[str]) -> None:
@@ -132,7 +132,7 @@ class TestShow:
 
 PROBE = """
 import json, sys
-from vla_eval.cli.main import main
+from vla_eval.cli.main import VERBS, main
 try:
     code = main(sys.argv[1:])
 except SystemExit as exc:

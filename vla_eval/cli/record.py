@@ -1,0 +1,121 @@
+"""`mikasa-vla record`: record demonstrations, or go on with it."""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vla_eval.cli.arguments import workers_argument
+from vla_eval.data.recipe import DatasetRecipe, fingerprint
+from vla_eval.decoding import decode
+from vla_eval.errors import RecipeError
+from vla_eval.recipes import apply_overrides, load_recipe
+
+if TYPE_CHECKING:
+    from vla_eval.data.recording import RecordedDataset
+
+DATA_FOLDER = Path("data")
+FINGERPRINT_DIGITS = 8
+MEGABYTE = 1_000_000
+DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
+
+RECIPE is a file, or the name of one in datasets/. Without it, name at least one --task. Flags go on top of
+the file, --set on top of flags. The same command again goes on where it stopped."""
+EPILOG = """exit codes: 0 all datasets are there; 1 a mistake (see the message); 130, 143 stopped by Ctrl-C,
+SIGTERM (the same command goes on)."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "record",
+        help="record demonstrations as LeRobot datasets, or go on with it",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("recipe", nargs="?", metavar="RECIPE", help="file, or name in datasets/")
+    parser.add_argument("--task", nargs="+", action="extend", dest="tasks", metavar="T", help="task ids")
+    parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task (250)")
+    parser.add_argument("--seed-start", type=int, metavar="S", help="the first seed that is tried (1000)")
+    parser.add_argument(
+        "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="A.B=C",
+        help="change any field of the recipe",
+    )
+    parser.add_argument(
+        "--allow-environment-change",
+        action="store_true",
+        help="go on although package versions or the machine have changed",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record; the datasets' names go to standard output, everything else to standard error."""
+    # Here and not above: `mikasa-vla --help` need not wait for lerobot.
+    from vla_eval.cli.progress import stop_on_signals
+    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.data.recording import record
+
+    recipe = _recipe(args)
+    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    out = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
+    with stop_on_signals() as stop:
+        progress = RecordingProgress(stop)
+        try:
+            summary = record(
+                recipe,
+                out=out,
+                command=command,
+                allow_environment_change=args.allow_environment_change,
+                observer=progress,
+            )
+        finally:
+            progress.close()
+    if summary.was_stopped:
+        print(f"Stopped. What was recorded is in {out}. To go on: {command}", file=sys.stderr)
+        return stop.exit_code
+    for dataset in summary.datasets:
+        print(describe(dataset))
+    return 0
+
+
+def describe(dataset: "RecordedDataset") -> str:
+    """Return what has come of one task, in one line."""
+    facts = dataset.facts
+    failed = ", ".join(str(one.seed) for one in dataset.failed) or "none"
+    return (
+        f"{dataset.path}: {facts.n_episodes} episodes, {facts.n_frames} frames, "
+        f"{dataset.n_bytes / MEGABYTE:.1f} MB, {dataset.seconds / 60:.1f} min; failed seeds: {failed}"
+    )
+
+
+def _recipe(args: argparse.Namespace) -> DatasetRecipe:
+    """Return the recipe: the file, flags on top of it, `--set` on top of those."""
+
+    def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        for name in ("tasks", "episodes", "seed_start", "workers"):
+            value = getattr(args, name)
+            if value is not None:
+                data[name] = value
+        apply_overrides(data, args.overrides, cls=DatasetRecipe)
+
+    if args.recipe is not None:
+        return load_recipe("datasets", args.recipe, DatasetRecipe, edit=edit).value
+    data: dict[str, Any] = {"name": "demonstrations"}
+    edit(data)
+    if "tasks" not in data:
+        raise RecipeError(
+            "Name a recipe (a file, or one of datasets/), or at least one --task. "
+            "Example: mikasa-vla record --task RememberColor3-v0 --episodes 10"
+        )
+    return decode(DatasetRecipe, data, where="command line")

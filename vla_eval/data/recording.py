@@ -1,0 +1,318 @@
+"""Record demonstrations: choose seeds without rendering, render and encode what is kept, put it together.
+
+One LeRobotDataset per task, OUT/TASK, since policies are trained per task. Stopped at any moment, by any
+means, the same call goes on where it stopped; what comes of it does not depend on that, nor on the number
+of workers.
+"""
+
+import importlib
+import time
+from collections import deque
+from collections.abc import Collection, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal, Protocol
+
+from vla_eval.data.demonstrations import Attempt
+from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
+from vla_eval.data.recipe import DatasetRecipe, content_of, fingerprint, options_of
+from vla_eval.data.recording_folder import RecordingFolder
+from vla_eval.data.recording_jobs import (
+    AttemptJob,
+    JoinJob,
+    RecordingAnswer,
+    RecordingJob,
+    ShardJob,
+    TaskPlan,
+)
+from vla_eval.data.recording_plan import RecordingPlan, plan_recording
+from vla_eval.data.seed_queue import SeedQueue, Selection
+from vla_eval.episode_worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
+from vla_eval.errors import RecordingError
+from vla_eval.evaluate import as_exception, available_cores
+from vla_eval.provenance import collect_environment
+from vla_eval.results.run_file import RunDescription
+from vla_eval.workers import WorkerPool
+
+WORKER_MODULE = "vla_eval.data.recording_worker"
+MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
+
+Phase = Literal["trying seeds", "rendering", "joining"]
+RecordingPool = WorkerPool[RecordingJob, RecordingAnswer]
+
+
+class RecordingObserver(Protocol):
+    """Watches a recording: progress on a terminal, for example."""
+
+    def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
+        """Called when a phase of a task begins, with how many episodes are done already."""
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Called when more is done of the phase."""
+
+    def on_tick(self) -> bool:
+        """Called several times a second; returns whether the recording shall stop now."""
+
+
+class _Silence:
+    """Watches nothing and never stops."""
+
+    def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
+        """Do nothing."""
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Do nothing."""
+
+    def on_tick(self) -> bool:
+        """Go on."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedDataset:
+    """One finished dataset."""
+
+    path: Path
+    facts: DatasetFacts
+    failed: tuple[FailedSeed, ...]
+    seconds: float  # of this call
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of its files."""
+        return sum(file.n_bytes for file in self.facts.files.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary:
+    """What one call of `record` has come to; fewer datasets than tasks if it was stopped."""
+
+    out: Path
+    datasets: tuple[RecordedDataset, ...]
+    was_stopped: bool
+
+
+def recording_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+    """Record for the parent until it closes the pipe; the entry point of a worker process."""
+    detach(log, parent_pid)
+    # Imported by the worker alone: lerobot costs the parent 5 s, in which a mistake can long be told.
+    runner = importlib.import_module(WORKER_MODULE).RecordingRunner
+    serve(connection, runner(Heartbeat(shared), connection.send))
+
+
+class _Stopped(Exception):
+    """The observer asked to stop."""
+
+
+def record(
+    recipe: DatasetRecipe,
+    *,
+    out: Path,
+    command: str = "",
+    allow_environment_change: bool = False,
+    observer: RecordingObserver | None = None,
+) -> RecordingSummary:
+    """Record all datasets of a recipe that are not there yet.
+
+    Args:
+        recipe: what to record.
+        out: the folder; each task's dataset appears in it.
+        command: what the user typed, for the record.
+        allow_environment_change: go on although package versions or the machine have changed.
+        observer: is told of progress.
+
+    Raises:
+        VlaEvalError: a mistake in the recipe, a recording that cannot go on, a full disk. What was
+            recorded stays.
+    """
+    plan = plan_recording(recipe)
+    description = RunDescription(
+        name=recipe.name,
+        config={**content_of(recipe), "task_versions": {one.task: one.task_version for one in plan.tasks}},
+        recipes=plan.recipe_files,
+        environment=collect_environment(),
+        options=options_of(recipe),
+        command=command,
+    )
+    datasets: list[RecordedDataset] = []
+    with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
+        n_workers = available_cores() if recipe.workers == "auto" else recipe.workers
+        with RecordingPool(
+            recording_main, size=n_workers, timeouts=recipe.timeouts, logs=folder.logs()
+        ) as pool:
+            recorder = _Recorder(
+                plan=plan,
+                folder=folder,
+                pool=pool,
+                observer=observer or _Silence(),
+                allow_environment_change=allow_environment_change,
+            )
+            try:
+                for task in plan.tasks:
+                    datasets.append(recorder.record(task))
+            except _Stopped:
+                return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
+    return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=False)
+
+
+@dataclass(slots=True, kw_only=True)
+class _Recorder:
+    """Takes the tasks of a recipe through their phases."""
+
+    plan: RecordingPlan
+    folder: RecordingFolder
+    pool: RecordingPool
+    observer: RecordingObserver
+    allow_environment_change: bool
+
+    def record(self, task: TaskPlan) -> RecordedDataset:
+        """Return the dataset of a task; made if it is not there yet."""
+        begun = time.monotonic()
+        path = self.folder.dataset(task.task)
+        if not self.folder.is_finished(task.task):
+            selection = self._try_seeds(task)
+            shards = self._render(task, selection.kept)
+            self._join(task, selection, shards)
+        self.folder.remove_shards(task.task)  # also what a killed session has left
+        return RecordedDataset(
+            path=path,
+            facts=read_facts(path),
+            failed=read_failed(path),
+            seconds=time.monotonic() - begun,
+        )
+
+    def _try_seeds(self, task: TaskPlan) -> Selection:
+        queue = SeedQueue(
+            task.recipe,
+            self.folder.attempts(task.task),
+            lambda seed: AttemptJob(plan=task, seed=seed),
+        )
+        self._begin(task, "trying seeds", n_done=queue.n_kept)
+        n_tries: dict[int, int] = {}
+        for event in self.pool.run(queue):
+            answered = self._look_at(event)
+            if answered is None:
+                continue
+            job, answer = answered
+            assert isinstance(job, AttemptJob)  # the queue makes no others
+            if isinstance(answer, Failed):
+                n_tries[job.seed] = _raise_if_hopeless(answer, n_tries.get(job.seed, 0), f"seed {job.seed}")
+                queue.give_back(job.seed)
+                continue
+            assert isinstance(answer, Attempt)
+            self.folder.append(task.task, answer)
+            queue.add(answer)
+            self.observer.on_progress(n_done=queue.n_kept)
+        return queue.selection()
+
+    def _render(self, task: TaskPlan, kept: Sequence[Attempt]) -> tuple[Path, ...]:
+        jobs = list(self._shard_jobs(task, kept))
+        open_jobs = [job for job in jobs if not job.path.exists()]
+        n_done = len(kept) - sum(len(job.attempts) for job in open_jobs)
+        self._begin(task, "rendering", n_done=n_done)
+        for done in self._finish(open_jobs):
+            assert isinstance(done, ShardJob)
+            n_done += len(done.attempts)
+            self.observer.on_progress(n_done=n_done)
+        return tuple(job.path for job in jobs)
+
+    def _join(self, task: TaskPlan, selection: Selection, shards: tuple[Path, ...]) -> None:
+        self._begin(task, "joining", n_done=0)
+        job = JoinJob(
+            plan=task,
+            path=self.folder.dataset(task.task),
+            shards=shards,
+            failed=tuple(FailedSeed(seed=one.seed, n_steps=one.n_steps) for one in selection.failed),
+            facts=self._facts(task, n_failed_seeds=len(selection.failed)),
+        )
+        for _ in self._finish([job]):
+            self.observer.on_progress(n_done=task.recipe.episodes)
+
+    def _finish(self, jobs: Sequence[RecordingJob]) -> Iterable[RecordingJob]:
+        """Run the jobs, each again if it fails once; yields each when it is done."""
+        queue = _Jobs(jobs)
+        n_tries: dict[int, int] = {}
+        for event in self.pool.run(queue):
+            answered = self._look_at(event)
+            if answered is None:
+                continue
+            job, answer = answered
+            if isinstance(answer, Failed):
+                where = f"{job.setup_key.kind} of {job.setup_key.task}"
+                n_tries[id(job)] = _raise_if_hopeless(answer, n_tries.get(id(job), 0), where)
+                queue.give_back(job)
+            else:
+                yield job
+
+    def _look_at(self, event: object) -> "tuple[RecordingJob, RecordingAnswer | Failed] | None":
+        """Return job and answer, if the event is one; else see to it."""
+        if event is None:
+            if self.observer.on_tick():
+                raise _Stopped
+        elif isinstance(event, DeviceFound):
+            self.folder.note_device(dict(event.device), allow_change=self.allow_environment_change)
+        else:
+            return event.job, event.answer  # type: ignore[attr-defined]  # an Answered
+        return None
+
+    def _begin(self, task: TaskPlan, phase: Phase, *, n_done: int) -> None:
+        self.observer.on_phase(task.task, phase, n_done=n_done, n_total=task.recipe.episodes)
+
+    def _shard_jobs(self, task: TaskPlan, kept: Sequence[Attempt]) -> Iterable[ShardJob]:
+        size = task.recipe.episodes_per_shard
+        for first in range(0, len(kept), size):
+            yield ShardJob(
+                plan=task,
+                path=self.folder.shard(task.task, first // size),
+                first_index=first,
+                attempts=tuple(kept[first : first + size]),
+            )
+
+    def _facts(self, task: TaskPlan, *, n_failed_seeds: int) -> DatasetFacts:
+        return DatasetFacts(
+            complete=True,
+            name=task.recipe.name,
+            task=task.task,
+            task_version=task.task_version,
+            instruction=task.group.instruction,
+            state=task.recipe.state,
+            n_episodes=0,
+            n_frames=0,
+            n_failed_seeds=n_failed_seeds,
+            recipe=content_of(task.recipe),
+            recipe_sha256=fingerprint(task.recipe),
+            recipe_files=self.plan.recipe_files,
+            environment=dict(self.folder.environment),
+            device=self.folder.device,
+            files={},
+        )
+
+
+class _Jobs:
+    """A `JobSource` of jobs that are all known from the start."""
+
+    def __init__(self, jobs: Iterable[RecordingJob]) -> None:
+        self._jobs = deque(jobs)
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> RecordingJob | None:
+        return self._jobs.popleft() if self._jobs else None
+
+    def give_back(self, job: RecordingJob) -> None:
+        self._jobs.appendleft(job)
+
+
+def _raise_if_hopeless(failed: Failed, n_tries: int, where: str) -> int:
+    """Return how often the job has been tried; raise if it makes no sense to try it again."""
+    if failed.refused:
+        raise as_exception(failed.error)
+    if n_tries + 1 >= MAX_TRIES:
+        error = failed.error
+        raise RecordingError(
+            f"{where}: failed {MAX_TRIES} times, the last time during {error.stage}: {error.kind}: "
+            f"{error.message}\n{error.details or ''}\nWhat was recorded is kept; the same command goes on."
+        )
+    return n_tries + 1

@@ -1,0 +1,226 @@
+"""What a recording keeps while it goes on, so that it can be stopped at any moment.
+
+    OUT/TASK/                            a finished dataset; appears in one step
+    OUT/recording/run.json               recipe and environment it was started with, and each continuation
+    OUT/recording/TASK/attempts.jsonl    one `Attempt` per line, in the order they came
+    OUT/recording/TASK/shards/shard-00000  finished shards; removed once the dataset is there
+    OUT/recording/logs/worker-0.log      what workers wrote
+    OUT/recording/recording.lock         held by the process that records
+
+Only the parent process writes here, but for shards and datasets. Knows nothing of what they hold.
+"""
+
+import dataclasses
+import json
+import logging
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vla_eval.data.demonstrations import Attempt
+from vla_eval.data.manifest import RECORDING_FILE
+from vla_eval.decoding import decode
+from vla_eval.errors import DatasetError, RecipeError, RunFolderError
+from vla_eval.results.durable import FolderLock, LineFile, storage_full, sync_folder
+from vla_eval.results.episodes_file import cut_tail
+from vla_eval.results.run_file import (
+    DEVICE,
+    JsonValue,
+    RunDescription,
+    RunFile,
+    Session,
+    environment_changed,
+    find_changes,
+)
+from vla_eval.results.store import DISK_TROUBLE
+
+logger = logging.getLogger(__name__)
+
+STATE_FOLDER = "recording"
+LOCK_FILE = "recording.lock"
+ATTEMPTS_FILE = "attempts.jsonl"
+
+
+class RecordingFolder:
+    """The folder of a recording that this process writes into; make it with `open`."""
+
+    def __init__(self, out: Path, lock: FolderLock, run_file: RunFile) -> None:
+        """Use `open`."""
+        self.out = out
+        self._lock = lock
+        self._run_file = run_file
+        self._attempts: dict[str, LineFile] = {}
+
+    @classmethod
+    def open(cls, out: Path, description: RunDescription, *, allow_environment_change: bool) -> Self:
+        """Start a recording in a folder, or go on with the one that is there.
+
+        Args:
+            out: the folder; it is made if it is not there.
+            description: recipe and environment; they must be what they were before.
+            allow_environment_change: go on although commit, versions or machine have changed.
+
+        Raises:
+            RunChangedError: recipe or environment are not what they were; the message says in what.
+            RunFolderError: another process records there, or the folder is somebody else's.
+            StorageFullError: the disk is full.
+        """
+        state = out / STATE_FOLDER
+        try:
+            _refuse_foreign(out)
+            state.mkdir(parents=True, exist_ok=True)
+            lock = FolderLock(state / LOCK_FILE)
+            try:
+                run_file = _continued(state, description, allow_environment_change)
+                run_file.save(state)
+                sync_folder(out)
+            except BaseException:
+                lock.release()
+                raise
+        except OSError as exc:
+            if exc.errno in DISK_TROUBLE:
+                raise storage_full(out, exc) from exc
+            raise RunFolderError(
+                f"{out}: cannot be recorded into ({exc.strerror or exc}). Use another --out."
+            ) from exc
+        return cls(out, lock, run_file)
+
+    def __enter__(self) -> Self:
+        """Return the folder."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the files and let other processes in."""
+        for file in self._attempts.values():
+            file.close()
+        self._attempts = {}
+        self._lock.release()
+
+    @property
+    def environment(self) -> Mapping[str, JsonValue]:
+        """The environment that the recording was started in, without the device."""
+        environment = self._run_file.description.environment
+        return {name: value for name, value in environment.items() if name != DEVICE}
+
+    @property
+    def device(self) -> dict[str, str]:
+        """What is known of the device that pictures are rendered on."""
+        device = self._run_file.description.environment.get(DEVICE)
+        return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
+
+    def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
+        """Record the device; pictures of one dataset must come from one device.
+
+        Raises:
+            RunChangedError: it is another one than before, and changes are not allowed.
+        """
+        changes = find_changes(
+            {name: value for name, value in self.device.items() if name in device},
+            {name: value for name, value in device.items() if name in self.device},
+            prefix=f"environment.{DEVICE}",
+        )
+        if changes and not allow_change:
+            raise environment_changed(changes, self.out)
+        if dict(device) != self.device:
+            self._run_file = self._run_file.with_device({**self.device, **device}, changes)
+            self._run_file.save(self.out / STATE_FOLDER)
+
+    def logs(self) -> Path:
+        """Return the folder of the workers' logs."""
+        return _made(self.out / STATE_FOLDER / "logs")
+
+    def dataset(self, task: str) -> Path:
+        """Return where the dataset of a task appears."""
+        return self.out / task
+
+    def is_finished(self, task: str) -> bool:
+        """Whether the dataset of a task is there; it appears only when it is complete."""
+        return (self.dataset(task) / RECORDING_FILE).exists()
+
+    def shard(self, task: str, index: int) -> Path:
+        """Return where a shard appears."""
+        return _made(self._task_folder(task) / "shards") / f"shard-{index:05d}"
+
+    def attempts(self, task: str) -> dict[int, Attempt]:
+        """Return seed -> attempt of all that is known.
+
+        Raises:
+            DatasetError: the file is damaged.
+        """
+        path = self._task_folder(task) / ATTEMPTS_FILE
+        cut_tail(path)
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
+        return {one.seed: one for one in found}
+
+    def append(self, task: str, attempt: Attempt) -> None:
+        """Keep an attempt; it is durable when this returns.
+
+        Raises:
+            StorageFullError: it could not be stored.
+        """
+        if task not in self._attempts:
+            self._attempts[task] = LineFile(self._task_folder(task) / ATTEMPTS_FILE, durable=True)
+        self._attempts[task].append(json.dumps(dataclasses.asdict(attempt)))
+
+    def remove_shards(self, task: str) -> None:
+        """Remove what is not needed once the dataset is there."""
+        shutil.rmtree(self._task_folder(task) / "shards", ignore_errors=True)
+
+    def _task_folder(self, task: str) -> Path:
+        return _made(self.out / STATE_FOLDER / task)
+
+
+def _continued(state: Path, description: RunDescription, allow_environment_change: bool) -> RunFile:
+    """Return what run.json must hold from now on."""
+    session = Session(
+        started_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=description.command,
+        options=description.options,
+    )
+    try:
+        known = RunFile.load(state)
+    except FileNotFoundError:
+        return RunFile(description=description, sessions=(session,))
+    known.check_unchanged(description, state.parent)
+    before = {name: value for name, value in known.description.environment.items() if name != DEVICE}
+    changes = find_changes(before, description.environment, prefix="environment")
+    if changes and not allow_environment_change:
+        raise environment_changed(changes, state.parent)
+    for change in changes:
+        logger.warning("%s: the environment has changed: %s", state.parent, change)
+    return known.with_session(dataclasses.replace(session, environment_changes=changes))
+
+
+def _refuse_foreign(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise RunFolderError(f"{out}: expected a folder, found a file. Use another --out.")
+    if not out.exists() or (out / STATE_FOLDER).exists():
+        return
+    names = sorted(entry.name for entry in out.iterdir())
+    if names:
+        shown = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+        raise RunFolderError(
+            f"{out}: holds other files ({shown}) and no recording: nothing is written into it. Use another "
+            f"--out."
+        )
+
+
+def _attempt(line: str, *, where: str) -> Attempt:
+    try:
+        return decode(Attempt, json.loads(line), where=where)
+    except (ValueError, RecipeError) as exc:
+        raise DatasetError(
+            f"{where}: expected an attempt, found {line[:80]!r} ({exc}). The file was changed by another "
+            f"program; restore it or record into another --out."
+        ) from exc
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

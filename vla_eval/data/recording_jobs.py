@@ -1,0 +1,124 @@
+"""What a recording consists of, as data that is sent to workers: tries, shards, joins.
+
+Knows nothing of lerobot, simulators or processes.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_eval.core import EpisodeStart
+from vla_eval.data.demonstrations import SLOT, Attempt
+from vla_eval.data.manifest import DatasetFacts, FailedSeed
+from vla_eval.data.recipe import DatasetRecipe
+from vla_eval.plan import Group
+
+
+class SetupKey(NamedTuple):
+    """What the jobs share that one environment can do."""
+
+    task: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskPlan:
+    """What is recorded of one task.
+
+    Attributes:
+        group: task, environment and expert, as an evaluation has them.
+        task_version: version of the task's rules.
+        expert_version: version of the expert's recipe.
+        recipe: the recipe of the dataset.
+    """
+
+    group: Group
+    task_version: int
+    expert_version: int
+    recipe: DatasetRecipe
+
+    @property
+    def task(self) -> str:
+        """Task id."""
+        return self.group.key.task
+
+    def start(self, seed: int, *, horizon_steps: int) -> EpisodeStart:
+        """Return the episode of a seed."""
+        return EpisodeStart(
+            slot=SLOT,
+            task=self.task,
+            seed=seed,
+            run=0,
+            instruction=self.group.instruction,
+            horizon_steps=horizon_steps,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttemptJob:
+    """Let the expert try one seed; the answer is an `Attempt`."""
+
+    plan: TaskPlan
+    seed: int
+
+    @property
+    def setup_key(self) -> SetupKey:
+        """See `workers.Job`."""
+        return SetupKey(self.plan.task, "attempt")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardJob:
+    """Render and encode some attempts; the answer is a `ShardWritten`."""
+
+    plan: TaskPlan
+    path: Path
+    first_index: int
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def setup_key(self) -> SetupKey:
+        """See `workers.Job`."""
+        return SetupKey(self.plan.task, "render")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinJob:
+    """Put the shards of a task together; the answer is a `DatasetWritten`.
+
+    Attributes:
+        plan: what was recorded.
+        path: where the dataset is to appear; its draft is written in the folder of the shards.
+        shards: all of them, in order.
+        failed: seeds at which the expert failed.
+        facts: what is known of the dataset but counts, device and digests.
+    """
+
+    plan: TaskPlan
+    path: Path
+    shards: tuple[Path, ...]
+    failed: tuple[FailedSeed, ...]
+    facts: DatasetFacts
+
+    @property
+    def setup_key(self) -> SetupKey:
+        """See `workers.Job`."""
+        return SetupKey(self.plan.task, "join")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardWritten:
+    """A shard is on the disk."""
+
+    n_episodes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetWritten:
+    """A dataset is on the disk, complete."""
+
+    facts: DatasetFacts
+
+
+RecordingJob = AttemptJob | ShardJob | JoinJob
+RecordingAnswer = Attempt | ShardWritten | DatasetWritten

@@ -1,0 +1,67 @@
+"""From a recipe to what is recorded of each task; finds mistakes before a simulator is started."""
+
+from dataclasses import dataclass
+
+from vla_eval.data.demonstrations import ONE_BY_ONE
+from vla_eval.data.recipe import DatasetRecipe
+from vla_eval.data.recording_jobs import TaskPlan
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.plan import Group, GroupKey
+from vla_eval.prompts import instruction_for, load_prompts
+from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe
+from vla_eval.registry import check_adapter
+from vla_eval.rollout import RolloutSettings
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingPlan:
+    """All that a recording needs to know before it starts.
+
+    Attributes:
+        tasks: what is recorded of each task.
+        recipe_files: `policies/oracle` -> sha256; likewise the prompts.
+    """
+
+    tasks: tuple[TaskPlan, ...]
+    recipe_files: dict[str, str]
+
+
+def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
+    """Find what can be wrong with a recipe before a simulator is started.
+
+    Raises:
+        UnknownNameError: a task, expert or prompt set does not exist.
+        RecipeError: the expert's recipe is wrong.
+        MissingInstructionError: a task has no instruction.
+    """
+    expert = load_recipe("policies", recipe.expert, PolicyRecipe)
+    check_adapter(expert.value.adapter)
+    prompts = load_prompts(recipe.prompt_set)
+    return RecordingPlan(
+        tasks=tuple(_task_plan(recipe, expert, task_spec(task)) for task in recipe.tasks),
+        recipe_files={f"policies/{expert.name}": expert.sha256, f"prompts/{prompts.name}": prompts.sha256},
+    )
+
+
+def _task_plan(recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec) -> TaskPlan:
+    return TaskPlan(
+        group=Group(
+            key=GroupKey(spec.id, expert.name, 1),
+            adapter=expert.value.adapter,
+            args=expert.value.args,
+            env=EnvSettings(
+                task=spec.id, kwargs=recipe.env, simulator=recipe.simulator, render=recipe.render
+            ),
+            rollout=RolloutSettings(
+                chunking=ONE_BY_ONE,
+                stop_at_success=recipe.cut == "after_success",
+                steps_after_success=recipe.steps_after_success,
+            ),
+            instruction=instruction_for(spec, recipe.prompt_set),
+        ),
+        task_version=spec.version,
+        expert_version=expert.value.version,
+        recipe=recipe,
+    )

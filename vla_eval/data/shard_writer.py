@@ -1,0 +1,203 @@
+"""Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together.
+
+lerobot loses a whole session when its process is killed, so a shard is written under another name,
+finalised, made durable and then renamed. Encoding goes through `LeRobotDataset` alone. Knows nothing of
+simulators: it is given frames.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self  # Any: lerobot is untyped
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.io_utils import write_stats
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from numpy.typing import NDArray
+
+from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
+from vla_eval.data.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
+from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, from_json, write_lines
+from vla_eval.errors import DatasetError
+from vla_eval.results.durable import sync_folder
+
+ROBOT_TYPE = "panda_wristcam"
+SHARD_EPISODES = MIKASA_FOLDER / "manifest.jsonl"
+SHARD_HISTOGRAMS = MIKASA_FOLDER / "histograms.npz"
+DRAFT_SUFFIX = ".draft"
+MIN_FRAMES = 2  # lerobot's statistics need two
+# One thread, so that the bytes of a video do not depend on the machine's cores.
+ENCODER_THREADS = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """What shards must have in common to become one dataset.
+
+    Attributes:
+        state: which proprioception `observation.state` is.
+        encoder: how frames become video.
+        max_frames: no episode has more.
+    """
+
+    state: StateKind
+    encoder: EncoderSettings
+    max_frames: int
+
+
+class ShardWriter:
+    """Writes one shard; a context manager that leaves either the whole shard or nothing.
+
+    Args:
+        path: where the shard is to appear.
+        format: see `Format`.
+    """
+
+    def __init__(self, path: Path, format: Format) -> None:
+        """Begin with an empty draft."""
+        self._path = path
+        remove_drafts(path)
+        self._draft = draft_path(path)
+        self._draft.parent.mkdir(parents=True, exist_ok=True)
+        self._episodes: list[RecordedEpisode] = []
+        self._histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
+        self._dataset = create_dataset(self._draft, format)
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def add_episode(self, episode: RecordedEpisode, frames: Iterable[dict[str, Any]]) -> None:
+        """Encode an episode.
+
+        Args:
+            episode: what is known of it.
+            frames: see `features.frame_values`.
+
+        Raises:
+            DatasetError: fewer than two frames.
+        """
+        if episode.n_steps < MIN_FRAMES:
+            raise DatasetError(
+                f"{episode.task}, seed {episode.seed}: {episode.n_steps} frames; lerobot needs at least "
+                f"{MIN_FRAMES}. Raise steps_after_success."
+            )
+        for frame in frames:
+            for key, histogram in self._histograms.items():
+                histogram += count_levels(frame[key])
+            self._dataset.add_frame({**frame, "task": episode.instruction})
+        self._dataset.save_episode()
+        self._episodes.append(episode)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Finish the shard, or drop it after an exception."""
+        if kind is not None:
+            remove_drafts(self._path)
+            return
+        self._dataset.finalize()
+        (self._draft / MIKASA_FOLDER).mkdir(parents=True, exist_ok=True)
+        write_lines(self._draft / SHARD_EPISODES, self._episodes)
+        np.savez_compressed(self._draft / SHARD_HISTOGRAMS, **self._histograms)  # type: ignore[arg-type]
+        publish(self._draft, self._path)
+
+
+def create_dataset(root: Path, format: Format) -> Any:  # Any: lerobot is untyped
+    """Return a new LeRobotDataset to write into."""
+    encoder = format.encoder
+    av.logging.set_libav_level(av.logging.ERROR)  # else twenty lines for each video
+    return LeRobotDataset.create(
+        repo_id=f"local/{root.name}",
+        fps=FPS,
+        features=dataset_features(format.state),
+        root=root,
+        robot_type=ROBOT_TYPE,
+        # Never batch_encoding_size > 1: it fails on a new dataset.
+        streaming_encoding=True,
+        # A full queue drops frames without an error: give a whole episode room.
+        encoder_queue_maxsize=format.max_frames + 1,
+        encoder_threads=ENCODER_THREADS,
+        rgb_encoder=RGBEncoderConfig(
+            vcodec=encoder.vcodec, pix_fmt=encoder.pix_fmt, crf=encoder.crf, g=encoder.g
+        ),
+    )
+
+
+def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ...]:
+    """Put shards together as one LeRobotDataset with exact statistics.
+
+    Args:
+        shards: finished shards, in order.
+        root: the new dataset; must not exist.
+
+    Returns:
+        The episodes, in order.
+    """
+    aggregate_datasets(
+        repo_ids=[f"local/{shard.name}" for shard in shards],
+        aggr_repo_id=f"local/{root.name}",
+        roots=list(shards),
+        aggr_root=root,
+    )
+    histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
+    for shard in shards:
+        with np.load(shard / SHARD_HISTOGRAMS) as stored:
+            for key, histogram in histograms.items():
+                histogram += stored[key]
+    write_exact_statistics(root, histograms)
+    return tuple(episode for shard in shards for episode in shard_episodes(shard))
+
+
+def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None:
+    """Replace `meta/stats.json` by statistics over all rows and all pixels."""
+    write_stats(dataset_statistics(read_columns(root), histograms), root)
+
+
+def read_columns(root: Path) -> dict[str, NDArray[np.generic]]:
+    """Return all numbers of a dataset: field -> (N,) or (N, D), in the order of frames."""
+    tables = [pq.read_table(path) for path in sorted((root / "data").glob("*/*.parquet"))]
+    names = tables[0].column_names
+    return {name: np.concatenate([np.asarray(table[name].to_pylist()) for table in tables]) for name in names}
+
+
+def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:
+    """Return the episodes of a finished shard."""
+    path = shard / SHARD_EPISODES
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return tuple(from_json(RecordedEpisode, line, where=str(path)) for line in lines)
+
+
+def draft_path(path: Path) -> Path:
+    """Return where something is written that is to appear at `path`; another one for each process.
+
+    lerobot keeps decoders open by their path: a draft must not have the path of an earlier one.
+    """
+    return path.with_name(f"{path.name}.{os.getpid()}{DRAFT_SUFFIX}")
+
+
+def remove_drafts(path: Path) -> None:
+    """Remove what earlier processes began to write."""
+    for draft in path.parent.glob(f"{path.name}.*{DRAFT_SUFFIX}"):
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def publish(draft: Path, path: Path) -> None:
+    """Make a folder durable and give it its final name, in one step that cannot be cut in half."""
+    for folder, _, names in os.walk(draft):
+        for name in names:
+            descriptor = os.open(Path(folder) / name, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        sync_folder(Path(folder))
+    os.rename(draft, path)
+    sync_folder(path.parent)
