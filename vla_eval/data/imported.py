@@ -1,0 +1,101 @@
+"""`meta/mikasa/import.json`: where a converted dataset came from, and what it does not have.
+
+A dataset that was recorded here has `recording.json` instead (`manifest`). Knows nothing of lerobot.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest
+from vla_eval.decoding import decode
+from vla_eval.errors import DatasetError, RecipeError
+from vla_eval.results.durable import replace_file
+
+IMPORT_FILE = MIKASA_FOLDER / "import.json"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportedEpisode:
+    """What the source says of an episode.
+
+    Attributes:
+        name: its file, or its number in the source.
+        n_steps: number of frames.
+        instruction: the language instruction.
+        source_seed: its seed in the source's environment; ours gives another episode for it.
+        success: whether the source's success flag holds at any frame; None if it has none.
+    """
+
+    name: str
+    n_steps: int
+    instruction: str
+    source_seed: int | None
+    success: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportFacts:
+    """What a converted dataset is; its presence with `complete` marks it as finished.
+
+    Attributes:
+        complete: written as true, after everything else.
+        source_layout: `npz_joints`, `npz_proprio` or `lerobot_official` (see `layouts`).
+        task: the task id that the user named; None if none was.
+        instruction_source: where the instruction comes from: `source`, or the prompt set of that task.
+        state: which proprioception `observation.state` is.
+        control_mode: what the actions are for.
+        executable_by_pd_ee_delta_pose: whether this project's environments can execute them.
+        absent: fields of our own datasets that the source does not have.
+        left_out: arrays of the source that were not taken over.
+        n_frames: of all episodes.
+        episodes: what the source says of each.
+        source_files: path below the source -> digest.
+        files: path below the dataset -> digest.
+        vla_eval_version: what converted it.
+    """
+
+    complete: bool
+    source_layout: str
+    task: str | None
+    instruction_source: str
+    state: str
+    control_mode: str
+    executable_by_pd_ee_delta_pose: bool
+    absent: tuple[str, ...]
+    left_out: tuple[str, ...]
+    n_frames: int
+    episodes: tuple[ImportedEpisode, ...]
+    source_files: dict[str, FileDigest]
+    files: dict[str, FileDigest]
+    vla_eval_version: str
+
+
+def write_import(dataset: Path, facts: ImportFacts) -> None:
+    """Write `import.json`, whole or not at all."""
+    (dataset / MIKASA_FOLDER).mkdir(parents=True, exist_ok=True)
+    data = {"format_version": FORMAT_VERSION, **dataclasses.asdict(facts)}
+    replace_file(dataset / IMPORT_FILE, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
+
+
+def read_import(dataset: Path) -> ImportFacts | None:
+    """Return where a dataset was converted from; None if it was not.
+
+    Raises:
+        DatasetError: the file is damaged, of another version, or the conversion did not finish.
+    """
+    path = dataset / IMPORT_FILE
+    if not path.exists():
+        return None
+    try:
+        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))  # Any: JSON
+        version = data.pop("format_version")
+        facts = decode(ImportFacts, data, where=str(path)) if version == FORMAT_VERSION else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecipeError) as exc:
+        raise DatasetError(f"{path}: damaged ({exc!r:.200}). Convert the source again.") from exc
+    if facts is None or not facts.complete:
+        raise DatasetError(f"{path}: of another version of this program. Convert the source again.")
+    return facts
