@@ -69,6 +69,10 @@ class TooManyErrorsError(VlaEvalError):
     """A run was stopped because episode after episode ended in an error."""
 
 
+class CheckpointError(VlaEvalError):
+    """A checkpoint is incomplete or damaged, or its weights are not those that the policy needs."""
+
+
 class DatasetError(VlaEvalError):
     """A dataset is damaged, incomplete, or not of a form that is understood."""
 

@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint import checkpoint_hashes
+from vla_eval.policies.recipe import LEROBOT_ADAPTER, load_policy_recipe
 from vla_eval.prompts import instruction_for, load_prompts
-from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, load_recipe, to_data
+from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
 from vla_eval.registry import check_adapter
 from vla_eval.results.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
@@ -76,7 +78,8 @@ class Plan:
 
     Attributes:
         jobs: every episode, in a fixed order.
-        recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts.
+        recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
+            policies, and the datasets that these were trained on.
         task_versions: task id -> version of the task's rules.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
         max_workers: the most workers that `workers: auto` may start; None: no limit.
@@ -99,7 +102,7 @@ def make_plan(config: EvalConfig) -> Plan:
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
-    policies = [load_recipe("policies", name, PolicyRecipe) for name in config.policies]
+    policies = [load_policy_recipe(name) for name in config.policies]
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
     prompts = load_prompts(config.prompt_set)
@@ -126,6 +129,7 @@ def make_plan(config: EvalConfig) -> Plan:
         recipe_hashes={
             f"prompts/{prompts.name}": prompts.sha256,
             **{f"policies/{policy.name}": policy.sha256 for policy in policies},
+            **_weights_hashes(policies),
         },
         task_versions={task.id: task.version for task in tasks},
         left_out=tuple(left_out),
@@ -192,6 +196,14 @@ class JobQueue:
         free = [key for key in waiting if key not in taken]
         chosen = next((key for key in waiting if key == loaded), (free or waiting)[0])
         return self._rest[chosen].popleft()
+
+
+def _weights_hashes(policies: Iterable[Recipe[PolicyRecipe]]) -> dict[str, str]:
+    hashes: dict[str, str] = {}
+    for policy in policies:
+        if policy.value.adapter == LEROBOT_ADAPTER:
+            hashes.update(checkpoint_hashes(policy.value.args, policy=policy.name))
+    return hashes
 
 
 def _refuse_instruction(config: EvalConfig) -> None:

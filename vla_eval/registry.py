@@ -25,6 +25,7 @@ POLICIES = {
     "oracle": "vla_eval.policies.scripted:make_oracle",
     "cue_blind": "vla_eval.policies.scripted:make_cue_blind",
     "tour": "vla_eval.policies.scripted:make_tour",
+    "lerobot": "vla_eval.policies.lerobot:make_lerobot",
 }
 
 

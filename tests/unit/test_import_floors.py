@@ -34,6 +34,8 @@ CHEAP = (
     "envs.factory",
     "envs.fake",
     "policies.chunking",
+    "policies.checkpoint",
+    "policies.recipe",
     "policies.scripted",
     "cli.main",
     "cli.eval",

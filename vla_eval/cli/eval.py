@@ -8,7 +8,8 @@ from typing import Any
 
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.recipes import EvalConfig, apply_overrides, find_recipe, load_recipe
+from vla_eval.policies.recipe import policy_name
+from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
 
 EXIT_EPISODE_ERRORS = 3
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
@@ -40,7 +41,13 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--task", **many, dest="tasks", metavar="T", help="task ids (`mikasa-vla list tasks`)"
     )
-    parser.add_argument("--policy", **many, dest="policies", metavar="P", help="names in policies/, or files")
+    parser.add_argument(
+        "--policy",
+        **many,
+        dest="policies",
+        metavar="P",
+        help="names in policies/, files, or folders of checkpoints",
+    )
     parser.add_argument(
         "--n-action-steps",
         **many,
@@ -127,7 +134,7 @@ def _print_table(out: Path, args: argparse.Namespace) -> None:
 
 def _check_baseline(baseline: str | None, config: EvalConfig) -> None:
     """Refuse a baseline that is not evaluated: now, and not when the night is over."""
-    policies = [find_recipe("policies", policy).stem for policy in config.policies]
+    policies = [policy_name(policy) for policy in config.policies]
     if baseline is not None and baseline not in policies:
         raise unknown_name("policy", baseline, policies, where="--baseline")
 

@@ -1,0 +1,202 @@
+"""LeRobot checkpoints as files: find them, hash them, and read what they were trained on.
+
+Standard library only: planning an evaluation must not wait for torch. Knows nothing of models.
+"""
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vla_eval.decoding import decode
+from vla_eval.errors import CheckpointError, RecipeError
+
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
+ADAPTER_WEIGHTS_FILE = "adapter_model.safetensors"
+ADAPTER_CONFIG_FILE = "adapter_config.json"
+PREPROCESSOR_FILE, POSTPROCESSOR_FILE = "policy_preprocessor.json", "policy_postprocessor.json"
+TOKENIZER_FOLDER = "tokenizer"
+FACTS_FILE = "mikasa_training.json"
+MODEL_FOLDER = "pretrained_model"
+# Where a checkpoint may lie below the folder that was named: lerobot's layout, then that of our runs.
+INSIDE = (
+    Path(),
+    Path(MODEL_FOLDER),
+    Path("checkpoints/last") / MODEL_FOLDER,
+    Path("train/checkpoints/last") / MODEL_FOLDER,
+)
+FACTS_VERSION = 1
+"""Of `mikasa_training.json`. Raise it when a field changes its meaning."""
+CHUNK_BYTES = 1 << 20
+# How the model was trained does not change what it is; the rest is for people.
+NOT_HASHED = frozenset({"train_config.json", "README.md", ".gitattributes"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingFacts:
+    """What a policy saw in training, kept beside its weights and compared before an evaluation.
+
+    Attributes:
+        run: name of the fine-tuning run.
+        dataset, dataset_sha256: which demonstrations; the digest names their content.
+        task: the task of the demonstrations.
+        state: which proprioception `observation.state` was: `eef` or `joints`.
+        images: image fields of the dataset, in the policy's order -> (height_px, width_px).
+        fps: control steps per second.
+        action_names: dimensions of the action.
+        control_mode: what an action means.
+        run_seed: seed of the training run.
+    """
+
+    run: str
+    dataset: str
+    dataset_sha256: str
+    task: str
+    state: str
+    images: dict[str, tuple[int, ...]]
+    fps: float
+    action_names: tuple[str, ...]
+    control_mode: str
+    run_seed: int
+
+
+def find_checkpoint(path: Path) -> Path:
+    """Return the folder with the weights, given that folder, a checkpoint, or a fine-tuning run.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    for inside in INSIDE:
+        folder = path / inside
+        if (folder / CONFIG_FILE).is_file() and weights_file(folder) is not None:
+            return folder
+    if not path.is_dir():
+        found = "no such folder"
+    else:
+        names = sorted(entry.name for entry in path.iterdir())
+        found = ", ".join(names[:8]) or "an empty folder"
+    raise CheckpointError(
+        f"{path}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder that "
+        f"holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) are "
+        f"never loaded: convert them to safetensors."
+    )
+
+
+def weights_file(folder: Path) -> Path | None:
+    """Return the file of the weights, or of the adapter's weights, if there is one."""
+    for name in (ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE):
+        if (folder / name).is_file():
+            return folder / name
+    return None
+
+
+def checkpoint_name(path: Path) -> str:
+    """Return a name for records and tables: the run's name and the step of the checkpoint."""
+    folder = find_checkpoint(path).resolve()
+    parts = [part for part in folder.parts if part not in (MODEL_FOLDER, "checkpoints", "train", "/")]
+    named = parts[-2:] if parts and parts[-1].isdigit() else parts[-1:]
+    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(named)) or "checkpoint"
+
+
+def checkpoint_sha256(path: Path) -> str:
+    """Return a digest of all files that the policy's actions depend on, the base of an adapter included."""
+    folder = find_checkpoint(path)
+    digest = hashlib.sha256()
+    for name, file in _hashed_files(folder):
+        digest.update(f"{name}\0{_file_sha256(file)}\n".encode())
+    base = adapter_base(folder)
+    if base is not None and base.is_dir():
+        digest.update(f"base\0{checkpoint_sha256(base)}\n".encode())
+    return digest.hexdigest()
+
+
+def adapter_base(folder: Path) -> Path | None:
+    """Return where the checkpoint that a LoRA adapter was trained on lies; None for a whole model."""
+    if not (folder / ADAPTER_CONFIG_FILE).is_file():
+        return None
+    base = read_json(folder / ADAPTER_CONFIG_FILE).get("base_model_name_or_path")
+    return Path(str(base)) if base else None
+
+
+def read_json(path: Path) -> dict[str, Any]:  # Any: JSON of another program
+    """Return the mapping that a JSON file holds.
+
+    Raises:
+        CheckpointError: it is missing or something else.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as exc:
+        raise CheckpointError(f"{path}: cannot be read as JSON ({exc}). Fetch the checkpoint again.") from exc
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path}: expected a mapping, found {data!r:.60}.")
+    return data
+
+
+def write_facts(folder: Path, facts: TrainingFacts) -> None:
+    """Write what the policy saw in training beside its weights."""
+    data = {"format_version": FACTS_VERSION, **dataclasses.asdict(facts)}
+    (folder / FACTS_FILE).write_text(f"{json.dumps(data, indent=2)}\n", encoding="utf-8")
+
+
+def read_facts(folder: Path) -> TrainingFacts | None:
+    """Return what the policy saw in training; None for a checkpoint that another program made.
+
+    Raises:
+        CheckpointError: the file is damaged or of another version.
+    """
+    path = folder / FACTS_FILE
+    if not path.is_file():
+        return None
+    data = read_json(path)
+    version = data.pop("format_version", None)
+    if version != FACTS_VERSION:
+        raise CheckpointError(
+            f"{path}: format version {version}, this program reads version {FACTS_VERSION}. Use the version "
+            f"of mikasa-vla-eval that wrote it."
+        )
+    try:
+        return decode(TrainingFacts, data, where=str(path))
+    except RecipeError as exc:
+        raise CheckpointError(f"{exc} The file was changed; fetch the checkpoint again.") from exc
+
+
+def checkpoint_hashes(args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
+    """Return what an evaluation notes of the weights that a recipe names: name -> digest.
+
+    Args:
+        args: the arguments of the recipe's adapter.
+        policy: the recipe's name.
+    """
+    checkpoint = args.get("checkpoint")
+    if not isinstance(checkpoint, str):
+        return {}
+    folder = find_checkpoint(Path(checkpoint))
+    hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
+    base = args.get("base_checkpoint")
+    if isinstance(base, str):
+        hashes[f"checkpoints/{policy}/base"] = checkpoint_sha256(Path(base))
+    facts = read_facts(folder)
+    if facts is not None:
+        hashes[f"datasets/{facts.dataset}"] = facts.dataset_sha256
+    return hashes
+
+
+def _hashed_files(folder: Path) -> Iterator[tuple[str, Path]]:
+    for file in sorted(folder.rglob("*")):
+        name = file.relative_to(folder).as_posix()
+        if file.is_file() and name not in NOT_HASHED:
+            yield name, file
+
+
+def _file_sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(CHUNK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()

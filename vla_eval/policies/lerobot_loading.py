@@ -1,0 +1,292 @@
+"""Load a LeRobot checkpoint so that nothing is missing without an error: weights, processors, statistics.
+
+lerobot's own loaders leave out what does not fit (`strict=False`), and those of π0, π0.5 and π0-FAST
+answer a failed load with random weights. Here every parameter is compared with the file afterwards.
+Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
+"""
+
+import os
+
+# Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
+
+import draccus
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors.torch import load_file
+from torch import Tensor
+
+from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
+from vla_eval.policies.checkpoint import (
+    ADAPTER_CONFIG_FILE,
+    ADAPTER_WEIGHTS_FILE,
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    TOKENIZER_FOLDER,
+    WEIGHTS_FILE,
+    adapter_base,
+    find_checkpoint,
+    read_json,
+)
+from vla_eval.policies.weights import check_same, put_weights
+
+NEEDED_STATISTICS = {
+    NormalizationMode.MEAN_STD: ("mean", "std"),
+    NormalizationMode.MIN_MAX: ("min", "max"),
+    NormalizationMode.QUANTILES: ("q01", "q99"),
+    NormalizationMode.QUANTILE10: ("q10", "q90"),
+}
+TOKENIZER_STEP = "tokenizer_processor"
+PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
+"""Where a processor step that is named by its import path may come from; others are never imported."""
+# Fields that make a constructor fetch weights which the checkpoint is about to replace.
+NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadOptions:
+    """How to load.
+
+    Attributes:
+        device: `cpu`, `cuda`, `cuda:1` …
+        dtype: `float32` or `bfloat16`, for policies that have such a setting; None: as saved.
+        tokenizer: folder of the tokenizer; None: the one in the checkpoint, else the one it names.
+        base_checkpoint: where the base of a LoRA adapter lies; None: where it was in training.
+    """
+
+    device: str
+    dtype: str | None = None
+    tokenizer: str | None = None
+    base_checkpoint: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadedPolicy:
+    """A policy ready for inference: `preprocessor`, `policy`, `postprocessor`, in this order."""
+
+    folder: Path
+    config: Any
+    policy: Any
+    preprocessor: Any
+    postprocessor: Any
+
+
+def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
+    """Load policy and processors.
+
+    Args:
+        path: a checkpoint or a run folder, see `find_checkpoint`.
+        options: how.
+
+    Raises:
+        CheckpointError: anything is missing, damaged, or does not fit.
+        MissingDependencyError: the policy needs a package that is not installed.
+    """
+    folder = find_checkpoint(path)
+    config = read_config(folder, options)
+    policy = load_weights(folder, config, options)
+    policy.eval()
+    preprocessor, postprocessor = load_processors(folder, config, options)
+    check_statistics(folder, preprocessor, postprocessor)
+    return LoadedPolicy(
+        folder=folder, config=config, policy=policy, preprocessor=preprocessor, postprocessor=postprocessor
+    )
+
+
+def read_config(folder: Path, options: LoadOptions) -> Any:
+    """Return the policy's configuration, set to the wanted device and precision."""
+    data = read_json(folder / CONFIG_FILE)
+    kind = data.pop("type", None)
+    cls = config_class(str(kind), where=str(folder / CONFIG_FILE))
+    data["device"] = options.device
+    if options.dtype is not None:
+        if "dtype" not in data:
+            raise CheckpointError(
+                f"{folder}: a policy of type '{kind}' has no setting `dtype`. Leave `dtype` out of its "
+                "recipe."
+            )
+        data["dtype"] = options.dtype
+    data.update({name: value for name, value in NO_DOWNLOADS.items() if name in data})
+    try:
+        config = draccus.decode(cls, data)
+    except Exception as exc:  # draccus has no class of its own for all that can be wrong
+        raise CheckpointError(
+            f"{folder / CONFIG_FILE}: not the configuration of a '{kind}' policy of the installed lerobot: "
+            f"{exc}"
+        ) from exc
+    return config
+
+
+def config_class(kind: str, *, where: str) -> Any:
+    """Return lerobot's configuration class of a type of policy; plugins (`lerobot_policy_*`) included."""
+    register_third_party_plugins()
+    known = list(PreTrainedConfig.get_known_choices())
+    if kind not in known:
+        error = unknown_name("LeRobot policy type", kind, known, where=where)
+        raise CheckpointError(
+            f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
+        )
+    return PreTrainedConfig.get_choice_class(kind)
+
+
+def make_empty_policy(config: Any, **kwargs: Any) -> Any:
+    """Return a policy with the weights that its constructor gives it."""
+    try:
+        return get_policy_class(config.type)(config, **kwargs)
+    except ImportError as exc:
+        raise MissingDependencyError(
+            f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
+        ) from exc
+    except OSError as exc:  # what transformers raises for files that are neither there nor cached
+        raise CheckpointError(
+            f"a LeRobot policy of type '{config.type}' could not be built without the network: {exc} Give it "
+            f"a local folder, or set HF_HUB_OFFLINE=0 once to let it fetch the file."
+        ) from exc
+
+
+def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
+    """Return the policy with exactly the weights of the checkpoint.
+
+    Args:
+        folder: with `model.safetensors`, or with a LoRA adapter.
+        config: what `read_config` returned.
+        options: `device`, `dtype` and `base_checkpoint` are used.
+        kwargs: further arguments of the policy's constructor.
+
+    Raises:
+        CheckpointError: keys, shapes or types differ; the message lists them.
+    """
+    if (folder / ADAPTER_CONFIG_FILE).is_file():
+        return _load_adapter(folder, config, options, kwargs)
+    policy = make_empty_policy(config, **kwargs)
+    weights = read_weights(folder / WEIGHTS_FILE)
+    put_weights(policy, weights, where=str(folder / WEIGHTS_FILE), cast=options.dtype is not None)
+    return policy.to(config.device)
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a safetensors file.
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    try:
+        return dict(load_file(path))
+    except Exception as exc:  # safetensors raises its own class, which is no public name
+        raise CheckpointError(
+            f"{path}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
+        ) from exc
+
+
+def _load_adapter(folder: Path, config: Any, options: LoadOptions, kwargs: Mapping[str, Any]) -> Any:
+    """Load a LoRA adapter on top of the checkpoint that it was trained on."""
+    from peft import PeftModel, get_peft_model_state_dict  # optional extra of lerobot
+
+    base = Path(options.base_checkpoint) if options.base_checkpoint else adapter_base(folder)
+    if base is None or not base.is_dir():
+        raise CheckpointError(
+            f"{folder}: a LoRA adapter needs the checkpoint it was trained on, which was at {base} and is "
+            f"not there. Name its folder with `base_checkpoint` in the recipe's args."
+        )
+    weights = read_weights(folder / ADAPTER_WEIGHTS_FILE)
+    policy = load_weights(find_checkpoint(base), config, options, **kwargs)
+    wrapped = PeftModel.from_pretrained(policy, str(folder), is_trainable=True)
+    # peft, too, leaves out what does not fit.
+    check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))
+    return wrapped.to(config.device)
+
+
+# ------------------------------------------------------------------------------------------ processors
+
+
+def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[Any, Any]:
+    """Return pre- and post-processor as the checkpoint describes them.
+
+    Raises:
+        CheckpointError: one is missing, or names code or a tokenizer that is not there.
+    """
+    described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
+    before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
+    overrides: dict[str, dict[str, Any]] = {}
+    if "device_processor" in before:
+        overrides["device_processor"] = {"device": config.device}
+    if "normalizer_processor" in before:
+        overrides["normalizer_processor"] = {"device": config.device}
+    if TOKENIZER_STEP in before:
+        tokenizer = _tokenizer(folder, options)
+        if tokenizer is not None:
+            overrides[TOKENIZER_STEP] = {"tokenizer_name": tokenizer}
+    elif options.tokenizer is not None:
+        raise CheckpointError(f"{folder}: `tokenizer` is given, but this policy's preprocessor has none.")
+    # The postprocessor ends with a step of the same name that brings actions to the CPU: left alone.
+    after_overrides = (
+        {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
+    )
+    try:
+        return make_pre_post_processors(  # type: ignore[no-any-return]
+            config,
+            pretrained_path=str(folder),
+            preprocessor_overrides=overrides,
+            postprocessor_overrides=after_overrides,
+        )
+    except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
+        raise CheckpointError(
+            f"{folder}: the processors cannot be made: {exc} Name a local folder with `tokenizer` in the "
+            f"recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
+            f"HF_HUB_OFFLINE=0 is set."
+        ) from exc
+
+
+def _tokenizer(folder: Path, options: LoadOptions) -> str | None:
+    if options.tokenizer is not None:
+        if not Path(options.tokenizer).is_dir():
+            raise CheckpointError(f"tokenizer: expected a folder, found nothing at {options.tokenizer}.")
+        return options.tokenizer
+    own = folder / TOKENIZER_FOLDER
+    return str(own) if own.is_dir() else None
+
+
+def _checked_steps(path: Path) -> tuple[str, ...]:
+    """Return the names of a processor's steps; refuse code that is no processor's."""
+    steps = read_json(path).get("steps", [])
+    names = []
+    for step in steps:
+        name, imported = step.get("registry_name"), step.get("class")
+        if name is None and not str(imported).startswith(PROCESSOR_PACKAGES):
+            # lerobot would import and call whatever is named here.
+            raise CheckpointError(
+                f"{path}: names the code '{imported}', which is neither lerobot's nor a lerobot plugin's. "
+                f"It is not run. If it is yours, register the step with ProcessorStepRegistry."
+            )
+        names.append(str(name))
+    return tuple(names)
+
+
+def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:
+    """Raise `CheckpointError` unless all that is normalised has its statistics.
+
+    lerobot passes on unchanged what it has no statistics of.
+    """
+    missing = []
+    for step in (*preprocessor.steps, *postprocessor.steps):
+        if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
+            continue
+        for key, feature in step.features.items():
+            mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
+            have = (step.stats or {}).get(key, {})
+            missing += [f"{key}.{name}" for name in NEEDED_STATISTICS.get(mode, ()) if name not in have]
+    if missing:
+        shown = ", ".join(dict.fromkeys(missing))
+        raise CheckpointError(
+            f"{folder}: the checkpoint has no statistics for {shown}; lerobot would skip that normalisation "
+            f"without a word. Fine-tune it on a dataset, or fetch the complete checkpoint."
+        )

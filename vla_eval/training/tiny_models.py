@@ -1,0 +1,93 @@
+"""π0 and π0.5 with a few thousand random weights, for tests: the whole way without network or GPU.
+
+lerobot 0.6.1 builds these models in full size only, so three names of its modules are replaced while a
+model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
+"""
+
+import contextlib
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal  # lerobot and transformers are untyped
+from unittest.mock import patch
+
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+
+Family = Literal["pi0", "pi05"]
+VOCABULARY = 512
+CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
+SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
+TINY_POLICY: dict[str, Any] = {
+    "chunk_size": 4,
+    "n_action_steps": 4,
+    "num_inference_steps": 2,
+    "image_resolution": [56, 56],
+    "dtype": "float32",
+}
+"""Fields of the policy's configuration that go with the tiny model."""
+
+
+@contextlib.contextmanager
+def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
+    """Make lerobot build the tiny model wherever it would build the full one, within the context."""
+    modeling: Any = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
+    sizes = {"depth": 2, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}  # 8 heads are hard-coded
+    vlm = modeling.GemmaConfig(width=64, mlp_dim=128, **sizes)
+    expert = modeling.GemmaConfig(width=32, mlp_dim=64, **sizes)
+    full_vlm = modeling.PaliGemmaForConditionalGenerationWithPiGemma
+    full_expert = modeling.PiGemmaForCausalLM
+
+    def make_vlm(config: Any) -> Any:
+        config._vocab_size = config.text_config.vocab_size = VOCABULARY
+        config.image_token_index = VOCABULARY - 1
+        config.projection_dim = config.vision_config.projection_dim = vlm.width
+        vision = config.vision_config
+        vision.hidden_size, vision.intermediate_size, vision.patch_size = 32, 64, 14
+        vision.num_hidden_layers, vision.num_attention_heads = 2, 2
+        return full_vlm(config=config)
+
+    def make_expert(config: Any) -> Any:
+        config.vocab_size = VOCABULARY
+        return full_expert(config=config)
+
+    with (
+        patch.object(modeling, "get_gemma_config", {"gemma_2b": vlm, "gemma_300m": expert}.__getitem__),
+        patch.object(modeling, "PaliGemmaForConditionalGenerationWithPiGemma", make_vlm),
+        patch.object(modeling, "PiGemmaForCausalLM", make_expert),
+    ):
+        yield
+
+
+def write_tiny_tokenizer(folder: Path) -> Path:
+    """Train a tokenizer on three sentences, save it, and return its folder."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast
+
+    tokenizer: Any = Tokenizer(models.BPE(unk_token="<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=VOCABULARY - 1,  # the last one is the image's
+        special_tokens=list(SPECIAL_TOKENS),
+        initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )
+    tokenizer.train_from_iterator(CORPUS, trainer)
+    make_fast: Any = PreTrainedTokenizerFast
+    fast = make_fast(
+        tokenizer_object=tokenizer,
+        pad_token="<pad>",
+        eos_token="<eos>",
+        bos_token="<bos>",
+        unk_token="<unk>",
+        padding_side="right",
+    )
+    fast.save_pretrained(str(folder))
+    return folder
+
+
+def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any) -> LeRobotPolicy:
+    """Make a policy from a tiny checkpoint; an adapter for recipes in tests."""
+    with tiny_paligemma(family):
+        return make_lerobot(context, **args)
