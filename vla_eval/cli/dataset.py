@@ -20,6 +20,20 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         "--state", choices=("eef", "joints"), default="eef", help="what observation.state is (%(default)s)"
     )
 
+    card = actions.add_parser("card", help="write README.md and a contact sheet", allow_abbrev=False)
+    card.add_argument("dataset", metavar="DIR", type=Path, help="a complete dataset")
+    card.add_argument("--license", metavar="ID", help="licence as the Hub names it (recordings: mit)")
+
+    push = actions.add_parser("push", help="upload a complete dataset to the Hub", allow_abbrev=False)
+    push.add_argument("dataset", metavar="DIR", type=Path, help="a complete dataset")
+    push.add_argument("repo_id", metavar="REPO_ID", help="USER/NAME on the Hub")
+    push.add_argument("--private", action="store_true", help="make the repository a private one")
+
+    pull = actions.add_parser("pull", help="download a dataset from the Hub", allow_abbrev=False)
+    pull.add_argument("repo_id", metavar="REPO_ID", help="USER/NAME on the Hub")
+    pull.add_argument("out", metavar="DIR", type=Path, help="a new folder")
+    pull.add_argument("--revision", metavar="REV", help="branch, tag or commit (default: the newest)")
+
 
 def run(args: argparse.Namespace) -> int:
     """Do the action."""
@@ -47,4 +61,32 @@ def _convert(args: argparse.Namespace) -> int:
     return 0
 
 
-_ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {"convert": _convert}
+def _card(args: argparse.Namespace) -> int:
+    from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
+
+    write_card(args.dataset, license_id=args.license)
+    print(f"{args.dataset / CARD_FILE}\n{args.dataset / SHEET_FILE}")
+    return 0
+
+
+def _push(args: argparse.Namespace) -> int:
+    from vla_eval.data.hub import push_dataset
+
+    print(push_dataset(args.dataset, args.repo_id, private=args.private))
+    return 0
+
+
+def _pull(args: argparse.Namespace) -> int:
+    from vla_eval.data.hub import pull_dataset
+
+    pulled = pull_dataset(args.repo_id, args.out, revision=args.revision)
+    print(f"{args.out}: commit {pulled.commit}, complete and checked")
+    return 0
+
+
+_ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "convert": _convert,
+    "card": _card,
+    "push": _push,
+    "pull": _pull,
+}

@@ -1,10 +1,12 @@
 """Open a dataset on this machine, never the network: lerobot looks on the Hub for whatever is missing."""
 
+import functools
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.import_utils import get_safe_default_video_backend
 
 from vla_eval.errors import DatasetError
 
@@ -37,10 +39,17 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
             raise DatasetError(
                 f"{root}: {path} is missing. Fetch the dataset again, or rebuild it from its manifest."
             )
+    options.setdefault("video_backend", _decoder())
     try:
         return LeRobotDataset(repo_id, root=root, **options)
     except (OSError, ValueError, KeyError, RuntimeError) as exc:
         raise DatasetError(f"{root}: lerobot cannot read the dataset ({exc!r:.300}).") from exc
+
+
+@functools.cache
+def _decoder() -> str:
+    """Return lerobot's choice of decoder; asked once, since torchcodec without FFmpeg fails slowly."""
+    return str(get_safe_default_video_backend())
 
 
 def _files(meta: LeRobotDatasetMetadata) -> list[Path]:

@@ -5,7 +5,6 @@ here was ever simulated, and no manifest says so: it is not a complete dataset.
 """
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,6 @@ def write_synthetic_dataset(
         state: which proprioception `observation.state` is.
         seed: of all that is drawn.
     """
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # lerobot must not look for a made-up name on the Hub
     features = dataset_features(state)
     dataset = LeRobotDataset.create(
         f"local/{root.name}",

@@ -1,0 +1,81 @@
+"""Fixtures of several test files."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="session")
+def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vla_eval.data.dataset_folder import digest_files
+    from vla_eval.data.manifest import (
+        FAILED_FILE,
+        MANIFEST_FILE,
+        MIKASA_FOLDER,
+        RECORDING_FILE,
+        DatasetFacts,
+        FailedSeed,
+        RecordedEpisode,
+        encode_actions,
+        write_entry,
+        write_lines,
+    )
+    from vla_eval.data.synthetic import write_synthetic_dataset
+
+    root = write_synthetic_dataset(
+        tmp_path_factory.mktemp("recorded") / "RememberColor3-v0", n_episodes=4, n_frames=13
+    )
+    (root / MIKASA_FOLDER).mkdir()
+    lengths = [13, 14, 15, 13]
+    episodes = [
+        RecordedEpisode(
+            episode_index=index,
+            task="RememberColor3-v0",
+            task_version=1,
+            env_kwargs={},
+            seed=1000 + index + (index >= 2),  # 1002 failed
+            instruction="look, wait, choose",
+            expert="oracle",
+            expert_version=1,
+            cue_steps=5,
+            delay_steps=5,
+            n_steps=n_steps,
+            success_step=n_steps,
+            actions=encode_actions(np.zeros((n_steps, 7), np.float32)),
+            intended_actions=None,
+            states_sha256="0" * 64,
+            images_sha256={},
+        )
+        for index, n_steps in enumerate(lengths)
+    ]
+    write_lines(root / MANIFEST_FILE, episodes)
+    write_lines(root / FAILED_FILE, [FailedSeed(seed=1002, n_steps=60)])
+    facts = DatasetFacts(
+        complete=True,
+        name="tiny",
+        task="RememberColor3-v0",
+        task_version=1,
+        instruction="look, wait, choose",
+        state="eef",
+        n_episodes=4,
+        n_frames=sum(lengths),
+        n_failed_seeds=1,
+        recipe={"name": "tiny", "keep": "successes", "cut": "after_success", "steps_after_success": 5},
+        recipe_sha256="1" * 64,
+        recipe_files={"policies/oracle": "2" * 64},
+        environment={},
+        device={"simulator": "fake"},
+        files=digest_files(root),
+    )
+    write_entry(root / RECORDING_FILE, facts)
+    return root
+
+
+@pytest.fixture
+def recorded(_recorded: Path, tmp_path: Path) -> Path:
+    """Return a copy of a dataset that counts as recorded: 4 episodes of 13, 14, 15, 13 frames."""
+    copy = tmp_path / "recorded" / _recorded.name
+    shutil.copytree(_recorded, copy)
+    return copy

@@ -1,0 +1,219 @@
+"""Write a dataset's card: `README.md` with the Hub's front matter, and a contact sheet.
+
+The same dataset gives the same card: no date, no machine's name, everything in a fixed order.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from vla_eval.data.dataset_summary import DatasetSummary, draw_sheet, summarize
+from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
+from vla_eval.results.durable import replace_file
+from vla_eval.tasks.catalog import TASKS
+
+CARD_FILE = Path("README.md")
+SHEET_FILE = Path("images/contact_sheet.png")
+OWN_LICENSE = "mit"  # of what is recorded here; of an import nothing is known
+MAX_SEEDS_SHOWN = 40
+
+
+def write_card(root: Path, *, license_id: str | None = None) -> str:
+    """Write card and contact sheet into a complete dataset, and return the card's text.
+
+    Args:
+        root: the dataset.
+        license_id: licence as the Hub names it; by default that of this project for recordings, and none
+            for imports.
+
+    Raises:
+        DatasetError: the dataset is not complete, or damaged.
+        StorageFullError: the disk is full.
+    """
+    summary = summarize(root)
+    (root / SHEET_FILE).parent.mkdir(exist_ok=True)
+    (root / SHEET_FILE).write_bytes(draw_sheet(root, summary))
+    text = render_card(summary, license_id=license_id)
+    replace_file(root / CARD_FILE, text)
+    return text
+
+
+def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> str:
+    """Return the card of a dataset."""
+    if license_id is None and summary.facts is not None:
+        license_id = OWN_LICENSE
+    sections = [_front_matter(license_id), f"# {_title(summary)}\n", _introduction(summary)]
+    for heading, section in _SECTIONS.items():
+        text = section(summary)
+        if text:
+            sections.append(f"## {heading}\n\n{text}")
+    if license_id is None:
+        sections.append("## Licence\n\nThat of the source, which the converter does not know.\n")
+    return "\n".join(sections)
+
+
+def _front_matter(license_id: str | None) -> str:
+    data = {
+        **({"license": license_id} if license_id else {}),
+        "task_categories": ["robotics"],
+        "tags": ["LeRobot", "ManiSkill", "memory", "mikasa-vla"],
+        # Without it the Hub's viewer guesses, and shows the manifest as data.
+        "configs": [{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    }
+    return f"---\n{yaml.safe_dump(data, sort_keys=False)}---\n"
+
+
+def _title(summary: DatasetSummary) -> str:
+    task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
+    return f"{task or 'Imported demonstrations'}: {len(summary.lengths)} demonstrations"
+
+
+def _introduction(summary: DatasetSummary) -> str:
+    task = TASKS.get(summary.facts.task) if summary.facts else None
+    about = f"{task.description} " if task else ""
+    sentences = "\n".join(f"> {sentence}" for sentence in summary.instructions)
+    return (
+        f"{about}Two cameras of 128 × 128 pixels, 20 frames per second, one frame per control step, as a "
+        f"LeRobotDataset v3.\n\nInstruction:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
+    )
+
+
+def _statistics(summary: DatasetSummary) -> str:
+    lengths = np.array(summary.lengths)
+    rows = [
+        ("episodes", str(len(lengths))),
+        ("frames", str(lengths.sum())),
+        ("frames per episode", f"{lengths.min()} to {lengths.max()}, mean {lengths.mean():.1f}"),
+        ("episodes with success", "not stored" if summary.n_success is None else str(summary.n_success)),
+    ]
+    if summary.facts is not None:
+        seeds = [episode.seed for episode in summary.episodes]
+        experts = sorted({f"{one.expert}, version {one.expert_version}" for one in summary.episodes})
+        rows += [
+            ("seeds", f"{min(seeds)} to {max(seeds)}"),
+            ("seeds left out because the expert failed", _failed(summary)),
+            ("expert", "; ".join(experts)),
+        ]
+    action = summary.action
+    numbers = zip(action.names, action.mean, action.std, action.low, action.high, strict=True)
+    lines = [f"| {name} | {value} |" for name, value in rows]
+    per_dim = [
+        f"| {name} | {mean:.4f} | {std:.4f} | {low:.4f} | {high:.4f} |"
+        for name, mean, std, low, high in numbers
+    ]
+    return "\n".join(
+        [
+            *("| | |", "|:--|:--|", *lines, ""),
+            *("| action | mean | std | min | max |", "|:--|--:|--:|--:|--:|", *per_dim, ""),
+        ]
+    )
+
+
+def _failed(summary: DatasetSummary) -> str:
+    seeds = [str(one.seed) for one in summary.failed]
+    shown = ", ".join(seeds[:MAX_SEEDS_SHOWN])
+    more = f" and {len(seeds) - MAX_SEEDS_SHOWN} more" if len(seeds) > MAX_SEEDS_SHOWN else ""
+    return f"{len(seeds)}: {shown}{more}" if seeds else "none"
+
+
+def _fields(summary: DatasetSummary) -> str:
+    lines = [f"| `{name}` | {kind} |" for name, kind in summary.fields.items()]
+    return "\n".join(["| field | type |", "|:--|:--|", *lines, ""])
+
+
+def _origin(summary: DatasetSummary) -> str:
+    """Say how a recording came about, and what proves it."""
+    facts = summary.facts
+    if facts is None:
+        return ""
+    replay = summary.replay
+    said = "not replayed yet (`mikasa-vla replay`)"
+    if replay is not None:
+        verdict = "passed" if replay.passed else f"FAILED ({len(replay.mismatches)} mismatches)"
+        said = f"{verdict}: {replay.n_episodes} of {replay.n_total} episodes, states {replay.states_compared}"
+    rows = [
+        ("task rules", f"{facts.task}, version {facts.task_version}"),
+        ("replay", said),
+        ("renderer", ", ".join(f"{key} {value}" for key, value in sorted(facts.device.items()))),
+        ("recipe sha256", f"`{facts.recipe_sha256}`"),
+        ("manifest sha256", f"`{facts.files[MANIFEST_FILE.as_posix()].sha256}`"),
+        *((f"{name} sha256", f"`{digest}`") for name, digest in sorted(facts.recipe_files.items())),
+    ]
+    lines = "\n".join(f"| {name} | {value} |" for name, value in rows)
+    recipe = yaml.safe_dump(facts.recipe, sort_keys=True, allow_unicode=True)
+    return (
+        f"`meta/mikasa/manifest.jsonl` has seed and actions of every episode: `mikasa-vla replay` checks the "
+        f"dataset with it. Digests of all files are in `meta/mikasa/recording.json`.\n\n"
+        f"| | |\n|:--|:--|\n{lines}\n\nRecipe:\n\n```yaml\n{recipe}```\n"
+    )
+
+
+def _import(summary: DatasetSummary) -> str:
+    """Say where an import came from, and what it lacks."""
+    facts = summary.imported
+    if facts is None:
+        return ""
+    lines = [
+        f"- layout of the source: `{facts.source_layout}`; digests of its files: `meta/mikasa/import.json`",
+        f"- instruction: {facts.instruction_source}",
+        f"- fields that the source does not have: {', '.join(facts.absent) or 'none'}",
+        f"- arrays of the source that were left out: {', '.join(facts.left_out) or 'none'}",
+        f"- actions are for the control mode `{facts.control_mode}`",
+    ]
+    if not facts.executable_by_pd_ee_delta_pose:
+        lines.append(
+            "- **not executable by `pd_ee_delta_pose`**: a policy trained on these actions cannot be "
+            "evaluated in this project's environments"
+        )
+    return "\n".join([*lines, ""])
+
+
+def _differences(summary: DatasetSummary) -> str:
+    """Say how a recording differs from the data that the paper's policies were trained on."""
+    facts = summary.facts
+    if facts is None:
+        return ""
+    lines = [
+        "- The simulation is a new implementation of the tasks, not the authors' code "
+        "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
+        _expert_difference(facts, summary),
+        f"- Kept: {facts.recipe.get('keep', 'successes')}; the paper's recorder kept every episode of its "
+        f"batch, whether it succeeded or not.",
+        f"- Cut: {_cut(facts)}; the paper's recorder went on to the horizon.",
+        "- Actions are end-effector deltas as they were executed; the paper's recordings for reinforcement "
+        "learning hold joint deltas.",
+        "- Pictures are video (lossy); the paper's are arrays of pixels.",
+    ]
+    if facts.recipe.get("render", {}).get("wrist_mesh") == "simplified":
+        lines.append("- The wrist camera's housing is drawn with a simpler mesh.")
+    return "\n".join([*lines, ""])
+
+
+def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
+    text = "- The paper's experts were trained by PPO; here the expert is "
+    text += f"`{facts.recipe.get('expert', 'oracle')}`"
+    noise = facts.recipe.get("action_noise", 0.0)
+    text += f", with noise of std {noise:g} in its actions." if noise else ", without noise."
+    if summary.action.constant:
+        text += (
+            f" Of its actions {', '.join(summary.action.constant)} never vary: normalise with care, and "
+            f"expect imitation to be easier than with the paper's data."
+        )
+    return text
+
+
+def _cut(facts: DatasetFacts) -> str:
+    if facts.recipe.get("cut") == "horizon":
+        return "at the horizon"
+    return f"{facts.recipe.get('steps_after_success')} steps after the first success"
+
+
+_SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {
+    "Statistics": _statistics,
+    "Fields": _fields,
+    "Origin and proof": _origin,
+    "Import": _import,
+    "Differences from the paper's data": _differences,
+}
