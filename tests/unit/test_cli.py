@@ -132,7 +132,7 @@ class TestShow:
 
 PROBE = """
 import json, sys
-from vla_eval.cli.main import VERBS, main
+from vla_eval.cli.main import main
 try:
     code = main(sys.argv[1:])
 except SystemExit as exc:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tqdm import tqdm
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class RecordingProgress:
-    """Implements `RecordingObserver` on standard error."""
+    """Implements `RecordingObserver` and `ReplayObserver`; all but mismatches goes to standard error."""
 
     def __init__(self, stop: StopRequest) -> None:
         """Take the request to stop."""
@@ -23,7 +23,9 @@ class RecordingProgress:
         self._n_done = self._n_before = self._n_total = 0
         self._begun = self._last_line = time.monotonic()
 
-    def on_phase(self, task: str, phase: "Phase", *, n_done: int, n_total: int) -> None:
+    def on_phase(
+        self, task: str, phase: "Phase | Literal['replaying']", *, n_done: int, n_total: int
+    ) -> None:
         """Begin a new bar, or a new line."""
         self.close()
         self._title = f"{task}: {phase}"
@@ -45,6 +47,10 @@ class RecordingProgress:
         if self._bar is not None:
             self._bar.update(n_done - self._n_done)
         self._n_done = n_done
+
+    def on_mismatch(self, sentence: str) -> None:
+        """Print it: it is what the command is for."""
+        tqdm.write(sentence, file=sys.stdout)
 
     def on_tick(self) -> bool:
         """Write a line now and then; return whether a signal has asked to stop."""

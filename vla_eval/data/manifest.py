@@ -135,6 +135,8 @@ class ReplayReport:
         pixels: whether pictures were compared, too.
         states_compared: `bit-equal`, or the tolerance where environments differ.
         mismatches: one sentence each.
+        lowest_psnr_db: camera -> how close the video comes to the rendered frames in the worst episode;
+            empty where pictures were not compared.
         manifest_sha256: digest of the manifest that was replayed; another manifest needs another replay.
         environment: where it was replayed.
     """
@@ -145,6 +147,7 @@ class ReplayReport:
     pixels: bool
     states_compared: str
     mismatches: tuple[str, ...]
+    lowest_psnr_db: dict[str, float]
     manifest_sha256: str
     environment: dict[str, Any] = field(default_factory=dict)  # Any: plain data
 

@@ -7,14 +7,14 @@ of workers.
 
 import importlib
 import time
-from collections import deque
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, Protocol
 
 from vla_eval.data.demonstrations import Attempt
+from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
 from vla_eval.data.recipe import DatasetRecipe, content_of, fingerprint, options_of
 from vla_eval.data.recording_folder import RecordingFolder
@@ -126,33 +126,66 @@ def record(
         VlaEvalError: a mistake in the recipe, a recording that cannot go on, a full disk. What was
             recorded stays.
     """
-    plan = plan_recording(recipe)
+    return run_plan(
+        recipe,
+        plan_recording(recipe),
+        out=out,
+        command=command,
+        allow_environment_change=allow_environment_change,
+        observer=observer or _Silence(),
+    )
+
+
+def run_plan(
+    recipe: DatasetRecipe,
+    plan: RecordingPlan,
+    *,
+    out: Path,
+    observer: RecordingObserver,
+    command: str = "",
+    allow_environment_change: bool = False,
+    selections: Mapping[str, Selection] | None = None,
+    source: str | None = None,
+) -> RecordingSummary:
+    """Record what is planned; see `record`.
+
+    Args:
+        recipe: what to record.
+        plan: what `plan_recording` makes of it.
+        out: the folder.
+        observer: is told of progress.
+        command: what the user typed.
+        allow_environment_change: go on although package versions or the machine have changed.
+        selections: task -> the attempts to render, where they are known already.
+        source: digest of what the selections were read from.
+    """
+    versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
         name=recipe.name,
-        config={**content_of(recipe), "task_versions": {one.task: one.task_version for one in plan.tasks}},
+        config={**content_of(recipe), "task_versions": versions, "source": source},
         recipes=plan.recipe_files,
         environment=collect_environment(),
         options=options_of(recipe),
         command=command,
     )
     datasets: list[RecordedDataset] = []
-    with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
-        n_workers = available_cores() if recipe.workers == "auto" else recipe.workers
-        with RecordingPool(
-            recording_main, size=n_workers, timeouts=recipe.timeouts, logs=folder.logs()
-        ) as pool:
-            recorder = _Recorder(
-                plan=plan,
-                folder=folder,
-                pool=pool,
-                observer=observer or _Silence(),
-                allow_environment_change=allow_environment_change,
-            )
-            try:
-                for task in plan.tasks:
-                    datasets.append(recorder.record(task))
-            except _Stopped:
-                return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
+    n_workers = available_cores() if recipe.workers == "auto" else recipe.workers
+    with (
+        RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder,
+        RecordingPool(recording_main, size=n_workers, timeouts=recipe.timeouts, logs=folder.logs()) as pool,
+    ):
+        recorder = _Recorder(
+            plan=plan,
+            folder=folder,
+            pool=pool,
+            observer=observer,
+            allow_environment_change=allow_environment_change,
+        )
+        try:
+            for task in plan.tasks:
+                datasets.append(recorder.record(task, (selections or {}).get(task.task)))
+        except _Stopped:
+            return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
     return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=False)
 
 
@@ -166,12 +199,12 @@ class _Recorder:
     observer: RecordingObserver
     allow_environment_change: bool
 
-    def record(self, task: TaskPlan) -> RecordedDataset:
+    def record(self, task: TaskPlan, selection: Selection | None) -> RecordedDataset:
         """Return the dataset of a task; made if it is not there yet."""
         begun = time.monotonic()
         path = self.folder.dataset(task.task)
         if not self.folder.is_finished(task.task):
-            selection = self._try_seeds(task)
+            selection = selection or self._try_seeds(task)
             shards = self._render(task, selection.kept)
             self._join(task, selection, shards)
         self.folder.remove_shards(task.task)  # also what a killed session has left
@@ -231,7 +264,7 @@ class _Recorder:
 
     def _finish(self, jobs: Sequence[RecordingJob]) -> Iterable[RecordingJob]:
         """Run the jobs, each again if it fails once; yields each when it is done."""
-        queue = _Jobs(jobs)
+        queue = JobList(jobs)
         n_tries: dict[int, int] = {}
         for event in self.pool.run(queue):
             answered = self._look_at(event)
@@ -287,22 +320,6 @@ class _Recorder:
             device=self.folder.device,
             files={},
         )
-
-
-class _Jobs:
-    """A `JobSource` of jobs that are all known from the start."""
-
-    def __init__(self, jobs: Iterable[RecordingJob]) -> None:
-        self._jobs = deque(jobs)
-
-    def __len__(self) -> int:
-        return len(self._jobs)
-
-    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> RecordingJob | None:
-        return self._jobs.popleft() if self._jobs else None
-
-    def give_back(self, job: RecordingJob) -> None:
-        self._jobs.appendleft(job)
 
 
 def _raise_if_hopeless(failed: Failed, n_tries: int, where: str) -> int:

@@ -15,15 +15,14 @@ from typing import Any, Self  # Any: lerobot is untyped
 
 import av
 import numpy as np
-import pyarrow.parquet as pq
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from numpy.typing import NDArray
 
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
 from vla_eval.data.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
+from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, from_json, write_lines
 from vla_eval.errors import DatasetError
 from vla_eval.results.durable import sync_folder
@@ -159,13 +158,6 @@ def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ..
 def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None:
     """Replace `meta/stats.json` by statistics over all rows and all pixels."""
     write_stats(dataset_statistics(read_columns(root), histograms), root)
-
-
-def read_columns(root: Path) -> dict[str, NDArray[np.generic]]:
-    """Return all numbers of a dataset: field -> (N,) or (N, D), in the order of frames."""
-    tables = [pq.read_table(path) for path in sorted((root / "data").glob("*/*.parquet"))]
-    names = tables[0].column_names
-    return {name: np.concatenate([np.asarray(table[name].to_pylist()) for table in tables]) for name in names}
 
 
 def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:

@@ -1,0 +1,116 @@
+"""`mikasa-vla replay`: do a dataset's episodes again and compare, or make it anew from its manifest."""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vla_eval.cli.arguments import workers_argument
+from vla_eval.errors import RecipeError
+
+if TYPE_CHECKING:
+    from vla_eval.data.manifest import ReplayReport
+
+EXIT_MISMATCH = 1
+DESCRIPTION = """Execute the stored actions of a dataset in the simulator; compare states and success, and
+with --pixels pictures. One line per mismatch. The result of a whole dataset is kept in it, and training
+refuses a dataset whose replay has failed.
+
+DATASET is the folder of one dataset, or one that holds some (OUT of `mikasa-vla record`)."""
+EPILOG = "exit codes: 0 no mismatch; 1 a mismatch, or a mistake; 130, 143 stopped by Ctrl-C, SIGTERM."
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "replay",
+        help="check a dataset by doing its episodes again",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
+    parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
+    parser.add_argument("--pixels", action="store_true", help="render, and compare pictures and video, too")
+    parser.add_argument(
+        "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
+    )
+    parser.add_argument(
+        "--rebuild",
+        type=Path,
+        metavar="OUT",
+        help="do not compare: make the dataset anew in OUT, from its manifest alone",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay; mismatches and summaries go to standard output, progress to standard error."""
+    if args.rebuild is not None:
+        return _rebuild(args)
+    # Here and not above: `mikasa-vla --help` need not wait for progress bars.
+    from vla_eval.cli.progress import stop_on_signals
+    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.data.replay import find_datasets, replay
+
+    code = 0
+    with stop_on_signals() as stop:
+        progress = RecordingProgress(stop)
+        try:
+            for dataset in find_datasets(args.dataset):
+                with tempfile.TemporaryDirectory() as logs:
+                    report = replay(
+                        dataset,
+                        logs=Path(logs),
+                        observer=progress,
+                        episodes=args.episodes,
+                        pixels=args.pixels,
+                        workers=args.workers,
+                    )
+                if report is None:
+                    return stop.exit_code
+                progress.close()
+                print(describe(dataset, report), flush=True)
+                code = code if report.passed else EXIT_MISMATCH
+        finally:
+            progress.close()
+    return code
+
+
+def describe(dataset: Path, report: "ReplayReport") -> str:
+    """Return the outcome of a dataset's replay, in one line."""
+    verdict = "as recorded" if report.passed else f"{len(report.mismatches)} MISMATCHES"
+    quality = "".join(f", {camera} ≥ {psnr:.1f} dB" for camera, psnr in report.lowest_psnr_db.items())
+    pictures = f"pictures compared{quality}" if report.pixels else "pictures not compared (--pixels)"
+    return (
+        f"{dataset}: {report.n_episodes} of {report.n_total} episodes replayed: {verdict}; states "
+        f"{report.states_compared}; {pictures}"
+    )
+
+
+def _rebuild(args: argparse.Namespace) -> int:
+    from vla_eval.cli.progress import stop_on_signals
+    from vla_eval.cli.record import describe as describe_dataset
+    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.data.rebuild import rebuild
+
+    if args.episodes is not None or args.pixels:
+        raise RecipeError(
+            "--rebuild makes the whole dataset anew: it does not go with --episodes or --pixels."
+        )
+    with stop_on_signals() as stop:
+        progress = RecordingProgress(stop)
+        try:
+            rebuilt = rebuild(args.dataset, out=args.rebuild, workers=args.workers, observer=progress)
+        finally:
+            progress.close()
+    if rebuilt is None:
+        print("Stopped. The same command goes on.", file=sys.stderr)
+        return stop.exit_code
+    print(describe_dataset(rebuilt.dataset))
+    print(
+        f"episodes whose raw pictures are those that were recorded: {rebuilt.n_same_pictures} "
+        f"of {rebuilt.dataset.facts.n_episodes}"
+    )
+    return 0

@@ -1,0 +1,56 @@
+"""What the last replay of a dataset found, kept in the dataset: training asks for it."""
+
+import hashlib
+from pathlib import Path
+
+from vla_eval.data.manifest import MANIFEST_FILE, REPLAY_FILE, ReplayReport, read_replay, write_entry
+from vla_eval.errors import DatasetError
+
+
+def keep_report(dataset: Path, report: ReplayReport) -> None:
+    """Write the report, unless one that is there says more.
+
+    A mismatch is always written. A report without any is written if it is about all episodes, and does
+    not hide a mismatch of pictures that it has not looked at.
+    """
+    if report.passed:
+        before = read_replay(dataset)
+        hides = (
+            before is not None
+            and before.manifest_sha256 == report.manifest_sha256
+            and not before.passed
+            and before.pixels
+            and not report.pixels
+        )
+        if hides or report.n_episodes < report.n_total:
+            return
+    write_entry(dataset / REPLAY_FILE, report)
+
+
+def require_passed(dataset: Path) -> ReplayReport | None:
+    """Raise `DatasetError` if a replay of the dataset has failed, or was one of another manifest.
+
+    Returns:
+        The report; None if the dataset has never been replayed.
+    """
+    report = read_replay(dataset)
+    if report is None:
+        return None
+    if report.manifest_sha256 != manifest_sha256(dataset):
+        raise DatasetError(
+            f"{dataset}: {REPLAY_FILE} is about another manifest. Replay the dataset: mikasa-vla replay "
+            f"{dataset}"
+        )
+    if not report.passed:
+        shown = "\n".join(f"  {sentence}" for sentence in report.mismatches[:5])
+        raise DatasetError(
+            f"{dataset}: its replay failed with {len(report.mismatches)} mismatches:\n{shown}\nWhat is "
+            f"learned from it would not fit the environment. Record it again, or make it anew from its "
+            f"manifest: mikasa-vla replay {dataset} --rebuild OUT"
+        )
+    return report
+
+
+def manifest_sha256(dataset: Path) -> str:
+    """Return the digest of a dataset's manifest."""
+    return hashlib.sha256((dataset / MANIFEST_FILE).read_bytes()).hexdigest()
