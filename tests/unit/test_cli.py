@@ -39,8 +39,7 @@ class TestMistakes:
         message = mistake(capsys, "evla")
 
         assert message == (
-            "mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? "
-            f"Known: {', '.join(VERBS)}.\n"
+            f"mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? Known: {', '.join(VERBS)}.\n"
         )
 
     def test_an_unknown_flag(self, capsys: pytest.CaptureFixture[str]) -> None:
