@@ -81,6 +81,10 @@ class RecordingError(VlaEvalError):
     """Demonstrations could not be recorded: an expert that fails, a worker that dies, states that differ."""
 
 
+class TrainingError(VlaEvalError):
+    """A fine-tuning cannot be started, continued, or has gone wrong."""
+
+
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 

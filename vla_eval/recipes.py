@@ -16,6 +16,7 @@ from vla_eval.decoding import decode, find_field, load_yaml
 from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.training.recipe import FinetuneRecipe
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
 PACKAGE_ROOT = Path(__file__).parent
@@ -50,6 +51,7 @@ class PolicyRecipe:
         default_n_action_steps: actions executed per inference, where the evaluation names none.
         max_workers: how many workers `workers: auto` may start, since each loads the policy.
         needs_candidates: the policy makes no sense for a task without candidates; such a pair is left out.
+        finetune: how weights for it are trained; None for policies that have nothing to train.
     """
 
     version: int
@@ -59,6 +61,7 @@ class PolicyRecipe:
     default_n_action_steps: int = 1
     max_workers: int | None = None
     needs_candidates: bool = False
+    finetune: FinetuneRecipe | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""

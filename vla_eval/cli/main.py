@@ -15,7 +15,7 @@ from vla_eval import __version__
 from vla_eval.errors import VlaEvalError, did_you_mean
 
 PROGRAM = "mikasa-vla"
-VERBS = ("eval", "report", "record", "replay", "dataset", "list", "show", "doctor", "bench")
+VERBS = ("eval", "report", "record", "replay", "dataset", "finetune", "list", "show", "doctor", "bench")
 EXIT_USER_MISTAKE = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
 

@@ -10,7 +10,6 @@ import os
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
@@ -165,12 +164,20 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
     """
+    return fill_policy(make_empty_policy(config, **kwargs), folder, options).to(config.device)
+
+
+def fill_policy(policy: Any, folder: Path, options: LoadOptions) -> Any:
+    """Put the weights of a checkpoint into a policy, or an adapter on top of them; return the policy.
+
+    Raises:
+        CheckpointError: keys, shapes or types differ; the message lists them.
+    """
     if (folder / ADAPTER_CONFIG_FILE).is_file():
-        return _load_adapter(folder, config, options, kwargs)
-    policy = make_empty_policy(config, **kwargs)
+        return _fill_adapter(policy, folder, options)
     weights = read_weights(folder / WEIGHTS_FILE)
     put_weights(policy, weights, where=str(folder / WEIGHTS_FILE), cast=options.dtype is not None)
-    return policy.to(config.device)
+    return policy
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
@@ -187,7 +194,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         ) from exc
 
 
-def _load_adapter(folder: Path, config: Any, options: LoadOptions, kwargs: Mapping[str, Any]) -> Any:
+def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
     """Load a LoRA adapter on top of the checkpoint that it was trained on."""
     from peft import PeftModel, get_peft_model_state_dict  # optional extra of lerobot
 
@@ -198,11 +205,11 @@ def _load_adapter(folder: Path, config: Any, options: LoadOptions, kwargs: Mappi
             f"not there. Name its folder with `base_checkpoint` in the recipe's args."
         )
     weights = read_weights(folder / ADAPTER_WEIGHTS_FILE)
-    policy = load_weights(find_checkpoint(base), config, options, **kwargs)
-    wrapped = PeftModel.from_pretrained(policy, str(folder), is_trainable=True)
+    filled = fill_policy(policy, find_checkpoint(base), options)
+    wrapped = PeftModel.from_pretrained(filled, str(folder), is_trainable=True)
     # peft, too, leaves out what does not fit.
     check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))
-    return wrapped.to(config.device)
+    return wrapped
 
 
 # ------------------------------------------------------------------------------------------ processors

@@ -1,0 +1,89 @@
+"""`mikasa-vla finetune`: fine-tune a policy on a dataset, or go on with it."""
+
+import argparse
+import shlex
+import sys
+from typing import Any
+
+from vla_eval.decoding import decode
+from vla_eval.errors import RecipeError
+from vla_eval.recipes import apply_overrides, load_recipe
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
+
+DESCRIPTION = """Train a policy on a dataset: lerobot's training loop, the recipe in policies/NAME.yaml.
+
+CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`; or name --policy
+and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
+`finetune` section (--set policy.chunk_size=8). The same command again goes on after a kill, exactly.
+Then: mikasa-vla eval --policy RUN --task TASK"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "finetune",
+        help="train a policy on a dataset, or go on with it",
+        description=DESCRIPTION,
+        epilog="docs/finetuning.md explains recipes, memory and resuming.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
+    parser.add_argument("--policy", metavar="NAME", help="recipe in policies/ with a `finetune` section")
+    parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset")
+    parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")
+    parser.add_argument("--batch-size", type=int, metavar="B", help="samples per step (the recipe's)")
+    parser.add_argument("--run-seed", type=int, metavar="S", help="seed of weights, order and noise (0)")
+    parser.add_argument("--base-checkpoint", metavar="DIR", help="weights to start from")
+    parser.add_argument("--device", metavar="D", help="auto, cpu, cuda")
+    parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-DATASET-SEED)")
+    parser.add_argument(
+        "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="A.B=C",
+        help="change any field of the recipe's `finetune` section",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fine-tune; lines for a person go to standard error, the checkpoint's folder to standard output."""
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from vla_eval.training.finetune import finetune
+
+    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
+    print(summary.checkpoint)
+    return 0
+
+
+def _config(args: argparse.Namespace) -> FinetuneConfig:
+    """Return the configuration: the file, flags on top of it, `--set` on top of those."""
+
+    def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        for name in ("policy", "dataset", "run_seed", "device", "out"):
+            if getattr(args, name) is not None:
+                data[name] = getattr(args, name)
+        if args.allow_unreplayed:
+            data["allow_unreplayed"] = True
+        changes: dict[str, Any] = data.setdefault("finetune", {})
+        for name in ("steps", "batch_size", "base_checkpoint"):
+            if getattr(args, name) is not None:
+                changes[name] = getattr(args, name)
+        apply_overrides(changes, args.overrides, cls=FinetuneRecipe)
+
+    if args.config is not None:
+        return load_recipe("configs", args.config, FinetuneConfig, edit=edit).value
+    data: dict[str, Any] = {}
+    edit(data)
+    for name in ("policy", "dataset"):
+        if name not in data:
+            raise RecipeError(
+                f"Name a configuration, or a policy and a dataset; --{name} is missing. Example: mikasa-vla "
+                f"finetune --policy act --dataset demos/RememberColor3-v0 --steps 20000"
+            )
+    return decode(FinetuneConfig, data, where="command line")

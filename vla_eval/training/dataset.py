@@ -1,0 +1,87 @@
+"""What a fine-tuning takes from a dataset, after making sure that it is whole and was replayed."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+from vla_eval.data.completeness import check_complete
+from vla_eval.data.dataset_folder import open_recorded
+from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.data.imported import ImportFacts
+from vla_eval.data.manifest import FileDigest
+from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.replay_report import require_passed
+from vla_eval.errors import DatasetError
+
+RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # what our recordings' actions are for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingDataset:
+    """A dataset that may be trained on.
+
+    Attributes:
+        root: its folder.
+        name: the folder's name.
+        sha256: digest of the digests of all its files.
+        task: task id; empty for an import that names none.
+        state, control_mode: see `TrainingFacts`.
+        was_replayed: whether a replay has confirmed it.
+        meta: lerobot's description of it.
+    """
+
+    root: Path
+    name: str
+    sha256: str
+    task: str
+    state: str
+    control_mode: str
+    was_replayed: bool
+    meta: Any
+
+
+def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
+    """Return a dataset that is complete and, unless that is waived, was replayed without a mismatch.
+
+    Raises:
+        DatasetError: it is not.
+    """
+    if not root.is_dir():
+        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
+    facts = check_complete(root)
+    is_import = isinstance(facts, ImportFacts)
+    report = None if is_import else require_passed(root)
+    if report is None and not allow_unreplayed:
+        way = "It was imported and cannot be replayed" if is_import else f"Run mikasa-vla replay {root}"
+        raise DatasetError(
+            f"{root}: no replay has confirmed this dataset: nobody knows whether its actions lead to what "
+            f"its pictures show. {way}; or train on it all the same with --allow-unreplayed, which is noted "
+            f"in the run."
+        )
+    if isinstance(facts, ImportFacts) and not facts.executable_by_pd_ee_delta_pose:
+        raise DatasetError(
+            f"{root}: its actions are for '{facts.control_mode}', which the environments here do not "
+            f"execute. A policy that is trained on it could not be evaluated."
+        )
+    opened = open_local_dataset(root) if is_import else open_recorded(root)
+    missing = [key for key in CAMERA_KEYS.values() if key not in opened.meta.features]
+    if missing:
+        raise DatasetError(f"{root}: expected the images {', '.join(missing)}, found none of that name.")
+    return TrainingDataset(
+        root=root,
+        name=root.resolve().name,
+        sha256=files_sha256(facts.files),
+        task=facts.task or "",
+        state=facts.state,
+        control_mode=facts.control_mode if isinstance(facts, ImportFacts) else RECORDED_CONTROL_MODE,
+        was_replayed=report is not None,
+        meta=opened.meta,
+    )
+
+
+def files_sha256(files: Mapping[str, FileDigest]) -> str:
+    """Return one digest for all files of a dataset."""
+    lines = (f"{name}\0{digest.sha256}\n" for name, digest in sorted(files.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -1,0 +1,254 @@
+"""Fine-tune: recipe and dataset in, a run folder with checkpoints out; the same call goes on after a kill."""
+
+import contextlib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+from unittest.mock import patch
+
+from lerobot.configs.default import DatasetConfig, PeftConfig, WandBConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.decoding import decode
+from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint import (
+    MODEL_FOLDER,
+    TrainingFacts,
+    checkpoint_sha256,
+    find_checkpoint,
+)
+from vla_eval.policies.lerobot import choose_device
+from vla_eval.provenance import collect_environment
+from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
+from vla_eval.results.durable import FolderLock
+from vla_eval.training.dataset import TrainingDataset, training_dataset
+from vla_eval.training.description import describe_model
+from vla_eval.training.loop import LoopHooks, run_loop
+from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
+from vla_eval.training.run_folder import METRICS_FILE, TRAIN_FOLDER, open_folder
+
+LOCK_FILE = "finetune.lock"
+TOKENIZER_STEP = "TokenizerProcessorStep"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneSummary:
+    """What a call has come to: the run folder, and the checkpoint that an evaluation takes."""
+
+    out: Path
+    checkpoint: Path
+
+
+def default_out(config: FinetuneConfig) -> Path:
+    """Return the run folder of a fine-tuning that names none."""
+    return (
+        Path("runs") / f"{Path(config.policy).stem}-{Path(config.dataset).resolve().name}-{config.run_seed}"
+    )
+
+
+def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
+
+    Raises:
+        RecipeError: the policy has none, or a field is wrong.
+    """
+    recipe = load_recipe("policies", config.policy, PolicyRecipe)
+    if recipe.value.finetune is None:
+        raise RecipeError(
+            f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
+            f"`mikasa-vla list policies` shows the recipes."
+        )
+    data = _merged(to_data(recipe.value.finetune), config.finetune)
+    value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
+    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+
+
+def finetune(
+    config: FinetuneConfig, *, command: str = "", say: Callable[[str], None] = lambda _line: None
+) -> FinetuneSummary:
+    """Fine-tune, or go on with it.
+
+    Args:
+        config: what to train on what.
+        command: what the user typed, for the record.
+        say: is given lines for a person.
+
+    Raises:
+        VlaEvalError: a mistake; what was saved stays.
+    """
+    recipe = load_finetune_recipe(config)
+    dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    device = choose_device(config.device)
+    policy = policy_config(recipe.value, dataset, device=device)
+    frames = used_frames(policy, dataset)
+    out = Path(config.out) if config.out is not None else default_out(config)
+    say(
+        f"dataset: {dataset.name} {dataset.sha256[:12]}, {frames.n_used} of {frames.n_frames} frames as "
+        "starts"
+    )
+    if not masks_padding(policy):
+        say(
+            "padded actions: this policy does not mask them; chunks that go beyond an episode's end are left "
+            "out"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    with _lock(out):
+        resume_from = _open(out, recipe, dataset, config, command)
+        say(f"run: {out}" + (f", going on from step {int(resume_from.name)}" if resume_from else ""))
+        _train(recipe.value, dataset, policy, config, out, resume_from, say)
+    return FinetuneSummary(out=out, checkpoint=find_checkpoint(out))
+
+
+def _train(
+    recipe: FinetuneRecipe,
+    dataset: TrainingDataset,
+    policy: Any,
+    config: FinetuneConfig,
+    out: Path,
+    resume_from: Path | None,
+    say: Callable[[str], None],
+) -> None:
+    if resume_from is not None and int(resume_from.name) >= recipe.steps:
+        return
+    base = find_checkpoint(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None
+    policy.pretrained_path = base
+    # Of a LoRA run the adapter names its base; of all others the checkpoint is whole.
+    weights = resume_from / MODEL_FOLDER if resume_from is not None else base
+
+    def describe(model: Any) -> None:
+        for line in describe_model(model).lines():
+            say(line)
+
+    hooks = LoopHooks(
+        facts=_facts(dataset, policy, config, out),
+        metrics_file=out / METRICS_FILE,
+        log_every_steps=recipe.log_every_steps,
+        run_seed=config.run_seed,
+        weights=weights,
+        cast=base is not None,
+        decode_ahead=recipe.decode_ahead,
+        tokenizer=recipe.tokenizer,
+        on_model=describe,
+        on_metrics=lambda line: say(
+            f"step {int(line['step'])}/{recipe.steps}  loss {line['loss']:.4f}  lr {line['lr']:.2e}  "
+            f"{line['update_s'] + line['dataloading_s']:.3f} s/step"
+        ),
+    )
+    loop_config = _loop_config(recipe, dataset, policy, config.run_seed, out, resume=resume_from is not None)
+    with _tokenizer_from(recipe.tokenizer, recipe.type):
+        run_loop(loop_config, hooks, resume_from=resume_from)
+
+
+def _loop_config(
+    recipe: FinetuneRecipe, dataset: TrainingDataset, policy: Any, run_seed: int, out: Path, *, resume: bool
+) -> Any:
+    lora = recipe.lora
+    config = TrainPipelineConfig(
+        dataset=DatasetConfig(
+            repo_id=f"local/{dataset.name}",
+            root=str(dataset.root),
+            use_imagenet_stats=recipe.imagenet_statistics,
+        ),
+        policy=policy,
+        output_dir=out / TRAIN_FOLDER,
+        resume=resume,
+        seed=run_seed,
+        steps=recipe.steps,
+        batch_size=recipe.batch_size,
+        num_workers=recipe.num_workers,
+        log_freq=recipe.log_every_steps,
+        save_freq=recipe.save_every_steps,
+        env_eval_freq=0,
+        rename_map=dict(recipe.rename_cameras),
+        wandb=WandBConfig(enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none"),
+        peft=None
+        if lora is None
+        else PeftConfig(r=lora.rank, lora_alpha=lora.alpha or lora.rank, target_modules=lora.target_modules),
+    )
+    if resume:  # lerobot then expects them from the file that it does not read here
+        config.optimizer = policy.get_optimizer_preset()
+        config.scheduler = policy.get_scheduler_preset()
+    return config
+
+
+def _facts(dataset: TrainingDataset, policy: Any, config: FinetuneConfig, out: Path) -> TrainingFacts:
+    features = dataset.meta.features
+    return TrainingFacts(
+        run=out.resolve().name,
+        dataset=dataset.name,
+        dataset_sha256=dataset.sha256,
+        task=dataset.task,
+        state=dataset.state,
+        images={field: tuple(features[field]["shape"][:2]) for field in CAMERA_KEYS.values()},
+        fps=float(dataset.meta.fps),
+        action_names=tuple(features["action"]["names"]),
+        control_mode=dataset.control_mode,
+        run_seed=config.run_seed,
+    )
+
+
+def _open(
+    out: Path, recipe: Recipe[FinetuneRecipe], dataset: TrainingDataset, config: FinetuneConfig, command: str
+) -> Path | None:
+    value = recipe.value
+    settings: dict[str, Any] = {  # Any: plain data
+        "finetune": to_data(value),
+        "dataset": {"name": dataset.name, "sha256": dataset.sha256},
+        "run_seed": config.run_seed,
+        "base_sha256": checkpoint_sha256(Path(value.base_checkpoint)) if value.base_checkpoint else None,
+    }
+    record: dict[str, Any] = {  # Any: plain data
+        "policy": recipe.name,
+        "recipe_sha256": recipe.sha256,
+        "dataset_was_replayed": dataset.was_replayed,
+        "environment": collect_environment(),
+        "command": command,
+    }
+    return open_folder(out, settings, record, ignore=frozenset({LOCK_FILE}))
+
+
+@contextlib.contextmanager
+def _lock(out: Path) -> Any:
+    if os.environ.get("RANK", "0") != "0":  # accelerate: the first process has it
+        yield
+        return
+    lock = FolderLock(out / LOCK_FILE)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def _tokenizer_from(folder: str | None, kind: str) -> Any:
+    """Let the policy's processors use this tokenizer: lerobot has the names of π0's written into its code."""
+    if folder is None:
+        yield
+        return
+    import importlib
+
+    processing: Any = importlib.import_module(f"lerobot.policies.{kind}.processor_{kind}")
+    if not Path(folder).is_dir() or not hasattr(processing, TOKENIZER_STEP):
+        raise RecipeError(
+            f"finetune.tokenizer: expected the folder of a tokenizer and a policy that uses one, found "
+            f"{folder} and '{kind}'."
+        )
+    step = getattr(processing, TOKENIZER_STEP)
+    with patch.object(
+        processing, TOKENIZER_STEP, lambda **fields: step(**{**fields, "tokenizer_name": folder})
+    ):
+        yield
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+    """Put changes on top, field by field; an empty mapping empties."""
+    merged = dict(base)
+    for name, value in changes.items():
+        inner = merged.get(name)
+        merges = isinstance(inner, dict) and isinstance(value, dict) and value
+        merged[name] = _merged(inner, value) if merges and inner else value
+    return merged

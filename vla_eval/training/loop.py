@@ -1,0 +1,221 @@
+"""lerobot's own training loop, with some of the names it calls replaced while it runs.
+
+lerobot 0.6.1 has no place to hook into, so names of its module are replaced (the version is pinned, and
+a test notices if one is gone):
+
+- `make_policy`: weights of a base are loaded strictly, never by the loaders that swallow errors.
+- `make_pre_post_processors`: those of a base or of a checkpoint get the tokenizer that lies on this machine.
+- `make_optimizer_and_scheduler`: what is about to be trained is reported.
+- `make_train_eval_datasets`: optionally, frames are decoded once and not per sample.
+- `update_policy`: all noise of a step is drawn from (run seed, step, process), so that a run that was
+  killed goes on exactly as it would have; metrics are written.
+- `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on.
+"""
+
+import contextlib
+import importlib
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+from unittest.mock import patch
+
+import numpy as np
+from lerobot.utils.random_utils import set_seed
+
+from vla_eval.data.memory_loader import MemoryDataset
+from vla_eval.errors import TrainingError
+from vla_eval.policies.checkpoint import (
+    MODEL_FOLDER,
+    PREPROCESSOR_FILE,
+    TOKENIZER_FOLDER,
+    TrainingFacts,
+    read_json,
+    write_facts,
+)
+from vla_eval.policies.lerobot_loading import TOKENIZER_STEP, LoadOptions, fill_policy
+
+PARTIAL_PREFIX = ".partial-"
+REPLACED = (
+    "make_policy",
+    "make_pre_post_processors",
+    "make_optimizer_and_scheduler",
+    "make_train_eval_datasets",
+    "update_policy",
+    "save_checkpoint",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopHooks:
+    """What is to happen at the replaced places.
+
+    Attributes:
+        facts: written beside each checkpoint's weights.
+        metrics_file: one line of JSON per logged step.
+        log_every_steps: how often.
+        run_seed: of all noise.
+        weights: folder of the weights to start from; None: from scratch.
+        cast: whether the weights' precision may differ from the model's.
+        decode_ahead, tokenizer: see `FinetuneRecipe`.
+        on_model: called with the model before its optimizer is made.
+        on_metrics: called with each line of metrics.
+    """
+
+    facts: TrainingFacts
+    metrics_file: Path
+    log_every_steps: int
+    run_seed: int
+    weights: Path | None
+    cast: bool
+    decode_ahead: bool
+    tokenizer: str | None
+    on_model: Callable[[Any], None]
+    on_metrics: Callable[[dict[str, float]], None]
+
+
+def run_loop(config: Any, hooks: LoopHooks, *, resume_from: Path | None) -> None:
+    """Train.
+
+    Args:
+        config: lerobot's `TrainPipelineConfig`.
+        hooks: see there.
+        resume_from: folder of a checkpoint (`…/000100`) to go on from.
+    """
+    module: Any = importlib.import_module("lerobot.scripts.lerobot_train")
+    for name in REPLACED:
+        if not hasattr(module, name):
+            raise TrainingError(
+                f"the installed lerobot's training loop does not call '{name}' any more. Install the version "
+                f"that this package names: pip install lerobot==0.6.1"
+            )
+    # lerobot reads the command line again, for the checkpoint to go on from.
+    arguments = [sys.argv[0]]
+    if resume_from is not None:
+        arguments.append(f"--config_path={resume_from / MODEL_FOLDER}")
+    with (
+        patch.object(sys, "argv", arguments),
+        _logging_as_it_was(),
+        contextlib.ExitStack() as stack,
+    ):
+        for name, replacement in _replacements(module, hooks).items():
+            stack.enter_context(patch.object(module, name, replacement))
+        module.train(config)
+
+
+def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]]:
+    originals = {name: getattr(module, name) for name in REPLACED}
+
+    def make_policy(*, cfg: Any, ds_meta: Any, rename_map: Any = None) -> Any:
+        path, cfg.pretrained_path = cfg.pretrained_path, None  # lerobot's loader is not to be asked
+        peft, cfg.use_peft = cfg.use_peft, False
+        set_seed(hooks.run_seed)
+        policy = originals["make_policy"](cfg=cfg, ds_meta=ds_meta, rename_map=rename_map or {"": ""})
+        cfg.pretrained_path, cfg.use_peft = path, peft
+        if hooks.weights is None:
+            return policy
+        options = LoadOptions(device=cfg.device, dtype=getattr(cfg, "dtype", None) if hooks.cast else None)
+        return fill_policy(policy, hooks.weights, options).to(cfg.device)
+
+    def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
+        tokenizer = _tokenizer_of(Path(pretrained_path), hooks.tokenizer) if pretrained_path else None
+        if tokenizer is not None:
+            overrides = {**kwargs["preprocessor_overrides"], TOKENIZER_STEP: {"tokenizer_name": tokenizer}}
+            kwargs["preprocessor_overrides"] = overrides
+        return originals["make_pre_post_processors"](policy_cfg, pretrained_path=pretrained_path, **kwargs)
+
+    def make_optimizer_and_scheduler(cfg: Any, policy: Any) -> Any:
+        hooks.on_model(policy)
+        return originals["make_optimizer_and_scheduler"](cfg, policy)
+
+    def make_train_eval_datasets(cfg: Any) -> Any:
+        training, held_out = originals["make_train_eval_datasets"](cfg)
+        return (MemoryDataset(training) if hooks.decode_ahead else training), held_out
+
+    def update_policy(tracker: Any, *args: Any, **kwargs: Any) -> Any:
+        process = kwargs["accelerator"].process_index
+        seed_step(hooks.run_seed, tracker.steps, process)
+        answer = originals["update_policy"](tracker, *args, **kwargs)
+        step = tracker.steps + 1
+        if step % hooks.log_every_steps == 0 and process == 0:
+            _write_metrics(hooks, step, tracker)
+        return answer
+
+    def save_checkpoint(checkpoint_dir: Path, **kwargs: Any) -> None:
+        partial = checkpoint_dir.with_name(f"{PARTIAL_PREFIX}{checkpoint_dir.name}")
+        originals["save_checkpoint"](checkpoint_dir=partial, **kwargs)
+        write_facts(partial / MODEL_FOLDER, hooks.facts)
+        _save_tokenizer(kwargs["preprocessor"], partial / MODEL_FOLDER / TOKENIZER_FOLDER)
+        _sync(partial)
+        os.replace(partial, checkpoint_dir)
+
+    replaced = (
+        make_policy,
+        make_pre_post_processors,
+        make_optimizer_and_scheduler,
+        make_train_eval_datasets,
+        update_policy,
+        save_checkpoint,
+    )
+    return {function.__name__: function for function in replaced}
+
+
+def seed_step(run_seed: int, step: int, process: int) -> None:
+    """Seed all global generators from these three numbers: lerobot's policies draw from them."""
+    drawn = np.random.SeedSequence(run_seed, spawn_key=(step, process)).generate_state(1)
+    set_seed(int(drawn[0]))
+
+
+def _write_metrics(hooks: LoopHooks, step: int, tracker: Any) -> None:
+    values = {name: value for name, value in tracker.to_dict().items() if name != "steps"}
+    line = {"step": step, **{name: float(value) for name, value in values.items()}}
+    with hooks.metrics_file.open("a", encoding="utf-8") as file:
+        file.write(f"{json.dumps(line)}\n")
+    hooks.on_metrics(line)
+    if not np.isfinite(line["loss"]):
+        raise TrainingError(
+            f"step {step}: the loss is {line['loss']}. Lower the learning rate, or look for fields of the "
+            f"dataset that hardly vary (docs/finetuning.md)."
+        )
+
+
+def _tokenizer_of(folder: Path, named: str | None) -> str | None:
+    """Return the tokenizer for processors that are loaded from a folder; None if they need none of ours."""
+    own = folder / TOKENIZER_FOLDER
+    found = named or (str(own) if own.is_dir() else None)
+    steps = read_json(folder / PREPROCESSOR_FILE).get("steps", [])
+    return found if any(step.get("registry_name") == TOKENIZER_STEP for step in steps) else None
+
+
+def _save_tokenizer(preprocessor: Any, folder: Path) -> None:
+    """Keep the tokenizer beside the weights: the name it was loaded by may mean nothing elsewhere."""
+    for step in preprocessor.steps:
+        tokenizer = getattr(step, "input_tokenizer", None)
+        if tokenizer is not None:
+            tokenizer.save_pretrained(str(folder))
+
+
+def _sync(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _logging_as_it_was() -> Iterator[None]:
+    """Undo what lerobot does to the root logger."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    try:
+        yield
+    finally:
+        root.handlers[:] = handlers
+        root.setLevel(level)

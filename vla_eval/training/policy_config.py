@@ -1,0 +1,122 @@
+"""From a recipe and a dataset to lerobot's configuration of a policy. Knows nothing of the loop."""
+
+import dataclasses
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any, NamedTuple  # lerobot is untyped
+
+import draccus
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.errors import RecipeError, SpecMismatchError, did_you_mean, unknown_name
+from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
+from vla_eval.training.dataset import TrainingDataset
+from vla_eval.training.recipe import FinetuneRecipe
+
+PADDING_KEY = "action_is_pad"
+
+
+class UsedFrames(NamedTuple):
+    """How many frames of a dataset a chunk can begin at, of how many."""
+
+    n_used: int
+    n_frames: int
+
+
+def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: str) -> Any:
+    """Return lerobot's configuration: the base's, if any, with the recipe's values and the dataset's fields.
+
+    Raises:
+        RecipeError: a field that the policy does not have, or a value that it refuses.
+        CheckpointError: the base checkpoint cannot be read, or there is no such type of policy.
+        SpecMismatchError: the recipe renames cameras that are not there.
+    """
+    cls = config_class(recipe.type, where="finetune.type")
+    known = [field.name for field in dataclasses.fields(cls)]
+    for name in recipe.policy:
+        if name not in known:
+            raise unknown_name("field", name, known, where=f"finetune.policy ({recipe.type})")
+    data: dict[str, Any] = {}
+    if recipe.base_checkpoint is not None:
+        data = _base_config(recipe)
+    data.update(recipe.policy, device=device, push_to_hub=False)
+    try:
+        config = draccus.decode(cls, data)
+    except Exception as exc:  # draccus and the policies raise what they like
+        raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
+    _set_features(config, recipe, dataset)
+    if not masks_padding(config):
+        # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
+        config.drop_n_last_frames = max(config.action_delta_indices)
+    return config
+
+
+def masks_padding(config: Any) -> bool:
+    """Whether the policy leaves actions beyond the episode's end out of its loss.
+
+    Told by its code: one that never reads `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
+    """
+    name = type(config).__module__.replace("configuration_", "modeling_")
+    if PADDING_KEY not in inspect.getsource(importlib.import_module(name)):
+        return False
+    return bool(getattr(config, "do_mask_loss_for_padding", True))
+
+
+def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
+    """Return how many frames are trained on.
+
+    Raises:
+        SpecMismatchError: none, since chunks are longer than the episodes.
+    """
+    dropped = getattr(config, "drop_n_last_frames", 0)
+    episodes = dataset.meta.episodes
+    lengths = [
+        end - begin
+        for begin, end in zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True)
+    ]
+    used = UsedFrames(sum(max(0, length - dropped) for length in lengths), sum(lengths))
+    if used.n_used == 0:
+        raise SpecMismatchError(
+            f"{dataset.name}: a policy of type '{config.type}' does not mask padded actions, so that chunks "
+            f"must lie within an episode; expected episodes of more than {dropped} frames, found at most "
+            f"{max(lengths)}. Lower chunk_size in the recipe."
+        )
+    return used
+
+
+def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
+    assert recipe.base_checkpoint is not None
+    data = read_json(find_checkpoint(Path(recipe.base_checkpoint)) / CONFIG_FILE)
+    kind = data.pop("type", None)
+    if kind != recipe.type:
+        raise RecipeError(
+            f"finetune.base_checkpoint: {recipe.base_checkpoint} holds a '{kind}', expected a "
+            f"'{recipe.type}'."
+        )
+    data.update({name: value for name, value in NO_DOWNLOADS.items() if name in data})
+    return {**data, "use_peft": False, "pretrained_path": None}
+
+
+def _set_features(config: Any, recipe: FinetuneRecipe, dataset: TrainingDataset) -> None:
+    """Let the policy expect just what the dataset has, under the base's names."""
+    for field in recipe.rename_cameras:
+        if field not in CAMERA_KEYS.values():
+            raise SpecMismatchError(
+                f"finetune.rename_cameras: the dataset has no image '{field}' (it has: "
+                f"{', '.join(CAMERA_KEYS.values())}).{did_you_mean(field, CAMERA_KEYS.values())}"
+            )
+    features = dataset_to_policy_features(dataset.meta.features)
+    inputs = {recipe.rename_cameras.get(field, field): features[field] for field in CAMERA_KEYS.values()}
+    if recipe.base_checkpoint is not None:
+        absent = [key for key in inputs if key not in config.image_features]
+        if absent:
+            raise SpecMismatchError(
+                f"finetune.base_checkpoint was trained with the images {', '.join(config.image_features)}; "
+                f"the dataset's would be called {', '.join(inputs)}. Give them the base's names with "
+                f"finetune.rename_cameras, for example {{{absent[0]}: {next(iter(config.image_features))}}}."
+            )
+    config.input_features = {**inputs, STATE_KEY: features[STATE_KEY]}
+    config.output_features = {ACTION_KEY: features[ACTION_KEY]}

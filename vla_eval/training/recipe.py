@@ -1,0 +1,103 @@
+"""How a policy is fine-tuned: the `finetune` section of `policies/*.yaml`, and one fine-tuning.
+
+Standard library only: `mikasa-vla list` reads recipes without waiting for torch.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from vla_eval.errors import RecipeError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoraRecipe:
+    """Train low-rank adapters instead of all weights.
+
+    Attributes:
+        rank: of the adapters.
+        alpha: scaling is alpha / rank; None: alpha = rank (peft would take 8, whatever the rank).
+        target_modules: regular expression of the modules that get one; None: lerobot's choice, which for
+            π0 and π0.5 is the action expert's attention and the projections, not the language model.
+    """
+
+    rank: int = 16
+    alpha: int | None = None
+    target_modules: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneRecipe:
+    """How to fine-tune one type of policy.
+
+    Attributes:
+        type: lerobot's name of the policy: `act`, `diffusion`, `smolvla`, `pi0`, `pi05`, `pi0_fast`, or
+            that of a plugin.
+        policy: fields of lerobot's configuration of that type, among them optimizer and schedule.
+        base_checkpoint: folder with the weights to start from; None: from scratch.
+        tokenizer: folder of the tokenizer; None: the one that the policy names, from the local cache.
+        rename_cameras: field of the dataset -> field of the base checkpoint.
+        lora: train adapters only.
+        steps: gradient steps.
+        batch_size: samples per step and process.
+        save_every_steps, log_every_steps: when checkpoints and metrics are written.
+        num_workers: processes that load samples.
+        decode_ahead: decode each frame once into the user's cache, instead of once per sample.
+        imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
+        wandb_project: log there, too.
+    """
+
+    type: str
+    policy: dict[str, Any] = field(default_factory=dict)  # Any: lerobot checks its own fields
+    base_checkpoint: str | None = None
+    tokenizer: str | None = None
+    rename_cameras: dict[str, str] = field(default_factory=dict)
+    lora: LoraRecipe | None = None
+    steps: int = 50_000
+    batch_size: int = 32
+    save_every_steps: int = 5_000
+    log_every_steps: int = 100
+    num_workers: int = 4
+    decode_ahead: bool = True
+    imagenet_statistics: bool = False
+    wandb_project: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        for name in ("steps", "batch_size", "save_every_steps", "log_every_steps"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"finetune.{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        if self.num_workers < 0:
+            raise RecipeError(f"finetune.num_workers is {self.num_workers}, expected a number ≥ 0.")
+        if self.lora is not None and self.base_checkpoint is None:
+            raise RecipeError(
+                "finetune.lora: adapters are trained on top of a base; name its folder with "
+                "finetune.base_checkpoint."
+            )
+        if self.rename_cameras and self.base_checkpoint is None:
+            raise RecipeError(
+                "finetune.rename_cameras is for a base_checkpoint whose cameras have other names; from "
+                "scratch, the dataset's names are used."
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneConfig:
+    """One fine-tuning, as `mikasa-vla finetune CONFIG` reads it.
+
+    Attributes:
+        policy: name of a recipe in `policies/` that has a `finetune` section.
+        dataset: folder of a dataset.
+        out: the run folder; None: `runs/POLICY-DATASET-SEED`.
+        run_seed: of initial weights, order of samples and noise.
+        finetune: fields of the recipe's `finetune` section, set to other values.
+        device: `auto`, `cpu`, `cuda`.
+        allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
+    """
+
+    policy: str
+    dataset: str
+    out: str | None = None
+    run_seed: int = 0
+    finetune: dict[str, Any] = field(default_factory=dict)  # Any: decoded as a FinetuneRecipe
+    device: str = "auto"
+    allow_unreplayed: bool = False
