@@ -20,8 +20,8 @@ from vla_eval.tasks.remember import COLORS
 
 TASK = "RememberColor3-v0"
 HORIZON = 24
-# Levels of 255, of the mean over a patch, in any channel. The nearest two of the nine colours, red and maroon,
-# are 127 apart.
+# Levels of 255, of the mean over a patch, in any channel. The nearest two of the nine colours, red and
+# maroon, are 127 apart.
 MAX_COLOUR_ERROR = 6.0
 
 

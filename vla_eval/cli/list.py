@@ -1,9 +1,10 @@
-"""`mikasa-vla list`: which tasks, policies, configurations and prompts there are."""
+"""`mikasa-vla list`: which tasks, policies, configurations, prompts and dataset recipes there are."""
 
 import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.prompts import load_prompts
 from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
@@ -15,7 +16,9 @@ Row = Sequence[str]
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser("list", help="list tasks, policies, configs, prompts", allow_abbrev=False)
+    parser = subparsers.add_parser(
+        "list", help="list tasks, policies, configs, prompts, datasets", allow_abbrev=False
+    )
     parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
 
 
@@ -68,7 +71,11 @@ def _prompts() -> list[Row]:
     return [(name, load_prompts(name).value.description) for name in list_recipes("prompts")]
 
 
-def _recipes(folder: Folder, cls: type[PolicyRecipe] | type[EvalConfig]) -> list[Row]:
+def _datasets() -> list[Row]:
+    return _recipes("datasets", DatasetRecipe)
+
+
+def _recipes(folder: Folder, cls: type[PolicyRecipe] | type[EvalConfig] | type[DatasetRecipe]) -> list[Row]:
     rows: list[Row] = []
     for name in list_recipes(folder):
         try:
@@ -83,4 +90,5 @@ _LISTS: dict[str, Callable[[], list[Row]]] = {
     "policies": _policies,
     "configs": _configs,
     "prompts": _prompts,
+    "datasets": _datasets,
 }
