@@ -40,6 +40,7 @@ class PrivilegedState:
             be), world frame, in candidate order; (0, 3) for a task without candidates.
         target: index of the right candidate, or None for a task without candidates.
         bodies: moving bodies by name: `ball`, `goal`. Positions (3,) and velocities (3,), world frame.
+        state_vector: (D,) the simulator's own flat state observation, for experts that are learned on it.
     """
 
     phase: Phase
@@ -50,6 +51,7 @@ class PrivilegedState:
     candidate_positions_m: NDArray[np.float64]
     target: int | None
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
+    state_vector: FloatArray = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

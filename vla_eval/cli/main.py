@@ -15,7 +15,20 @@ from vla_eval import __version__
 from vla_eval.errors import VlaEvalError, did_you_mean
 
 PROGRAM = "mikasa-vla"
-VERBS = ("eval", "report", "record", "replay", "dataset", "finetune", "list", "show", "doctor", "bench")
+VERBS = (
+    "eval",
+    "report",
+    "compare",
+    "record",
+    "replay",
+    "dataset",
+    "finetune",
+    "train-expert",
+    "list",
+    "show",
+    "doctor",
+    "bench",
+)
 EXIT_USER_MISTAKE = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
 
@@ -82,7 +95,7 @@ def _build_parser(verbs: Sequence[str]) -> _Parser:
 
 
 def _verb(name: str) -> Verb:
-    return cast(Verb, importlib.import_module(f"vla_eval.cli.{name}"))
+    return cast(Verb, importlib.import_module(f"vla_eval.cli.{name.replace('-', '_')}"))
 
 
 def _fail(message: str) -> int:

@@ -246,7 +246,16 @@ class FakeEnv:
             candidate_positions_m=episode.candidates_m.copy(),
             target=episode.target,
             bodies=bodies,
+            state_vector=np.concatenate(
+                [episode.tcp_m, [episode.gripper_width_m], self._wanted_m(episode), episode.ball_m]
+            ).astype(np.float32),
         )
+
+    @staticmethod
+    def _wanted_m(episode: _Episode) -> Vector:
+        """Return where the point has to go: the right candidate, or the ball's goal."""
+        wanted: Vector = episode.goal_m if episode.target is None else episode.candidates_m[episode.target]
+        return wanted
 
 
 def make_fake_env(settings: EnvSettings) -> FakeEnv:

@@ -306,6 +306,7 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
             name: BodyState(position_m=_vector(position[row]), velocity_m_s=_vector(velocity[row]))
             for name, (position, velocity) in env.moving_bodies().items()
         },
+        state_vector=_array(env.state_vector()[row]),
     )
 
 
