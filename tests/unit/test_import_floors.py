@@ -49,6 +49,7 @@ CHEAP = (
     "cli.list",
     "cli.show",
     "cli.report",
+    "cli.compare",
     "cli.finetune",
     "training.recipe",
     "cli.doctor",

@@ -98,7 +98,7 @@ def compare_with_baseline(groups: Mapping[RowKey, RowGroup], baseline: str) -> d
     found: dict[RowKey, tuple[RowKey, PairedTest]] = {}
     for key, group in groups.items():
         other = _baseline_of(key, groups, baseline)
-        test = mcnemar_exact(_count_pairs(group, other)) if other is not None else None
+        test = mcnemar_exact(count_pairs(group, other)) if other is not None else None
         if other is not None and test is not None:
             found[key] = (other.key, test)
     corrected = holm([test.p_value for _, test in found.values()])
@@ -155,7 +155,7 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowGroup], baseline: str) 
     return others[0] if len(others) == 1 else None
 
 
-def _count_pairs(group: RowGroup, other: RowGroup) -> PairCounts:
+def count_pairs(group: RowGroup, other: RowGroup) -> PairCounts:
     counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
     others = {(run.index, run.copy): run.results for run in other.runs}
     seen: set[tuple[int, str, str]] = set()

@@ -1,0 +1,60 @@
+"""`mikasa-vla compare`: chunk lengths, or policies, against a reference on the same episodes."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
+chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired
+test against a reference, and how many episodes would settle a difference.
+
+Each RUN is a folder that `mikasa-vla eval` made; several are put together."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "compare",
+        help="compare chunk lengths or policies with a reference",
+        description=DESCRIPTION,
+        epilog="docs/chunk_sizes.md explains the columns.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
+    # Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
+    parser.add_argument(
+        "--by", choices=("n_action_steps", "policy"), default="n_action_steps", help="(n_action_steps)"
+    )
+    parser.add_argument(
+        "--reference", metavar="NAME", help="a K, or a policy (the smallest K, or the first policy)"
+    )
+    parser.add_argument(
+        "--difference", type=float, default=0.1, metavar="D", help="difference to plan for (0.1)"
+    )
+    parser.add_argument("--format", choices=("markdown", "csv"), default="markdown", help="(markdown)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the comparison.
+
+    Raises:
+        VlaEvalError: a RUN is no run folder, or there is nothing to compare.
+    """
+    # Here and not above: `mikasa-vla --help` need not wait for statistics.
+    from vla_eval.results.store import read_run
+    from vla_eval.results.sweep import compare_runs
+    from vla_eval.results.sweep_format import render_sweep, sweep_notes
+
+    sweep = compare_runs(
+        [read_run(path) for path in args.runs],
+        by=args.by,
+        reference=args.reference,
+        difference=args.difference,
+    )
+    print(render_sweep(sweep, args.format))
+    if args.format == "csv":  # has no place for them
+        for note in sweep_notes(sweep):
+            print(f"note: {note}", file=sys.stderr)
+    return 0

@@ -1,0 +1,49 @@
+"""How many frames of the cue a policy was given: by the phases, and by when it looks. Knows no simulator."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from vla_eval.results.grouping import RowGroup
+from vla_eval.tasks.catalog import TASKS
+
+DEFAULT_CUE_STEPS = 5  # `cue_steps` of `MemoryTableEnv` and of the fake simulator; a test compares
+
+
+class CueFrames(NamedTuple):
+    """Frames of the cue that were given to the policy, the fewest and the most over the episodes."""
+
+    fewest: int
+    most: int
+
+    def __str__(self) -> str:
+        """Return `2`, or `2-3` where the cue's length is drawn per episode."""
+        return str(self.most) if self.fewest == self.most else f"{self.fewest}-{self.most}"
+
+
+def cue_frames(group: RowGroup, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
+    """Return how many frames that show the cue a row's policy was given per episode.
+
+    The observation at step s shows the cue if s < cue_steps. A policy that reads the last frame is given
+    those at steps 0, K, 2K, …; one that reads every frame is given them all, before it answers.
+
+    Args:
+        group: the row; its records tell whether the policy was given each frame.
+        env: the arguments of the task.
+
+    Returns:
+        None for a task without a cue phase, and where nothing was rendered for the policy to be told.
+    """
+    spec = TASKS.get(group.key.task)
+    if spec is None or spec.candidates is None or not group.results:
+        return None
+    steps = {**spec.kwargs, **env}.get("cue_steps", DEFAULT_CUE_STEPS)
+    fewest, most = (steps, steps) if isinstance(steps, int) else (min(steps), max(steps))
+    if _reads_every_frame(group):
+        return CueFrames(fewest, most)
+    k = group.key.n_action_steps
+    return CueFrames(-(-fewest // k), -(-most // k))  # rounded up: step 0 is always looked at
+
+
+def _reads_every_frame(group: RowGroup) -> bool:
+    """Whether more observations were given to the policy than it was asked for chunks."""
+    return any((r.n_frames or 0) > (r.n_inferences or 0) for r in group.results)

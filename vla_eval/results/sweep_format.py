@@ -1,0 +1,81 @@
+"""Write a comparison as text: Markdown or CSV."""
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import Literal
+
+from vla_eval.results.sweep import Sweep, SweepRow
+
+SweepFormat = Literal["markdown", "csv"]
+UNKNOWN = "—"
+TITLES = (
+    *("task", "policy", "K", "variant", "episodes", "success", "95 % interval", "chance", "ceiling"),
+    *("cue frames", "reference", "difference", "p", "p (Holm)", "episodes to settle"),
+)
+
+
+def render_sweep(sweep: Sweep, fmt: SweepFormat) -> str:
+    """Return the comparison as text, without the notes for CSV."""
+    cells = [_cells(row, sweep) for row in sweep.rows]
+    # A column in which nothing stands says nothing: the variant, where there is one only.
+    kept = [i for i, _ in enumerate(TITLES) if any(row[i] != "" for row in cells)]
+    titles = [TITLES[i] for i in kept]
+    rows = [[row[i] for i in kept] for row in cells]
+    if fmt == "csv":
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([titles, *rows])
+        return text.getvalue().rstrip("\n")
+    return f"{_markdown(titles, rows)}\n\n" + "\n".join(f"- {note}" for note in sweep_notes(sweep))
+
+
+def sweep_notes(sweep: Sweep) -> list[str]:
+    """Return what a reader must know about the columns."""
+    return [
+        f"p: exact McNemar test on the same task, run and seed, two-sided; Holm's correction over all "
+        f"{sweep.n_comparisons} comparisons of this table.",
+        f"episodes to settle: pairs that find a difference of {sweep.difference:g} with probability 0.8 at "
+        f"level {sweep.level:.3g} (0.05 over the number of comparisons), by the share of episodes in which "
+        "the two "
+        f"differed here.",
+        "cue frames: how many frames that show the cue the policy was given in an episode. A policy that "
+        "reads "
+        "the last frame only may still know nothing of them when it chooses; scripted controls look at none.",
+    ]
+
+
+def _cells(row: SweepRow, sweep: Sweep) -> list[str]:
+    key, measured, test = row.key, row.measured, row.test
+    interval = measured.interval
+    return [
+        key.task,
+        key.policy,
+        str(key.n_action_steps),
+        key.variant or "",
+        str(row.n_episodes),
+        _rate(measured.success_once),
+        f"{interval.low:.2f}-{interval.high:.2f}" if interval else UNKNOWN,
+        _rate(row.chance.rate if row.chance else None),
+        _rate(row.ceiling),
+        str(row.cue) if row.cue else UNKNOWN,
+        str(getattr(row.reference, sweep.by)) if row.reference else UNKNOWN,
+        f"{test.difference:+.2f}" if test else UNKNOWN,
+        f"{test.p_value:.3g}" if test else UNKNOWN,
+        f"{row.corrected_p:.3g}" if row.corrected_p is not None else UNKNOWN,
+        str(row.n_to_settle) if row.n_to_settle is not None else UNKNOWN,
+    ]
+
+
+def _rate(value: float | None) -> str:
+    return UNKNOWN if value is None else f"{value:.2f}"
+
+
+def _markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    table = [[cell.replace("|", "\\|") for cell in row] for row in (titles, *rows)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
+        return f"| {' | '.join(padded)} |"
+
+    return "\n".join([line(table[0]), line(["-" * width for width in widths]), *map(line, table[1:])])
