@@ -31,7 +31,13 @@ from vla_eval.training.description import describe_model
 from vla_eval.training.finetune import finetune, load_finetune_recipe
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import TINY_POLICY, make_tiny_pi0, tiny_paligemma, write_tiny_tokenizer
+from vla_eval.training.tiny_models import (
+    TINY_POLICY,
+    make_tiny_pi0,
+    tiny_paligemma,
+    write_tiny_smolvlm,
+    write_tiny_tokenizer,
+)
 
 TASK = "RememberColor3-v0"
 TINY_ACT = {
@@ -225,6 +231,35 @@ class TestRuns:
             save_file(tensors, file)
             with pytest.raises(CheckpointError, match=r"1 missing: model\.action_out_proj\.weight"):
                 finetune(pi0(recorded, tmp_path / "next", tokenizer, base_checkpoint=str(base)))
+
+    def test_a_tiny_pi05_goes_the_whole_way(self, recorded: Path, tmp_path: Path, tokenizer: Path) -> None:
+        recipe = recorded.parent / "tiny_pi0.yaml"
+        recipe.write_text(recipe.read_text().replace("type: pi0", "type: pi05"))
+        run = tmp_path / "run"
+        with tiny_paligemma("pi05"):
+            finetune(pi0(recorded, run, tokenizer, steps=2))
+        policy = make_tiny_pi0(context(), family="pi05", checkpoint=str(run))
+        assert run_an_episode(policy) == 3
+
+    def test_a_tiny_smolvla_goes_the_whole_way(self, recorded: Path, tmp_path: Path) -> None:
+        recipe = recorded.parent / "tiny_smolvla.yaml"
+        recipe.write_text("version: 1\ndescription: tiny\nadapter: lerobot\nfinetune: {type: smolvla}\n")
+        run = tmp_path / "run"
+        policy = {
+            **{"vlm_model_name": str(write_tiny_smolvlm(tmp_path / "vlm")), "load_vlm_weights": False},
+            **{"num_vlm_layers": 2, "resize_imgs_with_padding": [64, 64], "num_steps": 2},
+            **{"chunk_size": 4, "n_action_steps": 4},
+        }
+        config = FinetuneConfig(
+            policy=str(recipe),
+            dataset=str(recorded),
+            out=str(run),
+            finetune={**SHORT, "steps": 2, "policy": policy},
+            device="cpu",
+            allow_unreplayed=True,
+        )
+        finetune(config)
+        assert run_an_episode(make_lerobot(context(), checkpoint=str(run))) == 3
 
 
 class TestPaddedActions:

@@ -156,6 +156,7 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowGroup], baseline: str) 
 
 
 def count_pairs(group: RowGroup, other: RowGroup) -> PairCounts:
+    """Count the outcomes of two rows on the same run and seed."""
     counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
     others = {(run.index, run.copy): run.results for run in other.runs}
     seen: set[tuple[int, str, str]] = set()

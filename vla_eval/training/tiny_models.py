@@ -1,4 +1,4 @@
-"""π0 and π0.5 with a few thousand random weights, for tests: the whole way without network or GPU.
+"""π0, π0.5 and SmolVLA with few random weights, for tests: the whole way without network or GPU.
 
 lerobot 0.6.1 builds these models in full size only, so three names of its modules are replaced while a
 model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
@@ -6,7 +6,7 @@ model is being made, and nothing on disk is changed. What such a model does says
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal  # lerobot and transformers are untyped
 from unittest.mock import patch
@@ -18,6 +18,12 @@ Family = Literal["pi0", "pi05"]
 VOCABULARY = 512
 CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
 SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
+SMOLVLM_TOKENS = {
+    "image_token": "<image>",
+    "fake_image_token": "<fake_token_around_image>",
+    "global_image_token": "<global-img>",
+    "end_of_utterance_token": "<end_of_utterance>",
+}
 TINY_POLICY: dict[str, Any] = {
     "chunk_size": 4,
     "n_action_steps": 4,
@@ -61,6 +67,39 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
 
 def write_tiny_tokenizer(folder: Path) -> Path:
     """Train a tokenizer on three sentences, save it, and return its folder."""
+    _tokenizer({}).save_pretrained(str(folder))
+    return folder
+
+
+def write_tiny_smolvlm(folder: Path) -> Path:
+    """Save configuration and processor of a tiny SmolVLM, which SmolVLA needs none of lerobot patched for."""
+    from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
+    from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+
+    tokenizer = _tokenizer(SMOLVLM_TOKENS)
+    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
+    heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
+    text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4}
+    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    config: Any = SmolVLMConfig
+    config(
+        vision_config={**vision, "image_size": 64, "patch_size": 16},
+        text_config={**text, **heads, **special, "vocab_size": len(tokenizer)},
+        scale_factor=2,
+        image_token_id=tokenizer.convert_tokens_to_ids(SMOLVLM_TOKENS["image_token"]),
+        pad_token_id=tokenizer.pad_token_id,
+    ).save_pretrained(str(folder))
+    processor: Any = SmolVLMProcessor
+    processor(
+        image_processor=SmolVLMImageProcessor(),
+        tokenizer=tokenizer,
+        video_processor=SmolVLMVideoProcessor(),
+        image_seq_len=4,
+    ).save_pretrained(str(folder))
+    return folder
+
+
+def _tokenizer(named: Mapping[str, str]) -> Any:
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast
 
@@ -69,22 +108,22 @@ def write_tiny_tokenizer(folder: Path) -> Path:
     tokenizer.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
         vocab_size=VOCABULARY - 1,  # the last one is the image's
-        special_tokens=list(SPECIAL_TOKENS),
+        special_tokens=[*SPECIAL_TOKENS, *named.values()],
         initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
         show_progress=False,
     )
     tokenizer.train_from_iterator(CORPUS, trainer)
     make_fast: Any = PreTrainedTokenizerFast
-    fast = make_fast(
+    extra = {"extra_special_tokens": dict(named)} if named else {}
+    return make_fast(
         tokenizer_object=tokenizer,
         pad_token="<pad>",
         eos_token="<eos>",
         bos_token="<bos>",
         unk_token="<unk>",
         padding_side="right",
+        **extra,
     )
-    fast.save_pretrained(str(folder))
-    return folder
 
 
 def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any) -> LeRobotPolicy:
