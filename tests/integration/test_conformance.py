@@ -18,10 +18,16 @@ from vla_eval.specs import PolicySpec
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.testing import check_env, check_policy, check_task
 
+SAMPLE = ("RememberColor9-v0", "RememberShapeAndColor3x2-v0", "ShellGameTouch-v0", "InterceptMedium-v0")
+SAMPLED_TASKS = [
+    pytest.param(task, marks=() if task in SAMPLE else pytest.mark.slow) for task in sorted(TASKS)
+]
+"""Each family in every run, the rest of the catalogue under the marker `slow`."""
+
 FAKE = EnvSettings(task="RememberColor3-v0", simulator="fake", cameras=("base_camera", "hand_camera"))
 
 
-@pytest.mark.parametrize("task", sorted(TASKS))
+@pytest.mark.parametrize("task", SAMPLED_TASKS)
 def test_our_tasks_pass(task: str) -> None:
     check_task(task, n_episodes=5)
 

@@ -6,33 +6,70 @@ Horizons, phases and instructions: the paper, appendix "VLA experiments", and `d
 from vla_eval.errors import unknown_name
 from vla_eval.tasks.spec import TaskSpec
 
-_REMEMBER_COLOR = {
-    n: TaskSpec(
-        id=f"RememberColor{n}-v0",
+_REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."
+
+
+def _remember(
+    task: str, entry: str, key: str, *, n_items: int, kwargs: dict[str, int], what: str
+) -> TaskSpec:
+    return TaskSpec(
+        id=task,
         version=1,
-        entry_point="vla_eval.tasks.remember:RememberColorEnv",
-        kwargs={"n_items": n},
+        entry_point=f"vla_eval.tasks.remember:{entry}",
+        kwargs=kwargs,
         horizon_steps=60,
         memory="object",
-        instruction_key="RememberColor",
-        description=(
-            f"A cube of one colour is shown, the table is empty for a while, then {n} cubes of "
-            "different colours lie there: reach the one that has the colour shown."
-        ),
-        success="The tool centre point is within 5 cm of the right cube and the arm is at rest.",
+        instruction_key=key,
+        description=f"An item is shown, the table is empty for a while, then {what}",
+        success=_REMEMBER_SUCCESS,
         oracle="vla_eval.oracles.hover:CUBES",
-        oracle_sees="poses of all cubes and which one is right; moves once the choice has appeared",
-        candidates="cubes",
-        chance_success=1 / n,
+        oracle_sees="poses of all items and which one is right; moves once the choice has appeared",
+        candidates="items",
+        chance_success=1 / n_items,
         max_reward=3.0,
     )
-    for n in (3, 5, 9)
-}
+
+
+_REMEMBER = (
+    *(
+        _remember(
+            f"RememberColor{n}-v0",
+            "RememberColorEnv",
+            "RememberColor",
+            n_items=n,
+            kwargs={"n_items": n},
+            what=f"{n} cubes of different colours lie there: reach the one that has the colour shown.",
+        )
+        for n in (3, 5, 9)
+    ),
+    *(
+        _remember(
+            f"RememberShape{n}-v0",
+            "RememberShapeEnv",
+            "RememberShape",
+            n_items=n,
+            kwargs={"n_items": n},
+            what=f"{n} blue items of different shapes lie there: reach the one that has the shape shown.",
+        )
+        for n in (3, 5, 9)
+    ),
+    *(
+        _remember(
+            f"RememberShapeAndColor{shapes}x{colors}-v0",
+            "RememberShapeAndColorEnv",
+            "RememberShapeAndColor",
+            n_items=shapes * colors,
+            kwargs={"n_shapes": shapes, "n_colors": colors},
+            what=f"items of {shapes} shapes in {colors} colours lie there: reach the one that was shown.",
+        )
+        for shapes, colors in ((3, 2), (3, 3), (5, 3))
+    ),
+)
 
 TASKS: dict[str, TaskSpec] = {
     spec.id: spec
     for spec in (
-        *_REMEMBER_COLOR.values(),
+        *_REMEMBER,
         TaskSpec(
             id="ShellGameTouch-v0",
             version=1,
