@@ -184,8 +184,7 @@ def _step(
         actions[slot] = env.hold_action(slot) if action is None else action
         is_last = next_step >= episode.start.horizon_steps
         policy_looks = bool(spec.cameras) and (
-            settings.eager_rendering
-            or (not is_last and (spec.reads == "every" or episode.executor.infers_at(next_step)))
+            settings.eager_rendering or (not is_last and _is_for_policy(episode, spec, next_step))
         )
         if policy_looks or any(o.wants_images(next_step) for o in observers):
             render.add(slot)
@@ -196,6 +195,14 @@ def _step(
         _account(episode, actions[slot], results[slot], env.spec.action, settings)
         for observer in observers:
             observer.on_step(episode.start, actions[slot], results[slot])
+
+
+def _is_for_policy(episode: _Episode, spec: PolicySpec, step: int) -> bool:
+    """Whether the policy will be given the observation at `step`."""
+    inference_step = episode.executor.next_inference_step
+    if spec.reads == "every":
+        return inference_step < episode.start.horizon_steps  # what comes after the last inference is not seen
+    return step == inference_step
 
 
 def _account(

@@ -132,9 +132,11 @@ class TestFrames:
 
     def test_an_every_frame_policy_gets_all_frames_oldest_first(self) -> None:
         policy = Pusher(reads="every", cameras=ALL_CAMERAS, chunk_size=8)
+        env = env_for(policy)
 
-        record = run(policy, n_action_steps=8)
+        record = run(policy, n_action_steps=8, env=env)
 
+        assert env.n_renders == 57  # nothing after the last inference: nobody would look at it
         steps = [frame.step for window in policy.windows for frame in window.frames]
         # The frame of reset, then all up to the last inference at step 56: 57 frames.
         assert steps == list(range(57))

@@ -84,6 +84,11 @@ class ChunkExecutor:
         self._chunks = []
         self._next_inference_step = 0
 
+    @property
+    def next_inference_step(self) -> int:
+        """The step whose observation is to be given to the policy next."""
+        return self._next_inference_step
+
     def infers_at(self, step: int) -> bool:
         """Whether the observation at this step is to be given to the policy."""
         return step == self._next_inference_step
