@@ -22,6 +22,16 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder; goes on if it exists")
     parser.add_argument("--seed", type=int, default=0, help="of everything (default: %(default)s)")
     parser.add_argument("--envs", type=int, default=16, help="episodes per iteration (default: %(default)s)")
+    parser.add_argument(
+        "--dims",
+        nargs="+",
+        default=["dx", "dy", "dz"],
+        metavar="DIM",
+        help="dimensions of the action to learn; the others are held (default: dx dy dz)",
+    )
+    parser.add_argument(
+        "--gripper", type=float, default=1.0, help="its command while it is held (default: 1, open)"
+    )
     parser.add_argument("--workers", type=int, default=1, help="processes; moves no result (default: 1)")
     parser.add_argument(
         "--simulator", choices=("maniskill", "fake"), default="maniskill", help="fake: for dry runs"
@@ -41,7 +51,14 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.training.ppo_expert import POLICY_FILE, train_expert
     from vla_eval.training.ppo_settings import PpoSettings
 
-    settings = PpoSettings(task=task, seed=args.seed, n_envs=args.envs, simulator=args.simulator)
+    settings = PpoSettings(
+        task=task,
+        seed=args.seed,
+        n_envs=args.envs,
+        simulator=args.simulator,
+        learned_dims=tuple(args.dims),
+        held_gripper=args.gripper,
+    )
     recent: list[float] = []
     begun = time.monotonic()
     with stop_on_signals() as stop:

@@ -27,7 +27,8 @@ class PpoExpertPolicy:
     def __init__(self, context: PolicyContext, *, checkpoint: str) -> None:
         torch.set_num_threads(1)
         self._checkpoint = Path(checkpoint)
-        trained_on = read_settings(self._checkpoint).task
+        self._settings = read_settings(self._checkpoint)
+        trained_on = self._settings.task
         if trained_on != context.env.task:
             raise CheckpointError(
                 f"{checkpoint}: is an expert for {trained_on}, expected one for {context.env.task}: its "
@@ -58,8 +59,8 @@ class PpoExpertPolicy:
                 f"({self._checkpoint / 'config.json'})."
             )
         state = torch.from_numpy(privileged.state_vector[None])
-        action = self._network.best_actions(self._network.normalize(state))
-        return ActionChunk(actions=np.clip(action.numpy(), -1, 1).astype(np.float32))
+        learned = self._network.best_actions(self._network.normalize(state)).numpy()
+        return ActionChunk(actions=np.clip(self._settings.full_actions(learned), -1, 1))
 
 
 def make_ppo_expert(context: PolicyContext, *, checkpoint: str) -> PpoExpertPolicy:

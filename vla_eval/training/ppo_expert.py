@@ -35,7 +35,6 @@ CONFIG_FILE, WEIGHTS_FILE, PROGRESS_FILE, POLICY_FILE = (
     "ppo_expert.yaml",
 )
 FORMAT_VERSION = 1
-N_ACTION = 7
 # Far from the evaluation's seeds (1 to 100) and those of demonstrations (from 1000).
 FIRST_SEED = 10_000_000
 SEEDS_PER_RUN = 10_000_000
@@ -136,7 +135,7 @@ class _Learner:
             self.network = ActorCritic(
                 NetworkSpec(
                     n_state=n_state,
-                    n_action=N_ACTION,
+                    n_action=len(settings.learned_dims),
                     hidden=settings.hidden,
                     initial_std=settings.initial_std,
                 )
@@ -169,9 +168,9 @@ class _Learner:
         for _ in range(horizon):
             states = torch.from_numpy(result.states_ND)
             normalized = self.network.normalize(states)
-            noise = torch.randn((n_envs, N_ACTION), generator=self.rng)
+            noise = torch.randn((n_envs, len(self.settings.learned_dims)), generator=self.rng)
             decision = self.network.decide(normalized, noise=noise)
-            result = envs.step(decision.actions.numpy())
+            result = envs.step(self.settings.full_actions(decision.actions.numpy()))
             rows.append((normalized, *decision))
             raw.append(states)
             rewards.append(torch.from_numpy(result.rewards_N))
@@ -308,7 +307,9 @@ def load_expert(out: Path) -> ActorCritic:
     if "network.mean" not in tensors:
         raise CheckpointError(f"{out / WEIGHTS_FILE}: holds no expert. Train it again.")
     n_state = len(tensors["network.mean"])
-    network = ActorCritic(NetworkSpec(n_state=n_state, n_action=N_ACTION, hidden=settings.hidden))
+    network = ActorCritic(
+        NetworkSpec(n_state=n_state, n_action=len(settings.learned_dims), hidden=settings.hidden)
+    )
     load_network(network, tensors, where=out / WEIGHTS_FILE)
     return network.eval()
 

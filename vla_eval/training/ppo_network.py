@@ -9,8 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-# Parked objects lie 150 m away; what is farther than this is just "not there".
-STATE_LIMIT = 2.0
+# Hidden objects are parked 150 m away. Such a number would drown the centimetres that matter in the running
+# variance: what is beyond every pose and velocity of arm and table is just not there, as the simulator's own
+# state has zeros for wrong candidates.
+ABSENT_BEYOND = 20.0
 NORMALIZED_LIMIT = 10.0
 
 
@@ -54,7 +56,7 @@ class ActorCritic(nn.Module):
 
     def observe(self, states: Tensor) -> None:
         """Take (N, D) states into the running mean and variance. Source: Chan et al., parallel variance."""
-        states = states.clamp(-STATE_LIMIT, STATE_LIMIT)
+        states = _present(states)
         n_new, total = len(states), self.count + len(states)
         delta = states.mean(0) - self.mean
         m2 = self.variance * self.count + states.var(0, unbiased=False) * n_new
@@ -64,7 +66,7 @@ class ActorCritic(nn.Module):
 
     def normalize(self, states: Tensor) -> Tensor:
         """Return (B, D) states with mean 0 and variance 1, bounded."""
-        centred = states.clamp(-STATE_LIMIT, STATE_LIMIT) - self.mean
+        centred = _present(states) - self.mean
         return (centred / torch.sqrt(self.variance + 1e-8)).clamp(-NORMALIZED_LIMIT, NORMALIZED_LIMIT)
 
     def best_actions(self, normalized: Tensor) -> Tensor:
@@ -86,6 +88,10 @@ class ActorCritic(nn.Module):
         density = torch.distributions.Normal(means, self.log_std.exp().expand_as(means))
         log_probability = density.log_prob(actions).sum(1)  # type: ignore[no-untyped-call]  # torch
         return Decision(actions, log_probability, self.critic(normalized).squeeze(1))
+
+
+def _present(states: Tensor) -> Tensor:
+    return torch.where(states.abs() > ABSENT_BEYOND, 0.0, states)
 
 
 def _mlp(sizes: Sequence[int], *, last_gain: float) -> nn.Sequential:
