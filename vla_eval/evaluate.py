@@ -142,7 +142,11 @@ def available_cores() -> int:
 def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
     return RunDescription(
         name=config.name,
-        config={**results_config(config), "task_versions": dict(plan.task_versions)},
+        config={
+            **results_config(config),
+            "policy_names": list(plan.policy_names),
+            "task_versions": dict(plan.task_versions),
+        },
         recipes=dict(plan.recipe_hashes),
         environment=collect_environment(),
         options=options_of(config),

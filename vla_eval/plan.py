@@ -81,6 +81,7 @@ class Plan:
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
             policies, and the datasets that these were trained on.
         task_versions: task id -> version of the task's rules.
+        policy_names: what records call the policies, in the order of the configuration.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
         max_workers: the most workers that `workers: auto` may start; None: no limit.
     """
@@ -88,6 +89,7 @@ class Plan:
     jobs: tuple[EpisodeJob, ...]
     recipe_hashes: Mapping[str, str]
     task_versions: Mapping[str, int]
+    policy_names: tuple[str, ...]
     left_out: tuple[str, ...]
     max_workers: int | None
 
@@ -132,6 +134,7 @@ def make_plan(config: EvalConfig) -> Plan:
             **_weights_hashes(policies),
         },
         task_versions={task.id: task.version for task in tasks},
+        policy_names=tuple(policy.name for policy in policies),
         left_out=tuple(left_out),
         max_workers=min(limits, default=None),
     )

@@ -475,6 +475,13 @@ def test_a_complete_run_is_not_called_incomplete() -> None:
     assert not has_note(build_table([stored(episodes("p", "+e"), **config)]), "incomplete")
 
 
+def test_a_checkpoint_is_known_by_the_name_its_records_carry() -> None:
+    """`--policy runs/act` gives records of `act-020000`: nothing is missing."""
+    config = {"tasks": [COLOR], "policies": ["runs/act"], "policy_names": ["act-020000"], "episodes": 2}
+    run = stored(episodes("act-020000", "+-"), runs=1, n_action_steps=[1], **config)
+    assert not has_note(build_table([run]), "incomplete")
+
+
 def test_a_pair_that_was_left_out_is_not_called_incomplete() -> None:
     # A tour makes no sense on a task without candidates.
     groups = episodes("tour", "+"), episodes("p", "+"), episodes("p", "+", task=INTERCEPT, n_candidates=None)

@@ -18,6 +18,7 @@ from vla_eval.results.store import StoredRun
 VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", "simulator", "sim_backend")
 """Fields of a configuration that move success rates and are no part of an episode's key."""
 
+POLICY_NAMES = "policy_names"  # the policies' names in records, in the configuration of a run
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
 PROMPTS = "prompts/"  # recipes of which the names begin so hold the instructions
 DIGITS = 8
@@ -218,7 +219,10 @@ def _task_version(run: StoredRun, task: str) -> object:
 
 def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     """Return the tasks or policies of a run's configuration, as its records name them."""
-    names = run.description.config.get(field)
+    config = run.description.config
+    # A checkpoint is given as a folder; what its records are called is known once it has been looked at.
+    names = config.get(POLICY_NAMES) if field == "policies" else None
+    names = config.get(field) if names is None else names
     if isinstance(names, str) or not isinstance(names, Sequence):
         return ()
     # A policy may be given as a file, a task with its namespace; records carry the bare name.
