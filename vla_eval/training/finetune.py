@@ -159,7 +159,7 @@ def _loop_config(
         seed=run_seed,
         steps=recipe.steps,
         batch_size=recipe.batch_size,
-        num_workers=recipe.num_workers,
+        num_workers=min(recipe.num_workers, len(os.sched_getaffinity(0))),  # more would only wait
         log_freq=recipe.log_every_steps,
         save_freq=recipe.save_every_steps,
         env_eval_freq=0,

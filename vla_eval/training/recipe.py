@@ -40,7 +40,7 @@ class FinetuneRecipe:
         steps: gradient steps.
         batch_size: samples per step and process.
         save_every_steps, log_every_steps: when checkpoints and metrics are written.
-        num_workers: processes that load samples.
+        num_workers: processes that load samples, at most; no more than there are cores.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
         imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
         wandb_project: log there, too.
