@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from vla_eval.data.dataset_summary import DatasetSummary, draw_sheet, summarize
+from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
 from vla_eval.results.durable import replace_file
 from vla_eval.tasks.catalog import TASKS
@@ -196,10 +196,10 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
     text += f"`{facts.recipe.get('expert', 'oracle')}`"
     noise = facts.recipe.get("action_noise", 0.0)
     text += f", with noise of std {noise:g} in its actions." if noise else ", without noise."
-    if summary.action.constant:
+    if summary.action.idle:
         text += (
-            f" Of its actions {', '.join(summary.action.constant)} never vary: normalise with care, and "
-            f"expect imitation to be easier than with the paper's data."
+            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): normalise "
+            f"with care, and expect imitation to be easier than with the paper's data."
         )
     return text
 

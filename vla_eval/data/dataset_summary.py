@@ -26,6 +26,7 @@ from vla_eval.data.memory_loader import frame_layout, read_columns
 from vla_eval.data.opening import open_local_dataset
 
 N_SHEET_EPISODES = 3
+IDLE_STD = 1e-3  # of actions in [-1, 1]: 0.1 mm or 0.0001 rad per step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +40,9 @@ class ActionStatistics:
     high: FloatArray
 
     @property
-    def constant(self) -> tuple[str, ...]:
-        """The dimensions that never vary."""
-        # Not by the standard deviation: that of equal numbers need not be 0 after rounding.
-        bounds = zip(self.names, self.low, self.high, strict=True)
-        return tuple(name for name, low, high in bounds if low == high)
+    def idle(self) -> tuple[str, ...]:
+        """The dimensions that hardly vary, which a normalisation by the standard deviation blows up."""
+        return tuple(name for name, std in zip(self.names, self.std, strict=True) if std < IDLE_STD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
