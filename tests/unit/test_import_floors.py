@@ -56,6 +56,9 @@ CHEAP = (
     "cli.bench",
     "cli.record",
     "cli.replay",
+    "cli.dataset",
+    "cli.train_expert",
+    "training.ppo_settings",
 )
 CHEAP_PACKAGES = (vla_eval.results, vla_eval.testing)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from vla_eval.cli.main import main
-from vla_eval.core import EpisodeStart, Observation, ObservationWindow
+from vla_eval.core import EpisodeStart, Observation, ObservationWindow, PrivilegedState
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, SimulationError, SpecMismatchError, UnknownNameError
@@ -19,7 +20,7 @@ from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.ppo_expert import make_ppo_expert
 from vla_eval.registry import policy_factory
-from vla_eval.training.lockstep import LockstepEnvs, LockstepResult
+from vla_eval.training.lockstep import LockstepEnvs, LockstepResult, distance_to_go_m
 from vla_eval.training.ppo_expert import _Learner, advantages_of, train_expert
 from vla_eval.training.ppo_network import ActorCritic, NetworkSpec
 from vla_eval.training.ppo_settings import PpoSettings
@@ -57,7 +58,8 @@ class Bandit:
 
     def step(self, actions: Any) -> LockstepResult:
         rewards = -np.abs(actions[:, 0] - 0.5).astype(np.float32)
-        return LockstepResult(np.ones((len(actions), 3), dtype=np.float32), rewards, rewards > -0.05)
+        states, nothing = np.ones((len(actions), 3), np.float32), np.zeros(len(actions), np.float32)
+        return LockstepResult(states, rewards, rewards > -0.05, nothing)
 
 
 def test_it_learns() -> None:
@@ -66,11 +68,49 @@ def test_it_learns() -> None:
     for _ in range(30):
         rollout = learner.collect(Bandit(), 6)  # type: ignore[arg-type]  # all that it asks for
         learner.learn(rollout)
-        rewards.append(float(rollout.rewards_TN.mean()))
+        rewards.append(rollout.mean_reward)
 
     # At first actions are N(0, 0.4²): E|a - 0.5| ≈ 0.54; around 0.5 it is 0.4 √(2/π) = 0.32.
     assert rewards[0] < -0.45
     assert rewards[-1] > -0.33
+
+
+def test_coming_nearer_is_rewarded_by_a_potential() -> None:
+    class Approach(Bandit):
+        """One metre away at reset, a quarter nearer at each step, without any reward."""
+
+        def reset(self, seeds: Any) -> LockstepResult:
+            self.to_go_m = 1.25
+            return super().reset(seeds)
+
+        def step(self, actions: Any) -> LockstepResult:
+            self.to_go_m -= 0.25
+            to_go = np.full(len(actions), self.to_go_m, np.float32)
+            return super().step(actions)._replace(rewards_N=np.zeros_like(to_go), to_go_N=to_go)
+
+    settings = dataclasses.replace(SETTINGS, discount=0.9, shaping_per_m=2.0)
+    rollout = _Learner(settings, n_state=3).collect(Approach(), 2)  # type: ignore[arg-type]
+
+    # Potentials -2, -1.5, -1: 0.9 · -1.5 + 2 = 0.65, and 0.9 · -1 + 1.5 = 0.6. Reported is the reward.
+    assert rollout.rewards_TN[:, 0].tolist() == pytest.approx([0.65, 0.6])
+    assert rollout.mean_reward == 0
+
+
+def test_the_distance_to_go_is_that_of_the_arm_and_of_the_ball() -> None:
+    def privileged(task: str) -> PrivilegedState:
+        env = make_env(EnvSettings(task=task, simulator="fake", privileged=True))
+        world = env.reset({0: 1}, render=False)[0].observation.privileged
+        assert world is not None
+        return world
+
+    choice = privileged(TASK)
+    assert choice.target is not None
+    to_cube = choice.candidate_positions_m[choice.target] - choice.tcp_position_m
+    assert distance_to_go_m(choice) == pytest.approx(math.sqrt(sum(to_cube**2)))
+    rolling = privileged("InterceptMedium-v0")
+    ball, goal = rolling.bodies["ball"].position_m, rolling.bodies["goal"].position_m
+    expected = math.dist(ball, rolling.tcp_position_m) + math.dist(ball[:2], goal[:2])
+    assert distance_to_go_m(rolling) == pytest.approx(expected)
 
 
 def test_advantages_are_the_weighted_sum_of_errors() -> None:

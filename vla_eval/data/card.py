@@ -198,8 +198,8 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
     text += f", with noise of std {noise:g} in its actions." if noise else ", without noise."
     if summary.action.idle:
         text += (
-            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): normalise "
-            f"with care, and expect imitation to be easier than with the paper's data."
+            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): "
+            f"normalise with care, and expect imitation to be easier than with the paper's data."
         )
     return text
 

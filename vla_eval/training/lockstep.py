@@ -16,18 +16,23 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import FloatArray, SimEnv, StepResult
+from vla_eval.core import FloatArray, PrivilegedState, SimEnv, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import SimulationError, SpecMismatchError
 
 
 class LockstepResult(NamedTuple):
-    """One entry per environment: (N, D) true states, (N,) rewards, (N,) whether the success rule holds."""
+    """One entry per environment.
+
+    `states_ND`: true states. `rewards_N`: of the step. `success_N`: whether the success rule holds.
+    `to_go_N`: metres from where things are to where the task wants them, see `distance_to_go_m`.
+    """
 
     states_ND: FloatArray  # shape suffix
     rewards_N: FloatArray
     success_N: NDArray[np.bool_]
+    to_go_N: FloatArray
 
 
 class LockstepEnvs:
@@ -134,14 +139,20 @@ def _answer(env: SimEnv, command: str, values: NDArray[Any], *, task: str) -> Lo
 
 
 def _collect(results: Sequence[StepResult], task: str) -> LockstepResult:
-    states = []
-    for result in results:
-        state = result.observation.privileged
-        if state is None or state.state_vector.size == 0:
-            raise SpecMismatchError(f"{task}: the environment offers no state vector to learn from.")
-        states.append(state.state_vector)
+    worlds = [state for result in results if (state := result.observation.privileged) is not None]
+    if len(worlds) != len(results) or not all(world.state_vector.size for world in worlds):
+        raise SpecMismatchError(f"{task}: the environment offers no state vector to learn from.")
     return LockstepResult(
-        np.stack(states),
+        np.stack([world.state_vector for world in worlds]),
         np.array([result.reward for result in results], dtype=np.float32),
         np.array([result.status.success for result in results]),
+        np.array([distance_to_go_m(world) for world in worlds], dtype=np.float32),
     )
+
+
+def distance_to_go_m(world: PrivilegedState) -> float:
+    """Return how far the tool is from the right candidate, or from the ball and the ball from its goal."""
+    if world.target is not None:
+        return float(np.linalg.norm(world.candidate_positions_m[world.target] - world.tcp_position_m))
+    ball, goal = world.bodies["ball"].position_m, world.bodies["goal"].position_m
+    return float(np.linalg.norm(ball - world.tcp_position_m) + np.linalg.norm((goal - ball)[:2]))

@@ -67,7 +67,8 @@ class Rollout(NamedTuple):
     actions_TNA: Tensor
     log_probability_TN: Tensor
     values_TN: Tensor  # one row more: the value after the last step
-    rewards_TN: Tensor
+    rewards_TN: Tensor  # with shaping
+    mean_reward: float  # without
     success: float
 
 
@@ -164,7 +165,8 @@ class _Learner:
         first = FIRST_SEED + SEEDS_PER_RUN * self.settings.seed + self.n_iterations * n_envs
         result = envs.reset(range(first, first + n_envs))
         rows: list[tuple[Tensor, ...]] = []
-        raw, rewards, ever = [], [], np.zeros(n_envs, dtype=bool)
+        raw, rewards, to_go_m = [], [], [result.to_go_N]
+        ever = np.zeros(n_envs, dtype=bool)
         for _ in range(horizon):
             states = torch.from_numpy(result.states_ND)
             normalized = self.network.normalize(states)
@@ -174,10 +176,14 @@ class _Learner:
             rows.append((normalized, *decision))
             raw.append(states)
             rewards.append(torch.from_numpy(result.rewards_N))
+            to_go_m.append(result.to_go_N)
             ever |= result.success_N
         last = self.network.critic(self.network.normalize(torch.from_numpy(result.states_ND))).squeeze(1)
         states, actions, log_probability, values = (torch.stack(column) for column in zip(*rows, strict=True))
         self.network.observe(torch.cat(raw))
+        plain = torch.stack(rewards)
+        potential = -self.settings.shaping_per_m * torch.from_numpy(np.stack(to_go_m))
+        shaped = plain + self.settings.discount * potential[1:] - potential[:-1]
         self.n_steps += horizon * n_envs
         self.n_iterations += 1
         return Rollout(
@@ -185,7 +191,8 @@ class _Learner:
             actions,
             log_probability,
             torch.cat([values, last[None]]),
-            torch.stack(rewards),
+            shaped,
+            float(plain.mean()),
             float(ever.mean()),
         )
 
@@ -227,7 +234,7 @@ class _Learner:
         self.progress = PpoProgress(
             n_steps=self.n_steps,
             success=rollout.success,
-            mean_reward=float(rollout.rewards_TN.mean()),
+            mean_reward=rollout.mean_reward,
             action_std=float(self.network.log_std.detach().exp().mean()),
             steps_per_second=rollout.rewards_TN.numel() / seconds,
         )
