@@ -75,7 +75,7 @@ def test_it_learns() -> None:
     assert rewards[-1] > -0.33
 
 
-def test_coming_nearer_is_rewarded_by_a_potential() -> None:
+def test_coming_nearer_is_rewarded_while_learning() -> None:
     class Approach(Bandit):
         """One metre away at reset, a quarter nearer at each step, without any reward."""
 
@@ -91,8 +91,8 @@ def test_coming_nearer_is_rewarded_by_a_potential() -> None:
     settings = dataclasses.replace(SETTINGS, discount=0.9, shaping_per_m=2.0)
     rollout = _Learner(settings, n_state=3).collect(Approach(), 2)  # type: ignore[arg-type]
 
-    # Potentials -2, -1.5, -1: 0.9 · -1.5 + 2 = 0.65, and 0.9 · -1 + 1.5 = 0.6. Reported is the reward.
-    assert rollout.rewards_TN[:, 0].tolist() == pytest.approx([0.65, 0.6])
+    # A quarter of a metre per step at 2 per metre. Reported is the reward without it.
+    assert rollout.rewards_TN[:, 0].tolist() == pytest.approx([0.5, 0.5])
     assert rollout.mean_reward == 0
 
 

@@ -183,7 +183,7 @@ class _Learner:
         self.network.observe(torch.cat(raw))
         plain = torch.stack(rewards)
         potential = -self.settings.shaping_per_m * torch.from_numpy(np.stack(to_go_m))
-        shaped = plain + self.settings.discount * potential[1:] - potential[:-1]
+        shaped = plain + potential[1:] - potential[:-1]
         self.n_steps += horizon * n_envs
         self.n_iterations += 1
         return Rollout(

@@ -29,8 +29,9 @@ class PpoSettings:
         n_envs: episodes per iteration.
         n_epochs, n_minibatches: how often, and in how many parts, each iteration is learned from.
         discount, gae_lambda: of rewards and errors that come later.
-        shaping_per_m: reward per metre that the task comes nearer to its end, added while learning, as a
-            potential (Ng et al. 1999): which policy is best does not depend on it.
+        shaping_per_m: reward, while learning, per metre by which a step brings things nearer to where the
+            task wants them. Not discounted, unlike the potentials of Ng et al. 1999, which have the learned
+            values carry the whole distance.
         learning_rate, clip, value_weight, max_gradient_norm: as PPO has them.
         max_kl: no further epoch once the policy has moved so far.
         hidden: sizes of the hidden layers of actor and critic.
@@ -48,7 +49,7 @@ class PpoSettings:
     n_minibatches: int = 8
     discount: float = 0.95
     gae_lambda: float = 0.9
-    shaping_per_m: float = 3.0
+    shaping_per_m: float = 20.0
     learning_rate: float = 3e-4
     clip: float = 0.2
     value_weight: float = 0.5
