@@ -198,6 +198,7 @@ def write_official_lerobot(root: Path) -> Path:
         "local/official",
         fps=20,
         root=root,
+        streaming_encoding=True,
         features={
             "observation.image": image,
             "observation.wrist_image": image,
