@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.arguments import workers_argument
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.recipe import policy_name
@@ -58,7 +59,9 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task, policy and run (100)")
     parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
     parser.add_argument("--runs", type=int, metavar="R", help="independent runs over the same seeds (1)")
-    parser.add_argument("--workers", type=_workers, metavar="W", help="processes, or 'auto': one per core")
+    parser.add_argument(
+        "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
     parser.add_argument(
         "--set",
@@ -160,12 +163,3 @@ def _config(args: argparse.Namespace) -> EvalConfig:
                 f"{flag} is missing. Example: mikasa-vla eval --task RememberColor3-v0 --policy oracle"
             )
     return decode(EvalConfig, data, where="command line")
-
-
-def _workers(text: str) -> int | str:
-    if text == "auto":
-        return text
-    try:
-        return int(text)
-    except ValueError as exc:
-        raise argparse.ArgumentTypeError(f"expected 'auto' or a number, found '{text}'") from exc
