@@ -242,7 +242,8 @@ def noise_shape(config: Any) -> tuple[int, int] | None:
 
 
 def _history(config: Any) -> tuple[int, ...]:
-    deltas = config.observation_delta_indices
+    # A policy that keeps its own history may read other frames in training than when it acts.
+    deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices)
     return tuple(int(delta) for delta in deltas) if deltas else (0,)
 
 

@@ -48,10 +48,32 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
     _set_features(config, recipe, dataset)
+    if hasattr(config, "window_steps"):
+        _set_window(config, dataset)
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)
     return config
+
+
+def _set_window(config: Any, dataset: TrainingDataset) -> None:
+    """Let the history of a policy with a memory reach back to the beginning of every episode."""
+    longest = max(_lengths(dataset))
+    if config.window_steps is None:
+        config.window_steps = longest
+    if config.window_steps < longest:
+        raise SpecMismatchError(
+            f"finetune.policy.window_steps is {config.window_steps}; expected at least the length of the "
+            f"longest episode of {dataset.name}, {longest} frames: a memory must begin where the episode "
+            f"does. Leave the field out."
+        )
+
+
+def _lengths(dataset: TrainingDataset) -> list[int]:
+    """Return the number of frames of each episode."""
+    ends = dataset.meta.episodes
+    pairs = zip(ends["dataset_from_index"], ends["dataset_to_index"], strict=True)
+    return [int(end) - int(begin) for begin, end in pairs]
 
 
 def masks_padding(config: Any) -> bool:
@@ -72,11 +94,7 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
         SpecMismatchError: none, since chunks are longer than the episodes.
     """
     dropped = getattr(config, "drop_n_last_frames", 0)
-    episodes = dataset.meta.episodes
-    lengths = [
-        end - begin
-        for begin, end in zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True)
-    ]
+    lengths = _lengths(dataset)
     used = UsedFrames(sum(max(0, length - dropped) for length in lengths), sum(lengths))
     if used.n_used == 0:
         raise SpecMismatchError(

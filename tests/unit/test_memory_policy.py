@@ -1,0 +1,231 @@
+"""The positive control: the memory reaches back to the first frame, the twin's does not; all else is the same."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.nn import functional
+
+from vla_eval.core import EpisodeStart
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import SpecMismatchError
+from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy
+from vla_eval.policies.memory.network import MemoryNetwork, NetworkSizes
+from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
+from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.training.dataset import training_dataset
+from vla_eval.training.finetune import finetune
+from vla_eval.training.policy_config import policy_config
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
+
+TASK = "RememberColor3-v0"
+TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}
+BASE, WRIST = "observation.images.base", "observation.images.wrist"
+
+
+def tiny_policy(recorded: Path, *, remembers: bool = True, **fields: Any) -> Any:
+    torch.manual_seed(0)
+    recipe = FinetuneRecipe(type="mikasa_memory", policy={**TINY, "remembers": remembers, **fields})
+    dataset = training_dataset(recorded, allow_unreplayed=True)
+    return MikasaMemoryPolicy(policy_config(recipe, dataset, device="cpu")).eval()
+
+
+def frames(n_steps: int, *, n_episodes: int = 1) -> dict[str, torch.Tensor]:
+    draws = torch.Generator().manual_seed(1)
+    return {
+        BASE: torch.rand(n_episodes, n_steps, 3, 128, 128, generator=draws),
+        WRIST: torch.rand(n_episodes, n_steps, 3, 128, 128, generator=draws),
+        "observation.state": torch.rand(n_episodes, n_steps, 10, generator=draws),
+    }
+
+
+def at(batch: dict[str, torch.Tensor], step: int) -> dict[str, torch.Tensor]:
+    return {key: values[:, step] for key, values in batch.items()}
+
+
+def between(batch: dict[str, torch.Tensor], first: int, stop: int) -> dict[str, torch.Tensor]:
+    return {key: values[:, first:stop] for key, values in batch.items()}
+
+
+class TestMemory:
+    def test_an_answer_depends_on_the_first_frame_and_the_twins_does_not(self, recorded: Path) -> None:
+        seen = frames(6)
+        other = {key: values.clone() for key, values in seen.items()}
+        other[BASE][:, 0] = 1 - other[BASE][:, 0]
+        for remembers in (True, False):
+            network = tiny_policy(recorded, remembers=remembers).network
+            first, second = (
+                network(torch.stack([one[BASE], one[WRIST]], dim=2), one["observation.state"]).actions[:, -1]
+                for one in (seen, other)
+            )
+            assert torch.equal(first, second) is not remembers
+
+    def test_both_have_the_same_parameters(self, recorded: Path) -> None:
+        shapes = [
+            {name: value.shape for name, value in tiny_policy(recorded, remembers=r).state_dict().items()}
+            for r in (True, False)
+        ]
+        assert shapes[0] == shapes[1]
+
+    @pytest.mark.parametrize("remembers", [True, False])
+    def test_it_acts_frame_by_frame_as_it_was_trained_on_whole_episodes(
+        self, recorded: Path, remembers: bool
+    ) -> None:
+        policy, seen = tiny_policy(recorded, remembers=remembers), frames(5, n_episodes=2)
+        whole = policy.network(torch.stack([seen[BASE], seen[WRIST]], dim=2), seen["observation.state"])
+        memory = None
+        for first, stop in ((0, 1), (1, 4), (4, 5)):  # the harness shows what is new since it last asked
+            if remembers:
+                memory = policy.remember(between(seen, first, stop), memory)
+            chunk = policy.predict_action_chunk(at(seen, stop - 1), memory=memory)
+            torch.testing.assert_close(chunk, whole.actions[:, stop - 1].clamp(-1, 1), atol=1e-5, rtol=1e-5)
+
+    def test_lerobots_own_loop_gets_the_same_actions_and_forgets_at_a_reset(self, recorded: Path) -> None:
+        policy, seen = tiny_policy(recorded), frames(4)
+        memory = policy.remember(between(seen, 0, 3), None)
+        expected = policy.predict_action_chunk(at(seen, 2), memory=memory)[:, 0]
+        for _ in range(2):
+            policy.reset()
+            actions = [policy.select_action(at(seen, step)) for step in range(3)]
+            torch.testing.assert_close(actions[2], expected)  # two actions of a chunk, then it asks again
+
+    def test_asking_it_without_having_shown_the_frame_is_an_error(self, recorded: Path) -> None:
+        with pytest.raises(ValueError, match="remember"):
+            tiny_policy(recorded).predict_action_chunk(at(frames(1), 0))
+
+
+class TestTraining:
+    def batch(self, policy: Any, *, n_real: int) -> dict[str, torch.Tensor]:
+        n_steps, chunk = policy.config.n_window_steps, policy.config.chunk_size
+        batch = frames(n_steps + 1, n_episodes=2)
+        batch["action"] = torch.rand(2, n_steps + chunk - 1, 7, generator=torch.Generator().manual_seed(2))
+        is_pad = torch.zeros(2, n_steps + chunk - 1, dtype=torch.bool)
+        is_pad[:, : n_steps - n_real] = True  # before the episode
+        is_pad[:, -1] = True  # beyond its end
+        batch["action_is_pad"] = is_pad
+        batch["observation.state_is_pad"] = torch.cat([is_pad[:, :n_steps], torch.ones(2, 1).bool()], dim=1)
+        return batch
+
+    def test_what_is_padded_changes_nothing(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded)
+        batch = self.batch(policy, n_real=4)
+        loss, _ = policy.forward(batch)
+        n_before = policy.config.n_window_steps - 4
+        for key in (BASE, WRIST, "observation.state"):
+            batch[key][:, :n_before] = 0.123
+        batch["action"][:, :n_before] = 0.9
+        batch["action"][:, -1] = -0.9
+        changed, _ = policy.forward(batch)
+        torch.testing.assert_close(changed, loss)
+
+    def test_the_loss_of_the_mean_is_one_in_units_of_the_variance(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded)
+        batch = self.batch(policy, n_real=4)
+        goals = batch["observation.state"][:, -1, :3]
+        for parameter in policy.network.goal[-1].parameters():
+            torch.nn.init.zeros_(parameter)
+        with torch.no_grad():
+            policy.network.goal[-1].bias.copy_(goals.mean(dim=0))
+        _, parts = policy.forward(batch)
+        assert parts["goal"] == pytest.approx(1.0, rel=1e-4)
+
+    def test_waiting_is_thinned_but_the_first_and_the_sampled_frame_stay(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded, waiting_share=1e-6).train()
+        batch = self.batch(policy, n_real=5)
+        batch["action"][:] = 0.5
+        episodes = policy._episodes(batch)
+        n_steps = policy.config.n_window_steps
+        assert episodes.state.shape[1] == 2
+        torch.testing.assert_close(episodes.state[:, 0], batch["observation.state"][:, n_steps - 5])
+        torch.testing.assert_close(episodes.state[:, 1], batch["observation.state"][:, n_steps - 1])
+
+    def test_a_window_that_does_not_reach_the_beginning_is_refused(self, recorded: Path) -> None:
+        with pytest.raises(SpecMismatchError, match="a memory must begin where the episode does"):
+            tiny_policy(recorded, window_steps=2)
+
+    @pytest.mark.parametrize(("name", "reads"), [("memory", "every"), ("memoryless", "last")])
+    def test_the_recipes_go_from_a_dataset_to_an_episode(
+        self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reads: str
+    ) -> None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        short = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
+        summary = finetune(
+            FinetuneConfig(
+                policy=name,
+                dataset=str(recorded),
+                out=str(tmp_path / "run"),
+                finetune={**short, "policy": TINY},
+                device="cpu",
+                allow_unreplayed=True,
+            )
+        )
+        made: Any = make_env(EnvSettings(task=TASK, simulator="fake"))
+        context = PolicyContext(
+            name=name, env=made.spec, chunking=ChunkingSpec(n_action_steps=2), n_candidates=3
+        )
+        policy = make_lerobot(context, checkpoint=str(summary.checkpoint))
+        assert policy.spec.reads == reads
+        env = make_env(EnvSettings(task=TASK, simulator="fake", cameras=("base_camera", "hand_camera")))
+        start = EpisodeStart(slot=0, task=TASK, seed=1, run=0, instruction="touch it", horizon_steps=6)
+        chunking = ChunkingSpec(n_action_steps=2)
+        (record,) = rollout(env, policy, [start], RolloutSettings(chunking=chunking))
+        assert record.n_steps == 6
+
+
+def test_the_twins_recipe_differs_in_nothing_but_the_memory() -> None:
+    with_memory, without = (
+        to_data(load_recipe("policies", name, PolicyRecipe).value) for name in ("memory", "memoryless")
+    )
+    assert with_memory["finetune"]["policy"].pop("remembers") is True
+    assert without["finetune"]["policy"].pop("remembers") is False
+    assert with_memory["finetune"] == without["finetune"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("remembers", [True, False])
+def test_it_learns_to_go_where_the_colour_of_the_first_frame_is(remembers: bool) -> None:
+    """A square is shown, then nothing, then three squares: the goal is the one of the colour shown."""
+    torch.manual_seed(0)
+    sizes = NetworkSizes(
+        cameras=1, image_px=48, channels=16, heads=4, key=8, memory=64, hidden=64, thumbnail_px=6, chunk=1
+    )
+    network = MemoryNetwork(sizes, remembers=remembers)
+    optimizer = torch.optim.AdamW(network.parameters(), 2e-3)
+    draws = torch.Generator().manual_seed(1)
+    for _ in range(350):
+        pictures, goal = recall_episodes(16, draws)
+        answer = network(pictures, torch.zeros(*pictures.shape[:2], 10))
+        firsts = functional.adaptive_avg_pool2d(pictures[:, 0].flatten(0, 1), 6)[:, None, None]
+        recall = (answer.first_pictures - firsts).square().mean() / firsts.var(dim=0).mean()
+        reach = (answer.goal_m[:, -1, :2] - goal).square().mean() / goal.var(dim=0).mean()
+        optimizer.zero_grad()
+        (recall + reach).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+    pictures, goal = recall_episodes(100, torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        told = network(pictures, torch.zeros(*pictures.shape[:2], 10)).goal_m[:, -1, :2]
+    share_found = float(((told - goal).norm(dim=-1) < 0.2).float().mean())
+    assert share_found > 0.9 if remembers else share_found < 0.5  # 1/3 by guessing
+
+
+def recall_episodes(n: int, draws: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return pictures (n, 3 steps, 1, 3, 48, 48) and where the right square is, (n, 2) in [-1, 1]."""
+    colors = torch.eye(3)
+    pictures = torch.full((n, 3, 1, 3, 48, 48), 0.6)
+    goal = torch.zeros(n, 2)
+    for episode in range(n):
+        target = int(torch.randint(3, (1,), generator=draws))
+        pictures[episode, 0, 0, :, 20:26, 20:26] = colors[target, :, None, None]
+        for color, place in enumerate(torch.randperm(9, generator=draws)[:3].tolist()):
+            dx, dy = torch.randint(-2, 3, (2,), generator=draws).tolist()
+            x, y = 8 + 14 * (place % 3) + dx, 8 + 14 * (place // 3) + dy
+            pictures[episode, 2, 0, :, y : y + 5, x : x + 5] = colors[color, :, None, None]
+            if color == target:
+                goal[episode] = torch.tensor([x + 2.5, y + 2.5]) / 24 - 1
+    return pictures, goal

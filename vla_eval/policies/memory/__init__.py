@@ -1,0 +1,1 @@
+"""The positive control: two small policies of ours that differ in nothing but a memory."""

@@ -1,0 +1,149 @@
+"""lerobot's configuration of the positive control; `docs/positive_control.md` explains it."""
+
+from dataclasses import dataclass, field
+from typing import Any  # lerobot is untyped
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+TYPE = "mikasa_memory"
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
+    """A small policy with a memory, or its twin without one.
+
+    A training sample is an episode from its beginning to a frame: `observation.*` at the `window_steps`
+    frames up to it and, for the goal, at the episode's last frame; `action` at all of them and one chunk
+    further. So any loop that follows `*_delta_indices` trains it.
+
+    Attributes:
+        remembers: False for the twin, whose memory begins anew at each step.
+        window_steps: frames of history in a training sample; at least the longest episode, so that no
+            memory begins in its middle. None: our `finetune` takes the dataset's longest.
+        chunk_size: actions of a chunk.
+        n_action_steps: how many lerobot's own loop executes; ours sets its own number.
+        channels, patch_px, heads, key, memory, hidden, thumbnail_px, longest_span_steps: see `NetworkSizes`.
+        first_action_weight: share of a chunk's first action in the loss; the others share the rest.
+        change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
+            which raises the moment of decision.
+        waiting_share: a step whose action is that of the step before is used with this probability.
+        goal_weight, recall_weight: of the two auxiliary losses, each in units of its variance: where the
+            demonstration ends, and the episode's first pictures.
+        mix_colors: the three colours of an episode's pictures change places at random in training.
+        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
+            scheduler_decay_steps, scheduler_decay_lr: AdamW, warm-up, cosine.
+    """
+
+    remembers: bool = True
+    window_steps: int | None = None
+    chunk_size: int = 8
+    n_action_steps: int = 8
+
+    channels: int = 32
+    patch_px: int = 4
+    heads: int = 8
+    key: int = 16
+    memory: int = 128
+    hidden: int = 256
+    thumbnail_px: int = 16
+    longest_span_steps: float = 100.0
+
+    first_action_weight: float = 0.5
+    change_weight: float = 3.0
+    waiting_share: float = 0.3
+    goal_weight: float = 1.0
+    recall_weight: float = 1.0
+    mix_colors: bool = False
+
+    optimizer_lr: float = 2e-3
+    optimizer_weight_decay: float = 1e-4
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 50
+    scheduler_decay_steps: int = 2000
+    scheduler_decay_lr: float = 4e-5
+
+    # Positions in metres and actions in [-1, 1] need no statistics; rotation and gripper hardly vary in
+    # scripted demonstrations, and dividing by their deviation would blow up noise.
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a dataset."""
+        super().__post_init__()
+        if self.window_steps is not None and self.window_steps < 1:
+            raise ValueError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
+            )
+        for name in ("first_action_weight", "waiting_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
+            raise ValueError(f"'{TYPE}' needs pictures, observation.state and action")
+        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
+        if len(shapes) != 1:
+            raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")
+        _, height_px, width_px = next(iter(shapes))
+        if height_px != width_px or height_px % self.patch_px or height_px % self.thumbnail_px:
+            raise ValueError(
+                f"'{TYPE}' needs square pictures whose edge is a multiple of patch_px ({self.patch_px}) and "
+                f"thumbnail_px ({self.thumbnail_px}), found {height_px}×{width_px}"
+            )
+
+    @property
+    def n_window_steps(self) -> int:
+        """`window_steps`, once it is known."""
+        if self.window_steps is None:
+            raise ValueError(
+                f"'{TYPE}': window_steps is not set: give it the length in frames of the dataset's longest "
+                "episode (`mikasa-vla finetune` does)"
+            )
+        return self.window_steps
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The window up to the frame, and a frame beyond every episode's end: lerobot takes its last one."""
+        return [*range(1 - self.n_window_steps, 1), self.n_window_steps]
+
+    @property
+    def inference_delta_indices(self) -> list[int]:
+        """Only the frame itself: the policy keeps its own history."""
+        return [0]
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """A chunk for each frame of the window."""
+        return list(range(1 - self.n_window_steps, self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None
+
+    def get_optimizer_preset(self) -> Any:
+        """Return lerobot's configuration of AdamW."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> Any:
+        """Return lerobot's configuration of the schedule."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+        )

@@ -1,0 +1,213 @@
+"""The positive control as a LeRobot policy: loss over whole episodes, memory from frame to frame."""
+
+from collections import deque
+from typing import Any, NamedTuple  # lerobot is untyped
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+from torch.nn import functional
+
+from vla_eval.data.features import ACTION_KEY, STATE_KEY
+from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
+from vla_eval.policies.memory.network import GOAL, Memory, MemoryNetwork, NetworkSizes
+
+SAME_ACTION = 1e-3  # actions that differ by less are waiting
+LEAST_VARIANCE = 1e-6
+
+
+class Episodes(NamedTuple):
+    """A batch of B episodes of T steps, from their beginning; padding comes last.
+
+    Attributes:
+        pictures: (B, T, cameras, 3, H, W) in [0, 1].
+        state: (B, T, state).
+        actions: (B, T, chunk, action).
+        counts: (B, T, chunk) float, 0 for what is beyond the episode.
+        goal_m: (B, 3) the tool centre point at the episode's end.
+    """
+
+    pictures: Tensor
+    state: Tensor
+    actions: Tensor
+    counts: Tensor
+    goal_m: Tensor
+
+
+class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+    """See `MikasaMemoryConfig`.
+
+    With memory it has a method `remember`; the harness shows it every frame. The twin has none and is
+    shown the frame at which it is asked.
+    """
+
+    config_class = MikasaMemoryConfig
+    name = TYPE
+    draws_nothing = True
+
+    def __init__(self, config: MikasaMemoryConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: MikasaMemoryConfig = config
+        self.network = MemoryNetwork(network_sizes(config), remembers=config.remembers)
+        if config.remembers:
+            self.remember = self._remember
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """Return all parameters."""
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Forget what lerobot's own loop has shown."""
+        self._shown: Memory | None = None
+        self._queue: deque[Tensor] = deque()
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a batch of training samples, and its parts."""
+        config, episodes = self.config, self._episodes(batch)
+        answer = self.network(episodes.pictures, episodes.state)
+        errors = (answer.actions - episodes.actions).square().mean(dim=-1)
+        imitation = (errors * episodes.counts).sum() / episodes.counts.sum()
+        real = (episodes.counts.sum(dim=-1) > 0).float()
+        goal = _in_variances(answer.goal_m, episodes.goal_m, real)
+        firsts = functional.avg_pool2d(
+            episodes.pictures[:, 0].flatten(0, 1), episodes.pictures.shape[-1] // config.thumbnail_px
+        )
+        firsts = firsts.unflatten(0, (len(real), -1))
+        recall = _in_variances(answer.first_pictures, firsts, real)
+        loss = imitation + config.goal_weight * goal + config.recall_weight * recall
+        parts = {"imitation": imitation, "goal": goal, "recall": recall}
+        return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    @torch.no_grad()
+    def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:
+        """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
+        pictures, state = self._pictures(batch), batch[STATE_KEY]
+        shape = state.shape[:2]
+        sight = self.network.see(pictures.flatten(0, 1), state.flatten(0, 1))
+        before = self.network.begin(shape[0]) if memory is None else memory
+        after = self.network.write(
+            sight.things.unflatten(0, shape), sight.summary.unflatten(0, shape), before
+        )
+        return Memory(after.things[:, -1], after.rest[:, -1])
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self, batch: dict[str, Tensor], memory: Memory | None = None, **kwargs: Any
+    ) -> Tensor:
+        """Return (B, chunk, action) for one frame per episode, (B, …); `memory` has that frame in it already.
+
+        The twin takes no memory: it sees the frame and nothing else.
+        """
+        self.eval()
+        if self.config.remembers and memory is None:
+            raise ValueError(f"'{TYPE}' with a memory needs what `remember` returned for this frame")
+        pictures, state = self._pictures(batch), batch[STATE_KEY]
+        sight = self.network.see(pictures, state)
+        if memory is None:
+            after = self.network.write(
+                sight.things[:, None], sight.summary[:, None], self.network.begin(len(state))
+            )
+            memory = Memory(after.things[:, 0], after.rest[:, 0])
+        return self.network.act(sight, memory, state)[0].clamp(-1, 1)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes."""
+        if self.config.remembers:
+            frames = {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
+            self._shown = self._remember(frames, self._shown)
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch, self._shown)
+            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._queue.popleft()
+
+    def _pictures(self, batch: dict[str, Tensor]) -> Tensor:
+        return torch.stack([batch[key] for key in self.config.image_features], dim=-4)
+
+    def _episodes(self, batch: dict[str, Tensor]) -> Episodes:
+        """Return the steps to train on, moved together: those of the episode, most waiting left out."""
+        config, n_steps = self.config, self.config.n_window_steps
+        real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
+        actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
+        counts = (~batch[f"{ACTION_KEY}_is_pad"]).float().unfold(1, config.chunk_size, 1)
+        change = _change(actions[:, :, 0], real)
+        kept = real
+        if self.training:
+            waits = (change < SAME_ACTION) & (torch.rand_like(change) > config.waiting_share)
+            waits[:, -1] = False  # the frame that was sampled
+            kept = real & ~waits
+        order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
+
+        def taken(values: Tensor) -> Tensor:
+            index = order.reshape(*order.shape, *[1] * (values.ndim - 2))
+            return values.take_along_dim(index, dim=1)
+
+        weights = torch.full((config.chunk_size,), 1.0, device=actions.device)
+        if config.chunk_size > 1:
+            weights = weights * (1 - config.first_action_weight) / (config.chunk_size - 1)
+            weights[0] = config.first_action_weight
+        counts = counts * weights * (1 + config.change_weight * change)[..., None] * kept[..., None]
+        pictures = taken(self._pictures({key: batch[key][:, :n_steps] for key in config.image_features}))
+        if self.training and config.mix_colors:
+            pictures = _mixed(pictures)
+        return Episodes(
+            pictures=pictures,
+            state=taken(batch[STATE_KEY][:, :n_steps]),
+            actions=taken(actions),
+            counts=taken(counts),
+            goal_m=batch[STATE_KEY][:, n_steps, :GOAL],
+        )
+
+
+def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
+    """Return the sizes that a configuration and its fields ask for."""
+    images = list(config.image_features.values())
+    return NetworkSizes(
+        cameras=len(images),
+        image_px=int(images[0].shape[-1]),
+        state=int(config.robot_state_feature.shape[0]),
+        action=int(config.action_feature.shape[0]),
+        chunk=config.chunk_size,
+        channels=config.channels,
+        patch_px=config.patch_px,
+        heads=config.heads,
+        key=config.key,
+        memory=config.memory,
+        hidden=config.hidden,
+        thumbnail_px=config.thumbnail_px,
+        longest_span_steps=config.longest_span_steps,
+    )
+
+
+def _change(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): by how much at most an action (B, T, action) differs from the one before.
+
+    The first of an episode has none before it: 1, a full change.
+    """
+    change = torch.ones_like(actions[..., 0])
+    difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
+    change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
+    return change.clamp(max=1.0)
+
+
+def _mixed(pictures: Tensor) -> Tensor:
+    """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
+    orders = torch.rand(len(pictures), 3, device=pictures.device).argsort(dim=1)
+    return pictures.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
+
+
+def _in_variances(told: Tensor, right: Tensor, real: Tensor) -> Tensor:
+    """Return the mean squared error over the steps (B, T) that are real, in units of the batch's variance.
+
+    So 1 is what the mean would reach, however small a part of the picture the cue is.
+
+    Args:
+        told: (B, T, …).
+        right: (B, …).
+        real: (B, T).
+    """
+    errors = (told - right[:, None]).square().flatten(2).mean(dim=-1)
+    variance = (right - right.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE)
+    return (errors * real).sum() / real.sum() / variance
