@@ -1,4 +1,4 @@
-"""The positive control: the memory reaches back to the first frame, the twin's does not; all else is the same."""
+"""The positive control: a memory reaches back to the first frame, its twin has none, all else is alike."""
 
 from pathlib import Path
 from typing import Any
