@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
-from vla_eval.policies.memory.network import GOAL, Memory, MemoryNetwork, NetworkSizes
+from vla_eval.policies.memory.network import GOAL, Memory, MemoryNetwork, NetworkSizes, by_episode
 
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 LEAST_VARIANCE = 1e-6
@@ -74,7 +74,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         firsts = functional.avg_pool2d(
             episodes.pictures[:, 0].flatten(0, 1), episodes.pictures.shape[-1] // config.thumbnail_px
         )
-        firsts = firsts.unflatten(0, (len(real), -1))
+        firsts = by_episode(firsts, (len(real), -1))
         recall = _in_variances(answer.first_pictures, firsts, real)
         loss = imitation + config.goal_weight * goal + config.recall_weight * recall
         parts = {"imitation": imitation, "goal": goal, "recall": recall}
@@ -87,9 +87,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         shape = state.shape[:2]
         sight = self.network.see(pictures.flatten(0, 1), state.flatten(0, 1))
         before = self.network.begin(shape[0]) if memory is None else memory
-        after = self.network.write(
-            sight.things.unflatten(0, shape), sight.summary.unflatten(0, shape), before
-        )
+        after = self.network.write(by_episode(sight.things, shape), by_episode(sight.summary, shape), before)
         return Memory(after.things[:, -1], after.rest[:, -1])
 
     @torch.no_grad()

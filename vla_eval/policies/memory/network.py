@@ -10,6 +10,7 @@ that it can be compared with the pictures that come later.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -265,8 +266,8 @@ class MemoryNetwork(nn.Module):
     def act(self, sight: Sight, memory: Memory, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions (N, chunk, action) and goal (N, 3) for N steps whose memory is written."""
         sizes = self.sizes
-        asked = self.asks(memory.rest).unflatten(-1, (sizes.cameras, sizes.heads, -1))
-        things = memory.things.unflatten(1, (sizes.cameras, sizes.heads))
+        asked = self.asks(memory.rest).reshape(len(state), sizes.cameras, sizes.heads, -1)
+        things = memory.things.reshape(len(state), sizes.cameras, sizes.heads, -1)
         found = [
             look(sight.places[index], sight.keys[index], self.keys[index](things[:, index]) + asked[:, index])
             for index, look in enumerate(self.likeness)
@@ -275,7 +276,7 @@ class MemoryNetwork(nn.Module):
         goal = self.goal(looked_up)
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * STATE_SCALE]
         actions = self.acts(torch.cat([*known, goal.detach()], dim=-1))
-        return actions.unflatten(-1, (sizes.chunk, sizes.action)), goal
+        return actions.reshape(-1, sizes.chunk, sizes.action), goal
 
     def forward(self, pictures: Tensor, state: Tensor) -> Answer:
         """Answer for each step of episodes from their beginning.
@@ -288,14 +289,19 @@ class MemoryNetwork(nn.Module):
         flat_state = state.flatten(0, 1)
         sight = self.see(pictures.flatten(0, 1), flat_state)
         memories = self.write(
-            sight.things.unflatten(0, shape), sight.summary.unflatten(0, shape), self.begin(shape[0])
+            by_episode(sight.things, shape), by_episode(sight.summary, shape), self.begin(shape[0])
         )
         flat = Memory(memories.things.flatten(0, 1), memories.rest.flatten(0, 1))
         actions, goal = self.act(sight, flat, flat_state)
         thumbnails = self.recalls(torch.cat([flat.things.flatten(1), flat.rest], dim=-1))
         size = (sizes.cameras, RGB, sizes.thumbnail_px, sizes.thumbnail_px)
         return Answer(
-            actions=actions.unflatten(0, shape),
-            goal_m=goal.unflatten(0, shape),
-            first_pictures=thumbnails.unflatten(0, shape).unflatten(-1, size),
+            actions=by_episode(actions, shape),
+            goal_m=by_episode(goal, shape),
+            first_pictures=thumbnails.reshape(*shape, *size),
         )
+
+
+def by_episode(steps: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return (B · T, …) as (B, T, …), `shape` being (B, T)."""
+    return steps.reshape(*shape, *steps.shape[1:])
