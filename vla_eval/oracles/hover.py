@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.core import PrivilegedState
-from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state
+from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state, towards
 
-GAIN_PER_M = 13.0  # action per metre of distance; 0.039 m per step and unit: half the way per step
+TOUCH_MARGIN = 1.2  # near enough is 1.2 times the height at which the arm comes to rest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,10 +33,15 @@ class HoverExpert:
         arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         rows = []
         for _ in range(n_actions):
-            translation = np.clip(GAIN_PER_M * (self._goal(centre, arm.position_m) - arm.position_m), -1, 1)
+            translation = towards(self._goal(centre, arm.position_m), arm)
             rows.append(action_row(translation, GRIPPER_OPEN))
             arm = advance(arm, translation)
         return np.stack(rows)
+
+    def is_done(self, state: PrivilegedState, candidate: int) -> bool:
+        """Whether the arm has come near enough to a candidate to touch it, if it rests there."""
+        distance_m = np.linalg.norm(state.tcp_position_m - state.candidate_positions_m[candidate])
+        return bool(distance_m <= TOUCH_MARGIN * self.rest_above_m)
 
     def _goal(self, centre: Vector, tcp: Vector) -> Vector:
         goal = centre.copy()

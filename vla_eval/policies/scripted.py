@@ -29,15 +29,13 @@ from vla_eval.tasks.streams import Stream, generator
 # ManiSkill's Panda: the gripper command in [-1, 1] is mapped to finger positions in this range.
 FINGER_LOW_M, FINGER_HIGH_M = -0.01, 0.04
 STATIC_RAD_S = 0.2
-TOUCH_MARGIN = 1.2  # a tour takes a candidate as touched at 1.2 times the hover height
 
 
 class CandidateExpert(Protocol):
     """Brings the arm to one of several candidates."""
 
-    @property
-    def rest_above_m(self) -> float:
-        """Height over the candidate's centre where the arm comes to rest."""
+    def is_done(self, state: PrivilegedState, candidate: int) -> bool:
+        """Whether all is done with this candidate that is to be done, but for coming to rest."""
 
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7)."""
@@ -165,9 +163,8 @@ class ChoicePolicy(_Scripted):
         return order[0]
 
     def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:
-        distance_m = np.linalg.norm(state.tcp_position_m - state.candidate_positions_m[candidate])
         at_rest = bool(np.abs(window.last.state["qvel"][:-2]).max() <= STATIC_RAD_S)
-        return at_rest and bool(distance_m <= TOUCH_MARGIN * self._expert.rest_above_m)
+        return at_rest and self._expert.is_done(state, candidate)
 
 
 class BallPolicy(_Scripted):
