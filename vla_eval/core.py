@@ -39,8 +39,9 @@ class PrivilegedState:
         candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
             be), world frame, in candidate order; (0, 3) for a task without candidates.
         target: index of the right candidate, or None for a task without candidates.
-        bodies: moving bodies by name: `ball`, `goal`. Positions (3,) and velocities (3,), world frame.
+        bodies: bodies and places by name, as the task names them: `ball`, `goal` …
         state_vector: (D,) the simulator's own flat state observation, for experts that are learned on it.
+        tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
     """
 
     phase: Phase
@@ -52,14 +53,16 @@ class PrivilegedState:
     target: int | None
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
     state_vector: FloatArray = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
+    tcp_yaw_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyState:
-    """Position (m) and linear velocity (m/s) of a body, each (3,) in the world frame."""
+    """Position (m) and linear velocity (m/s) of a body, each (3,), and its yaw, in the world frame."""
 
     position_m: NDArray[np.float64]
     velocity_m_s: NDArray[np.float64]
+    yaw_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

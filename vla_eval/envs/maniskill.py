@@ -96,7 +96,7 @@ class ManiSkillEnv:
         self.spec = EnvSpec(
             task=row.id,
             cameras=CAMERAS,
-            states=STATES,
+            states=_states(env_class(row)),
             action=ACTION,
             horizon_steps=horizon_steps,
             control_hz=CONTROL_HZ,
@@ -168,6 +168,8 @@ class ManiSkillEnv:
             "qpos": env.agent.robot.get_qpos(),
             "qvel": env.agent.robot.get_qvel(),
         }
+        if env.PROMPT_DIMS:
+            state["task_cue"] = env.prompt()
         results = {}
         for slot in slots:
             row = slot % self._slots_per_env
@@ -214,6 +216,13 @@ def _render_backend(settings: EnvSettings) -> str:
     if settings.render.backend == "auto":
         return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
     return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
+
+
+def _states(cls: Any) -> tuple[StateSpec, ...]:
+    """Return what every task offers, and the numbers of the prompt where the task has one."""
+    if not cls.PROMPT_DIMS:
+        return STATES
+    return (*STATES, StateSpec(name="task_cue", dims=cls.PROMPT_DIMS, unit="rad", frame="world"))
 
 
 def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
@@ -303,10 +312,15 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
         candidate_positions_m=positions,
         target=int(env.target_index()[row]) if is_choice else None,
         bodies={
-            name: BodyState(position_m=_vector(position[row]), velocity_m_s=_vector(velocity[row]))
-            for name, (position, velocity) in env.moving_bodies().items()
+            name: BodyState(
+                position_m=_vector(body.position_m[row]),
+                velocity_m_s=_vector(body.velocity_m_s[row]),
+                yaw_rad=float(body.yaw_rad[row]),
+            )
+            for name, body in env.moving_bodies().items()
         },
         state_vector=_array(env.state_vector()[row]),
+        tcp_yaw_rad=float(env.tcp_yaw_rad()[row]),
     )
 
 

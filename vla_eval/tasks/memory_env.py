@@ -25,6 +25,7 @@ from mani_skill.utils.structs import Actor, Pose
 from vla_eval.core import Phase
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks import robots as _robots  # registers the arm with the simplified camera mesh
+from vla_eval.tasks.bodies import Body, yaw_rad
 from vla_eval.tasks.streams import Stream, generator
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
@@ -81,6 +82,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     MAX_REWARD: float
     FAMILY: int
     """Number of the task family in random streams. Part of every result: never renumber, only add."""
+    PROMPT_DIMS: tuple[str, ...] = ()
+    """Names of the numbers that say what is asked for, if a sentence cannot; rad."""
     HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
     HUMAN_CAMERA_TARGET: tuple[float, float, float] = (-0.3, 0.0, 0.0)
 
@@ -291,9 +294,17 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         begun: torch.Tensor = self._elapsed_steps >= self._response_step
         return success & begun
 
-    def moving_bodies(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Return name -> (B, 3) position in m and (B, 3) velocity in m/s of bodies an expert may see."""
+    def moving_bodies(self) -> dict[str, Body]:
+        """Return name -> body of what an expert may see besides candidates."""
         return {}
+
+    def tcp_yaw_rad(self) -> torch.Tensor:
+        """Return (B,): how far the gripper is turned about world z; 0 with the fingers in a row along y."""
+        return yaw_rad(self.agent.tcp.pose.q)
+
+    def prompt(self) -> torch.Tensor:
+        """Return the (B, D) numbers that come with each observation, as `PROMPT_DIMS` names them."""
+        raise NotImplementedError
 
     def oracle_info(self) -> torch.Tensor:
         """Return what only an oracle may know, (B, …)."""
@@ -306,6 +317,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         info["cue_steps"] = self._cue_end_step.clone()
         info["delay_steps"] = self._response_step - self._cue_end_step
         info["oracle_info"] = self.oracle_info().clone()
+        if self.PROMPT_DIMS:
+            info["task_cue"] = self.prompt().clone()
         if self.instruction is not None:
             info["language_instruction"] = [self.instruction] * self.num_envs
         return info
@@ -314,6 +327,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         extra = {"tcp_pose": self.agent.tcp.pose.raw_pose}
         if self.obs_mode_struct.use_state:
             extra.update(self._privileged_extra())
+        elif self.PROMPT_DIMS:
+            extra["task_cue"] = self.prompt()
         return extra
 
     def state_vector(self) -> torch.Tensor:

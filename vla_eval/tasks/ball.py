@@ -1,0 +1,93 @@
+"""A ball that rolls across the table: its start, its speed, and what is known of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.building import actors
+from mani_skill.utils.structs import Pose
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.bodies import Body, moving_body
+from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive
+from vla_eval.tasks.streams import Stream
+
+SPAWN_X_M = (-0.35, -0.05)
+SPAWN_Y_M = (-0.9, -0.65)
+SIDE_VELOCITY_M_S = (0.0, 0.05)
+
+
+class RollingBallEnv(OnePhaseEnv):
+    """A red ball rolls along y past the robot; see the families for what is to be done with it.
+
+    Args:
+        velocity_range_m_s: (least, most) of the initial speed along y; a solid ball keeps 5/7 of it once
+            it rolls without slipping.
+        ball_radius_m: radius of the ball.
+    """
+
+    BALL_DROP_M: float
+    """So much higher than where it rests the ball's centre is at the start."""
+
+    def __init__(
+        self,
+        *args: Any,
+        velocity_range_m_s: Sequence[float] = (0.5, 0.75),
+        ball_radius_m: float = 0.02,
+        **kwargs: Any,
+    ) -> None:
+        """Check the numbers and build the scene."""
+        pair = tuple(float(v) for v in velocity_range_m_s)
+        if len(pair) != 2 or not 0 < pair[0] <= pair[1]:
+            raise TaskArgumentError(
+                f"velocity_range_m_s={velocity_range_m_s!r}: expected (least, most) with 0 < least ≤ most."
+            )
+        check_positive(ball_radius_m=ball_radius_m)
+        self.velocity_range_m_s = pair
+        self.ball_radius_m = ball_radius_m
+        super().__init__(*args, **kwargs)
+
+    def _load_items(self) -> None:
+        self.ball = actors.build_sphere(
+            self.scene,
+            radius=self.ball_radius_m,
+            color=[1.0, 0.0, 0.0, 1.0],
+            name="ball",
+            initial_pose=sapien.Pose(p=[SPAWN_X_M[0], SPAWN_Y_M[0], self._ball_start_z_m()]),
+        )
+        self._start = torch.zeros(self.num_envs, 3, device=self.device)
+        self._initial_velocity = torch.zeros(self.num_envs, 3, device=self.device)
+
+    def _ball_start_z_m(self) -> float:
+        return self.ball_radius_m + self.BALL_DROP_M
+
+    def _sample_episode(self, env: int) -> None:
+        layout = self.episode_generator(env, Stream.LAYOUT)
+        start_m = (layout.uniform(*SPAWN_X_M), layout.uniform(*SPAWN_Y_M), self._ball_start_z_m())
+        self._sample_goal(env, layout, lane_x_m=start_m[0])
+        motion = self.episode_generator(env, Stream.MOTION)
+        velocity_m_s = (motion.uniform(*SIDE_VELOCITY_M_S), motion.uniform(*self.velocity_range_m_s), 0.0)
+        self._start[env] = torch.tensor(start_m)
+        self._initial_velocity[env] = torch.tensor(velocity_m_s)
+
+    def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
+        """Draw where the ball has to go, if it has to go anywhere, after its start has been drawn."""
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        self.move(self.ball, mask, Pose.create_from_pq(self._start))
+        with self._only(mask):
+            self.ball.set_linear_velocity(self._initial_velocity[mask])
+
+    def moving_bodies(self) -> dict[str, Body]:
+        """Return `ball`."""
+        return {"ball": moving_body(self.ball.pose.p, self.ball.linear_velocity)}
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return (B, 3): the ball's initial velocity, m/s, world frame."""
+        return self._initial_velocity
+
+    def _tcp_to_ball_m(self) -> torch.Tensor:
+        offset: torch.Tensor = self.ball.pose.p - self.tcp_position_m()
+        return offset

@@ -1,0 +1,36 @@
+"""What a task tells privileged readers of a body: where it is, how fast, how it is turned."""
+
+from typing import NamedTuple
+
+import torch
+
+
+class Body(NamedTuple):
+    """Position (B, 3) in m, linear velocity (B, 3) in m/s and yaw (B,) in rad, world frame."""
+
+    position_m: torch.Tensor
+    velocity_m_s: torch.Tensor
+    yaw_rad: torch.Tensor
+
+
+def moving_body(
+    position_m: torch.Tensor, velocity_m_s: torch.Tensor, yaw_rad: torch.Tensor | None = None
+) -> Body:
+    """Return a body; one for which no turn matters has yaw 0."""
+    return Body(position_m, velocity_m_s, torch.zeros_like(position_m[:, 0]) if yaw_rad is None else yaw_rad)
+
+
+def resting_body(position_m: torch.Tensor, yaw_rad: torch.Tensor | None = None) -> Body:
+    """Return a body at rest, or a place."""
+    return moving_body(position_m, torch.zeros_like(position_m), yaw_rad)
+
+
+def yaw_rad(quaternion_wxyz: torch.Tensor) -> torch.Tensor:
+    """Return the (B,) angle in (-π, π] about world z by which the x axis of (B, 4) rotations is turned."""
+    w, x, y, z = quaternion_wxyz.unbind(dim=1)
+    return torch.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+
+
+def wrapped_rad(angle_rad: torch.Tensor) -> torch.Tensor:
+    """Return the same angles in [-π, π)."""
+    return torch.remainder(angle_rad + torch.pi, 2 * torch.pi) - torch.pi

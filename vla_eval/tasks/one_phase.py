@@ -1,0 +1,57 @@
+"""Tasks without cue and delay: what must be remembered is seen at the start, and then changes."""
+
+from typing import Any
+
+import torch
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.memory_env import MemoryTableEnv
+
+
+class OnePhaseEnv(MemoryTableEnv):
+    """A memory task of which the whole episode is response; nothing is hidden or revealed.
+
+    Arguments: those of `MemoryTableEnv` without `cue_steps` and `delay_steps`.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Refuse lengths of phases that there are not."""
+        for name in ("cue_steps", "delay_steps"):
+            if name in kwargs:
+                raise TaskArgumentError(
+                    f"{name}: this task has no phases, its objects are always to be seen. Leave it out."
+                )
+        super().__init__(*args, cue_steps=0, delay_steps=0, **kwargs)
+
+    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+        return False
+
+
+def check_positive(**numbers: float) -> None:
+    """Raise `TaskArgumentError` unless every number is > 0."""
+    for name, number in numbers.items():
+        if isinstance(number, bool) or not isinstance(number, int | float) or not number > 0:
+            raise TaskArgumentError(f"{name}={number!r}: expected a number > 0.")
+
+
+def check_range(name: str, value: Any, *, least: float, unit: str) -> tuple[float, float]:
+    """Return (least, most) of a pair of numbers.
+
+    Args:
+        name: of the argument.
+        value: what was given for it.
+        least: the pair must be greater than this, or equal.
+        unit: for the message.
+
+    Raises:
+        TaskArgumentError: no pair of numbers in order, or below `least`.
+    """
+    try:
+        low, high = (float(number) for number in value)
+    except (TypeError, ValueError):
+        low, high = 1.0, 0.0
+    if not least <= low <= high:
+        raise TaskArgumentError(
+            f"{name}={value!r}: expected (least, most) in {unit} with {least:g} ≤ least ≤ most."
+        )
+    return low, high
