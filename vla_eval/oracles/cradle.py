@@ -3,6 +3,8 @@
 The gripper is left 3 cm open: both fingers stand in a row along y and hold the 4 cm ball like a cradle
 while it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
 
+The ball's speed decides where the arm meets it, and how fast it pushes: one row of `CradleTactics` per mode.
+
 The law is applied to a model of arm and ball that is advanced step by step, so that it gives one action
 (closed loop) or many (open loop) in the same way; and, for the blind control, to a ball that exists in
 the model only.
@@ -17,6 +19,7 @@ from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     FULL_SPEED_M_S,
     GRIPPER_CRADLE,
+    POSITION_GAIN_PER_M,
     STEP_SECONDS,
     ArmState,
     Vector,
@@ -31,22 +34,43 @@ MIN_REACH_M = 0.30  # nearer to the base the inverse kinematics finds no pose at
 LANE_OFFSET_M = 0.065  # distance to the lane while waiting
 FOLLOW_GAP_M = 0.05
 CONTACT_GAP_M = 0.03
-MEET_Y_MIN_M = -0.5
 MEET_Y_EXTRA_M = 0.03
-PUSH_SPEED_M_S = 0.47
 PUSH_SPEED_RANGE_M_S = (0.2, 0.6)
 ALIGNED_M = 0.006
 TRACK_GAIN_PER_S = 6.0
 SIDE_SPEED_CHANGE_M_S = 0.04  # per control step; a faster change lets the ball slip past a finger
 FOLLOW_LEAD_S = 0.10
-POSITION_GAIN_PER_M = 13.0
 UNSEEN_STEPS = 6  # so long the ball is outside the base camera's view: a nominal one is assumed
 GOAL_OFFSET_X_M = 0.2
-NOMINAL_VELOCITY_M_S = (0.018, 0.446)
 ROLLING_SHARE = 5 / 7  # of the initial speed that is left once a solid ball rolls without slipping
 IMAGINED_Y_M = (-0.9, -0.65)
 IMAGINED_VELOCITY_X_M_S = (0.0, 0.05)
-IMAGINED_VELOCITY_Y_M_S = (0.5, 0.75)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CradleTactics:
+    """What depends on how fast the ball is; called, it makes the expert of an episode.
+
+    Attributes:
+        imagined_velocity_y_m_s: range of the initial speed along y, from which the blind arm draws its ball.
+        nominal_velocity_m_s: the rolling ball's (x, y) velocity that is assumed while it is out of view.
+        push_speed_m_s: speed along x at which the gap is closed, and by which the meeting place is chosen.
+        meet_y_min_m: farther back than this the arm does not wait.
+    """
+
+    imagined_velocity_y_m_s: tuple[float, float]
+    nominal_velocity_m_s: tuple[float, float]
+    push_speed_m_s: float = 0.47
+    meet_y_min_m: float = -0.5
+
+    def __call__(self, *, rng: np.random.Generator, imagined: bool) -> "CradleExpert":
+        """Make an expert; `imagined` makes it play a ball of its own invention, not the real one."""
+        return CradleExpert(self, rng=rng, imagined=imagined)
+
+
+SLOW = CradleTactics(imagined_velocity_y_m_s=(0.25, 0.5), nominal_velocity_m_s=(0.018, 0.268))
+MEDIUM = CradleTactics(imagined_velocity_y_m_s=(0.5, 0.75), nominal_velocity_m_s=(0.018, 0.446))
+FAST = CradleTactics(imagined_velocity_y_m_s=(0.75, 1.0), nominal_velocity_m_s=(0.018, 0.625))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +82,7 @@ class _Play:
         side_speed_m_s: the speed along y that is being commanded while pushing.
     """
 
+    tactics: CradleTactics
     arm: ArmState
     ball_m: Vector
     ball_velocity_m_s: Vector
@@ -74,14 +99,15 @@ class _Play:
 class CradleExpert:
     """One episode's expert; `imagined` makes it play a ball of its own invention, not the real one."""
 
-    def __init__(self, *, rng: np.random.Generator, imagined: bool) -> None:
+    def __init__(self, tactics: CradleTactics, *, rng: np.random.Generator, imagined: bool) -> None:
         """Draw the imagined ball now, before anything is seen."""
+        self._tactics = tactics
         self._imagined = imagined
         self._stage = "wait"
         self._side_speed_m_s = 0.0
         self._drawn_y_m = rng.uniform(*IMAGINED_Y_M)
         self._drawn_velocity_m_s = np.array(
-            [rng.uniform(*IMAGINED_VELOCITY_X_M_S), rng.uniform(*IMAGINED_VELOCITY_Y_M_S)]
+            [rng.uniform(*IMAGINED_VELOCITY_X_M_S), rng.uniform(*tactics.imagined_velocity_y_m_s)]
         )
         self._imagined_play: _Play | None = None
 
@@ -104,13 +130,14 @@ class CradleExpert:
         if self._imagined:
             ball, velocity = self._imagined_ball(goal)
         elif step < UNSEEN_STEPS:
-            velocity = np.array(NOMINAL_VELOCITY_M_S)
+            velocity = np.array(self._tactics.nominal_velocity_m_s)
             ball = np.array([goal[0] - GOAL_OFFSET_X_M, np.mean(IMAGINED_Y_M)])
             ball = ball + velocity * step * STEP_SECONDS
         else:
             body = state.bodies["ball"]
             ball, velocity = body.position_m[:2], body.velocity_m_s[:2]
         return _Play(
+            tactics=self._tactics,
             arm=arm,
             ball_m=ball,
             ball_velocity_m_s=velocity,
@@ -155,7 +182,7 @@ def _command(play: _Play) -> Vector:
         keep_gap = TRACK_GAIN_PER_S * (play.gap_m - FOLLOW_GAP_M)
         return np.array([ball_v_x + keep_gap, ball_v_y + tracking, height])
     if play.stage == "close":
-        return np.array([PUSH_SPEED_M_S, ball_v_y + tracking, height])
+        return np.array([play.tactics.push_speed_m_s, ball_v_y + tracking, height])
     forward, _ = _push_speeds_m_s(play)
     return np.array([forward, _next_side_speed_m_s(play) + tracking, height])
 
@@ -164,8 +191,8 @@ def _waiting_place_m(play: _Play) -> Vector:
     """Return (x, y) beside the lane from which a push carries the ball to the goal."""
     lane_x = float(play.ball_m[0])
     v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
-    run_up_y = float(play.goal_m[0] - lane_x) * v_y / PUSH_SPEED_M_S + MEET_Y_EXTRA_M
-    meet_y = max(float(play.goal_m[1]) - run_up_y, MEET_Y_MIN_M)
+    run_up_y = float(play.goal_m[0] - lane_x) * v_y / play.tactics.push_speed_m_s + MEET_Y_EXTRA_M
+    meet_y = max(float(play.goal_m[1]) - run_up_y, play.tactics.meet_y_min_m)
     x = lane_x + v_x * (meet_y - float(play.ball_m[1])) / v_y - LANE_OFFSET_M
     from_base_x = x - BASE_X_M
     if np.hypot(from_base_x, meet_y) < MIN_REACH_M:
