@@ -81,15 +81,23 @@ class ChoiceEnv(MemoryTableEnv):
     def _update_latches(self, step: torch.Tensor) -> None:
         distance, nearest = self._distances_m().min(dim=1)
         touches = (distance <= self.goal_threshold_m) & self.is_static() & (step >= self._response_step)
+        self._latch_touch(touches, nearest)
+
+    def _latch_touch(self, touches: torch.Tensor, candidate: torch.Tensor) -> None:
+        """Take down, where `touches` (B,) holds, that these candidates, (B,) indices, are touched."""
         self._first_choice = torch.where(
-            touches & (self._first_choice == NO_CHOICE), nearest, self._first_choice
+            touches & (self._first_choice == NO_CHOICE), candidate, self._first_choice
         )
         rows = torch.arange(self.num_envs, device=self.device)
-        self._touched[rows, nearest] |= touches
+        self._touched[rows, candidate] |= touches
+
+    def is_placed(self) -> torch.Tensor:
+        """Return (B,) bool: the success rule holds, but for the arm being at rest."""
+        return self.target_distance_m() <= self.goal_threshold_m
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Read success, failure and choices; changes nothing."""
-        placed = self.target_distance_m() <= self.goal_threshold_m
+        placed = self.is_placed()
         static = self.is_static()
         success = self.gated(placed & static)
         n_wrong = self._touched.sum(dim=1) - self._of_target(self._touched.long())

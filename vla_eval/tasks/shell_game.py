@@ -1,4 +1,7 @@
-"""ShellGameTouch: a ball is shown at one of three places, then mugs stand there; find the ball's mug."""
+"""The shell game: a ball is shown at one of three places, then mugs stand there; find the ball's mug.
+
+Touching it is `ShellGameTouchEnv`; pushing and picking it are in `shell_game_moves`.
+"""
 
 import math
 from typing import Any, Literal
@@ -23,18 +26,13 @@ _NORM = math.sqrt(1.25)
 UPSIDE_DOWN_WXYZ = (0.0, 1 / _NORM, 0.5 / _NORM, 0.0)  # official (0, 1, 0.5, 0), made a unit quaternion
 
 
-class ShellGameTouchEnv(ChoiceEnv):
-    """ShellGameTouch: find the mug that stands over the ball.
+class ShellGameEnv(ChoiceEnv):
+    """Find the mug that stands over the ball; the families say what is to be done with it.
 
     Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
     stands on each of them, one over the ball (response, without a delay).
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: pose of the right mug 7, of the ball 7, oracle 1).
-
-    Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 where solved.
 
     Starting state: middle of the row uniform in ±10 cm; the ball's place uniform.
 
@@ -43,20 +41,15 @@ class ShellGameTouchEnv(ChoiceEnv):
     Arguments: `mug` (`primitive`, or `ycb` where installed), and those of `ChoiceEnv`, `MemoryTableEnv`.
 
     Chance level: 1/3 for a perfect arm that ignores the cue.
-
-    Version history: 1, first version.
     """
 
-    MAX_REWARD = 3.0
     FAMILY = 2
-    REACH_SCALE_PER_M = 5.0
     HUMAN_CAMERA_EYE = (0.6, 0.7, 0.6)
     HUMAN_CAMERA_TARGET = (0.0, 0.0, 0.15)
 
     def __init__(
         self,
         *args: Any,
-        goal_threshold_m: float = 0.08,
         delay_steps: StepRange = 0,
         mug: Literal["primitive", "ycb"] = "primitive",
         **kwargs: Any,
@@ -65,7 +58,7 @@ class ShellGameTouchEnv(ChoiceEnv):
         if mug not in ("primitive", "ycb"):
             raise TaskArgumentError(f"mug={mug!r}: expected 'primitive' or 'ycb'.")
         self.mug = mug
-        super().__init__(*args, goal_threshold_m=goal_threshold_m, delay_steps=delay_steps, **kwargs)
+        super().__init__(*args, delay_steps=delay_steps, **kwargs)
 
     def _load_items(self) -> None:
         self.candidates = []
@@ -89,6 +82,10 @@ class ShellGameTouchEnv(ChoiceEnv):
         pose = self.parking_pose(name, half_height_m=MUG_REST_Z_M)
         return sapien.Pose(p=pose.p, q=list(UPSIDE_DOWN_WXYZ))
 
+    def _mug_orientation_wxyz(self) -> torch.Tensor:
+        """Return how all mugs are turned when they appear, (4,) or (B, 4)."""
+        return torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device)
+
     def _sample_episode(self, env: int) -> None:
         self._target[env] = int(self.episode_generator(env, Stream.TARGET).integers(N_MUGS))
         layout = self.episode_generator(env, Stream.LAYOUT)
@@ -111,17 +108,17 @@ class ShellGameTouchEnv(ChoiceEnv):
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
         choice_begins = mask & (step == self._response_step)
         hidden = mask & (step >= self._cue_end_step) & (step < self._response_step)
-        self.reveal(choice_begins, torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device))
+        self.reveal(choice_begins, self._mug_orientation_wxyz())
         # Between cue and choice the ball is out of sight; later it goes where its mug goes.
         self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
         covered = mask & (step >= self._response_step)
         self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
         return bool((choice_begins | hidden | covered).any())
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
-        begun = self._elapsed_steps >= self._response_step
-        return {name: term * begun for name, term in super().reward_terms(info).items()}
+    def _begun(self) -> torch.Tensor:
+        """Return (B,) bool: the mugs stand there."""
+        begun: torch.Tensor = self._elapsed_steps >= self._response_step
+        return begun
 
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         poses = torch.stack([actor.pose.raw_pose for actor in self.candidates], dim=1)
@@ -130,3 +127,28 @@ class ShellGameTouchEnv(ChoiceEnv):
             "ball_pose": self.ball.pose.raw_pose,
             "oracle_info": self.oracle_info(),
         }
+
+
+class ShellGameTouchEnv(ShellGameEnv):
+    """ShellGameTouch: reach the mug that stands over the ball; see `ShellGameEnv`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: pose of the right mug 7, of the ball 7, oracle 1).
+
+    Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 where solved.
+
+    Arguments: `goal_threshold_m`, and those of `ShellGameEnv`.
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 3.0
+    REACH_SCALE_PER_M = 5.0
+
+    def __init__(self, *args: Any, goal_threshold_m: float = 0.08, **kwargs: Any) -> None:
+        """Give the threshold its default."""
+        super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
+        return {name: term * self._begun() for name, term in super().reward_terms(info).items()}

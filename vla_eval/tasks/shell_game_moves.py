@@ -1,0 +1,226 @@
+"""ShellGamePush and ShellGamePick: the mug over the ball must be moved, forwards or up.
+
+A mug counts as chosen once it has been moved, in the response phase, by as much as success needs, but
+at most `CHOSEN_M`: a wrong one that is shoved aside counts, one that is brushed does not.
+"""
+
+import math
+from typing import Any
+
+import torch
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.bodies import Body, moving_body, resting_body, yaw_rad
+from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.one_phase import check_positive
+from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
+
+CHOSEN_M = 0.02
+GOAL_ABOVE_BALL_M = 0.025
+PUSH_REACH_M = 0.08
+PICK_REACH_M = 0.04
+# The official quaternions (0, 1, s, 0): s depends on the mug that hides the ball, and so the handles show
+# it. Here all mugs have the last one.
+OFFICIAL_TURNS = (2.3, 2.7, 2.5)
+
+
+def _upside_down_wxyz(turn: float) -> tuple[float, float, float, float]:
+    norm = math.hypot(1, turn)
+    return (0.0, 1 / norm, turn / norm, 0.0)
+
+
+class ShellGameMoveEnv(ShellGameEnv):
+    """Move the mug that stands over the ball to a goal of its own; see `ShellGameEnv`."""
+
+    MODE: int
+    """Number of the mode in random streams. Part of every result: never renumber, only add."""
+    SLOWING_WEIGHT = 0.2
+    RESTING_WEIGHT = 0.2
+
+    def stream_key(self) -> tuple[int, ...]:
+        """Return the shell game's number and the mode's: the same seed has other places in each mode."""
+        return (self.FAMILY, self.MODE)
+
+    def _goal_offset_m(self) -> tuple[float, float, float]:
+        """Return where the goal is, seen from the ball's centre; world frame."""
+        raise NotImplementedError
+
+    def goal_positions_m(self) -> torch.Tensor:
+        """Return (B, N, 3): where each mug would have to go, were the ball under it; world frame."""
+        goals = self._slots.clone()
+        goals[:, :, 2] = BALL_RADIUS_M
+        return goals + torch.tensor(self._goal_offset_m(), device=self.device)
+
+    def _target_to_goal_m(self) -> torch.Tensor:
+        offset: torch.Tensor = self._of_target(self.goal_positions_m() - self.candidate_positions_m())
+        return offset
+
+    def is_placed(self) -> torch.Tensor:
+        """Return (B,) bool: the right mug is within the threshold of its goal."""
+        return torch.linalg.norm(self._target_to_goal_m(), dim=1) <= self.goal_threshold_m
+
+    def _chosen_m(self) -> float:
+        """Return by how much a mug must have been moved to count as chosen."""
+        return CHOSEN_M
+
+    def _update_latches(self, step: torch.Tensor) -> None:
+        moved_m = torch.linalg.norm(self.candidate_positions_m() - self._slots, dim=2)
+        moved_m = torch.where((step > self._response_step)[:, None], moved_m, 0.0)
+        # The one moved most first: it was touched first if two pass the limit in the same step.
+        for rank in range(N_MUGS):
+            farthest, index = moved_m.sort(dim=1, descending=True)
+            self._latch_touch(farthest[:, rank] >= self._chosen_m(), index[:, rank])
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success, failure and choices; changes nothing."""
+        return {**super().evaluate(), "obj_to_goal_pos": self._target_to_goal_m()}
+
+    def moving_bodies(self) -> dict[str, Body]:
+        """Return `mug_0` … and `goal_0` …, of all mugs alike, in candidate order."""
+        bodies = {}
+        goals = self.goal_positions_m()
+        for index, actor in enumerate(self.candidates):
+            bodies[f"mug_{index}"] = moving_body(
+                self.final_positions_m()[:, index], actor.linear_velocity, yaw_rad(actor.pose.q)
+            )
+            bodies[f"goal_{index}"] = resting_body(goals[:, index])
+        return bodies
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        return {"goal_pos": self._of_target(self.goal_positions_m()), **super()._privileged_extra()}
+
+
+class ShellGamePushEnv(ShellGameMoveEnv):
+    """ShellGamePush: push the mug that stands over the ball forwards; see `ShellGameEnv`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: goal 3, pose of the right mug 7, of the ball 7, oracle 1).
+
+    Rewards: dense, from the response phase on: reach the mug 1, bring it to the goal 2 while the tool
+    centre point is within 8 cm of it, slow down 0.2 and stand still 0.2 there; 4 where solved.
+
+    Arguments: `push_distance_m`, how far ahead of the ball the goal is; `goal_threshold_m`, how near the
+    mug's centre must come to it (with the defaults a push of 2 cm is enough); and those of `ShellGameEnv`.
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 4.0
+    MODE = 1
+    REACH_SCALE_PER_M = 10.0
+
+    def __init__(
+        self, *args: Any, push_distance_m: float = 0.1, goal_threshold_m: float = 0.08, **kwargs: Any
+    ) -> None:
+        """Refuse a goal in which the mug already stands."""
+        check_positive(push_distance_m=push_distance_m)
+        if not 0 < goal_threshold_m < push_distance_m:
+            raise TaskArgumentError(
+                f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than push_distance_m="
+                f"{push_distance_m}, or the mug stands in the goal before anything is done."
+            )
+        self.push_distance_m = push_distance_m
+        super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
+
+    def _goal_offset_m(self) -> tuple[float, float, float]:
+        return (self.push_distance_m, 0.0, GOAL_ABOVE_BALL_M)
+
+    def _chosen_m(self) -> float:
+        return min(CHOSEN_M, self.push_distance_m - self.goal_threshold_m)
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Reach the right mug and push it, once the mugs stand there."""
+        reach_m = self.target_distance_m()
+        to_goal_m = torch.linalg.norm(self._target_to_goal_m(), dim=1)
+        terms = super().reward_terms(info)
+        terms["pushing"] = 2 * nearness(5.0, to_goal_m) * (reach_m <= PUSH_REACH_M)
+        return {name: term * self._begun() for name, term in terms.items()}
+
+
+class ShellGamePickEnv(ShellGameMoveEnv):
+    """ShellGamePick: lift the mug that stands over the ball; see `ShellGameEnv`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: goal 3, pose of the right mug 7, of the ball 7, oracle 1, grasped 1).
+
+    Rewards: dense, from the response phase on: reach the mug 3; with the tool centre point within 4 cm of
+    its centre 2, bring it to the goal 30, slow down 5 and stand still 5 there; 75 where solved.
+
+    Arguments: `lift_height_m`, by how much the mug's centre must have risen (the paper's 0.1 m);
+    `goal_threshold_m` (0.08: the official rule instead, the mug's centre within so many metres of a point
+    `lift_height_m` + 2.5 cm over the ball, for which 2.4 cm are enough); `official_mug_yaws` (the handles
+    show which mug it is, as in the official code); and those of `ShellGameEnv`.
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 75.0
+    MODE = 2
+    REACH_SCALE_PER_M = 10.0
+
+    def __init__(
+        self,
+        *args: Any,
+        lift_height_m: float = 0.1,
+        goal_threshold_m: float | None = None,
+        official_mug_yaws: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Refuse a goal in which the mug already is, and one that the arm cannot reach."""
+        if not 0 < lift_height_m <= 0.4:
+            raise TaskArgumentError(f"lift_height_m={lift_height_m}: expected > 0 and at most 0.4.")
+        if goal_threshold_m is not None and not 0 < goal_threshold_m < lift_height_m:
+            raise TaskArgumentError(
+                f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than lift_height_m="
+                f"{lift_height_m}, or the mug is at the goal before anything is done."
+            )
+        self.lift_height_m = lift_height_m
+        self.goal_is_a_point = goal_threshold_m is not None
+        self.official_mug_yaws = official_mug_yaws
+        super().__init__(
+            *args,
+            goal_threshold_m=lift_height_m if goal_threshold_m is None else goal_threshold_m,
+            **kwargs,
+        )
+
+    def _goal_offset_m(self) -> tuple[float, float, float]:
+        return (0.0, 0.0, self.lift_height_m + GOAL_ABOVE_BALL_M)
+
+    def is_placed(self) -> torch.Tensor:
+        """Return (B,) bool: the right mug has been lifted high enough."""
+        if self.goal_is_a_point:
+            return super().is_placed()
+        risen_m = self._of_target(self.candidate_positions_m() - self._slots)[:, 2]
+        return self._begun() & (risen_m >= self.lift_height_m)
+
+    def _chosen_m(self) -> float:
+        needed_m = self.lift_height_m - (self.goal_threshold_m if self.goal_is_a_point else 0.0)
+        return min(CHOSEN_M, needed_m)
+
+    def _mug_orientation_wxyz(self) -> torch.Tensor:
+        quaternions = torch.tensor([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], device=self.device)
+        return quaternions[self._target] if self.official_mug_yaws else quaternions[-1]
+
+    def _is_grasped(self) -> torch.Tensor:
+        grasped = torch.stack([self.agent.is_grasping(actor) for actor in self.candidates], dim=1)
+        return self._of_target(grasped)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success, failure and choices; changes nothing."""
+        return {**super().evaluate(), "is_grasped": self._is_grasped()}
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Reach the right mug and lift it, once the mugs stand there."""
+        reach_m = self.target_distance_m()
+        to_goal_m = torch.linalg.norm(self._target_to_goal_m(), dim=1)
+        placed, near = info["is_obj_placed"], reach_m <= PICK_REACH_M
+        terms = {
+            "reaching": 3 * nearness(self.REACH_SCALE_PER_M, reach_m),
+            "lifting": (2 + 30 * nearness(5.0, to_goal_m)) * near,
+            "slowing": 5 * nearness(5.0, self.arm_speed()) * (placed & near),
+            "resting": 5.0 * (info["is_robot_static"] & placed & near),
+        }
+        return {name: term * self._begun() for name, term in terms.items()}
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        return {**super()._privileged_extra(), "is_grasped": self._is_grasped()[:, None]}
