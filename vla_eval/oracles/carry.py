@@ -1,0 +1,144 @@
+"""Expert for TakeItBack: grasp the cube, draw it onto the disc, draw it back."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import PrivilegedState
+from vla_eval.oracles.arm_model import (
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    ArmState,
+    Vector,
+    action_row,
+    advance,
+    advance_gripper,
+    gripper_state,
+    towards,
+)
+
+HOVER_M = 0.08
+GRASP_M = 0.02
+CARRY_M = 0.03  # off the table: no friction
+BEHIND_M = 0.010  # so far behind its middle the cube is held: the disc is at the edge of the arm's reach
+
+OVER_M = 0.012
+AT_GRASP_M = 0.008
+CUBE_WIDTH_M = 0.04
+HELD_WIDTH_M = 0.043
+ON_DISC_M = 0.07  # within 8 cm counts
+REACH_X_M = 0.18  # so far out the tool centre point may be sent at the height of the cube
+ACTION_M = 0.1  # what an action of 1 adds to the target of the controller
+CREEP = 0.15
+AIM_M = 0.055  # so near to the disc's middle the cube is brought
+BACK_M = 0.02
+IMAGINED_X_M = (-0.05, 0.05)
+IMAGINED_BANDS_Y_M = (-0.1, 0.0, 0.1)
+IMAGINED_BAND_WIDTH_M = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Play:
+    """The model's world: arm, cube, where the cube shall go, and what the law has to remember."""
+
+    arm: ArmState
+    cube_m: Vector
+    goal_m: Vector
+    home_m: Vector
+    was_there: bool
+    closing: bool
+
+    @property
+    def held(self) -> bool:
+        """Whether the fingers hold the cube."""
+        return self.closing and self.arm.width_m < HELD_WIDTH_M
+
+
+class CarryExpert:
+    """One episode's expert; with an imagined home it brings the cube back to that place."""
+
+    def __init__(self, *, imagined_home_m: Vector | None) -> None:
+        """Take the place to bring the cube back to, if it is not the one seen at the start."""
+        self._imagined_home_m = imagined_home_m
+        self._was_there = False
+        self._closing = False
+
+    def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7), planned from this state and from what happened before."""
+        home_m = state.bodies["first_place"].position_m[:2]
+        play = _Play(
+            arm=gripper_state(state),
+            cube_m=state.bodies["cube"].position_m[:2],
+            goal_m=state.bodies["goal"].position_m[:2],
+            home_m=home_m if self._imagined_home_m is None else self._imagined_home_m,
+            was_there=self._was_there,
+            closing=self._closing,
+        )
+        # Only what was seen counts: a model that believes the cube is there would turn round too early.
+        self._was_there |= float(np.linalg.norm(play.cube_m - play.goal_m)) < ON_DISC_M
+        play = replace(play, was_there=self._was_there)
+        rows = []
+        for index in range(n_actions):
+            play = _decide(play)
+            if index == 0:  # later steps are the model's, not what happened
+                self._closing = play.closing
+            translation, gripper = _command(play)
+            rows.append(action_row(translation, gripper))
+            play = _advance(play, translation, gripper)
+        return np.stack(rows)
+
+
+def _decide(play: _Play) -> _Play:
+    over = float(np.linalg.norm(_grasp_place_m(play) - play.arm.position_m[:2])) < OVER_M
+    low = abs(play.arm.position_m[2] - GRASP_M) < AT_GRASP_M
+    return replace(play, closing=play.closing or (over and low))
+
+
+def _grasp_place_m(play: _Play) -> Vector:
+    return play.cube_m - np.array([BEHIND_M, 0.0])
+
+
+def _command(play: _Play) -> tuple[Vector, float]:
+    """Return translation and gripper command."""
+    arm = play.arm
+    if not play.closing:
+        place = _grasp_place_m(play)
+        over = float(np.linalg.norm(place - arm.position_m[:2])) < OVER_M
+        return towards(np.array([*place, GRASP_M if over else HOVER_M]), arm), GRIPPER_OPEN
+    if not play.held:
+        return np.zeros(3), GRIPPER_CLOSED
+    shift = (play.home_m if play.was_there else play.goal_m) - play.cube_m
+    distance = float(np.linalg.norm(shift))
+    if play.was_there and distance < BACK_M:
+        shift = np.zeros(2)
+    elif not play.was_there:
+        shift *= max(distance - AIM_M, 0.0) / max(distance, 1e-6)
+    translation = towards(np.array([*(arm.position_m[:2] + shift), CARRY_M]), arm)
+    translation[0] = min(translation[0], _farthest(float(arm.position_m[0])))
+    return translation, GRIPPER_CLOSED
+
+
+def _farthest(x_m: float) -> float:
+    """Return the most that an action may ask for in x: the arm freezes if its target is out of reach."""
+    return max((REACH_X_M - x_m) / ACTION_M, CREEP)
+
+
+def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
+    """Return the model's world one control step later: what is held moves with the hand."""
+    arm = advance_gripper(advance(play.arm, translation), 0.0, gripper, held_width_m=CUBE_WIDTH_M)
+    moved = (arm.position_m - play.arm.position_m)[:2] if play.held else np.zeros(2)
+    return replace(play, arm=arm, cube_m=play.cube_m + moved)
+
+
+class CubeCarries:
+    """Makes the expert of an episode."""
+
+    def __call__(self, *, rng: np.random.Generator, imagined: bool) -> CarryExpert:
+        """Draw the imagined first place now, before anything is seen."""
+        x, band = rng.uniform(*IMAGINED_X_M), IMAGINED_BANDS_Y_M[int(rng.integers(3))]
+        home_m = np.array([x, band + rng.uniform(0, IMAGINED_BAND_WIDTH_M)])
+        return CarryExpert(imagined_home_m=home_m if imagined else None)
+
+
+CUBE = CubeCarries()

@@ -1,0 +1,199 @@
+"""TakeItBack: bring the cube to the goal, then back to where it was, which nothing marks any more."""
+
+from typing import Any
+
+import sapien
+import torch
+from mani_skill.utils.building import actors
+from mani_skill.utils.structs import Pose
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.bodies import Body, moving_body, resting_body
+from vla_eval.tasks.intercept import UPWARDS_WXYZ
+from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive
+from vla_eval.tasks.streams import Stream
+
+START_X_M = (-0.05, 0.05)
+START_BANDS_Y_M = (-0.1, 0.0, 0.1)
+START_BAND_WIDTH_M = 0.05  # y is uniform from a band's number on, over this width
+GOAL_X_M = (0.2, 0.25)
+GOAL_Y_M = (-0.025, 0.025)
+DISC_Z_M = 0.001
+DISC_HALF_THICKNESS_M = 1e-5
+PUSH_BEHIND_M = 0.025  # the reward's push point lies so far behind the cube, seen from the goal,
+PULL_AHEAD_M = 0.03  # and its pull point so far ahead of it;
+CONTACT_M = 0.01  # the tool centre point is there within this distance.
+GREEN_RGBA = (0.0, 1.0, 0.0, 1.0)
+RED_RGBA = (194 / 255, 19 / 255, 22 / 255, 1.0)
+VIOLET_RGBA = (147 / 255, 0.0, 211 / 255, 1.0)
+
+
+class TakeItBackEnv(OnePhaseEnv):
+    """TakeItBack: move the cube into the goal region, then back to where it lay.
+
+    Description: a green cube lies in front of the robot, behind it a red disc. Once the cube has been on
+    the disc, the disc turns violet and the cube must go back to its first place, which is not marked.
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: goal 3, cube pose 7, first place 3, goal reached 1).
+
+    Rewards: dense: until the goal is reached 2 for nearing the point behind the cube, and 5 for the cube
+    nearing the goal while the arm is there; then 10 and 15 likewise for the way back; 30 where solved.
+
+    Starting state: cube at x in [-0.05, 0.05], y in one of three bands of 5 cm; goal at x in [0.2, 0.25],
+    y in [-0.025, 0.025] m.
+
+    Episode end: 180 control steps; success is reported but ends nothing by itself. There are no phases.
+
+    Arguments: `goal_radius_m` and `return_radius_m`, how near the cube's centre must come to the middle of
+    the disc and to its first place; `cube_half_size_m`; `latch_goal_color` (off: the disc is violet only
+    while the cube is on it, as in the official code on the GPU); and those of `OnePhaseEnv`.
+
+    Chance level: to be measured (`cue_blind`); there are no candidates.
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 30.0
+    FAMILY = 10
+
+    def __init__(
+        self,
+        *args: Any,
+        goal_radius_m: float = 0.08,
+        return_radius_m: float = 0.08,
+        cube_half_size_m: float = 0.02,
+        latch_goal_color: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        """Check the sizes and build the scene."""
+        check_positive(
+            goal_radius_m=goal_radius_m, return_radius_m=return_radius_m, cube_half_size_m=cube_half_size_m
+        )
+        if goal_radius_m >= GOAL_X_M[0] - START_X_M[1]:
+            raise TaskArgumentError(
+                f"goal_radius_m={goal_radius_m}: expected less than {GOAL_X_M[0] - START_X_M[1]:g}, or the "
+                "cube can lie in the goal region from the start."
+            )
+        self.goal_radius_m = goal_radius_m
+        self.return_radius_m = return_radius_m
+        self.cube_half_size_m = cube_half_size_m
+        self.latch_goal_color = latch_goal_color
+        super().__init__(*args, **kwargs)
+
+    def _load_items(self) -> None:
+        half = self.cube_half_size_m
+        self.cube = actors.build_cube(
+            self.scene,
+            half_size=half,
+            color=list(GREEN_RGBA),
+            name="cube",
+            initial_pose=sapien.Pose(p=[0, 0, half]),
+        )
+        self.red_disc = self._build_disc("goal_region", RED_RGBA)
+        self.violet_disc = self._build_disc("changed_goal_region", VIOLET_RGBA)
+        self._first_place = torch.zeros(self.num_envs, 3, device=self.device)
+        self._goal_position = torch.zeros(self.num_envs, 3, device=self.device)
+        self._goal_reached = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._is_violet = torch.zeros_like(self._goal_reached)
+
+    def _build_disc(self, name: str, rgba: tuple[float, ...]) -> Any:  # an actor; ManiSkill is untyped
+        builder = self.scene.create_actor_builder()
+        if self.scene.can_render():
+            material = sapien.render.RenderMaterial(base_color=rgba)
+            builder.add_cylinder_visual(
+                radius=self.goal_radius_m, half_length=DISC_HALF_THICKNESS_M, material=material
+            )
+        builder.initial_pose = self._parked_disc(name)
+        return builder.build_kinematic(name=name)
+
+    def _parked_disc(self, name: str) -> sapien.Pose:
+        pose = self.parking_pose(name, half_height_m=DISC_Z_M)
+        return sapien.Pose(p=pose.p, q=list(UPWARDS_WXYZ))
+
+    def _sample_episode(self, env: int) -> None:
+        layout = self.episode_generator(env, Stream.LAYOUT)
+        band_m = START_BANDS_Y_M[int(self.episode_generator(env, Stream.TARGET).integers(3))]
+        x, y = layout.uniform(*START_X_M), band_m + layout.uniform(0, START_BAND_WIDTH_M)
+        self._first_place[env] = torch.tensor((x, y, self.cube_half_size_m))
+        goal_m = (layout.uniform(*GOAL_X_M), layout.uniform(*GOAL_Y_M), DISC_Z_M)
+        self._goal_position[env] = torch.tensor(goal_m)
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        self._goal_reached[mask] = False
+        self.move(self.cube, mask, Pose.create_from_pq(self._first_place))
+        self._color_goal(mask, torch.zeros_like(mask))
+
+    def _color_goal(self, mask: torch.Tensor, violet: torch.Tensor) -> None:
+        """Show the violet disc where `mask` and `violet` hold, the red one where only `mask` does."""
+        turned = torch.tensor(UPWARDS_WXYZ, device=self.device).expand(self.num_envs, 4)
+        at_goal = Pose.create_from_pq(self._goal_position, turned)
+        for disc, shown in ((self.red_disc, mask & ~violet), (self.violet_disc, mask & violet)):
+            self.move(disc, shown, at_goal)
+            self.move(disc, mask & ~shown, self._parked_disc(disc.name))
+        self._is_violet = torch.where(mask, violet, self._is_violet)
+
+    def _cube_distance_m(self, place: torch.Tensor) -> torch.Tensor:
+        distance: torch.Tensor = torch.linalg.norm((self.cube.pose.p - place)[:, :2], dim=1)
+        return distance
+
+    def _in_goal(self) -> torch.Tensor:
+        return self._cube_distance_m(self._goal_position) < self.goal_radius_m
+
+    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+        # No phase begins, but the disc changes colour where the cube has come to it, or left it again.
+        in_goal = self._in_goal()
+        violet = in_goal | (self._goal_reached & self.latch_goal_color)
+        changed = mask & (step > 0) & (violet != self._is_violet)
+        self._color_goal(changed, violet)
+        return bool(changed.any())
+
+    def _update_latches(self, step: torch.Tensor) -> None:
+        self._goal_reached |= self._in_goal()
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success: the goal was reached and the cube is back at this step; changes nothing."""
+        is_back = self._cube_distance_m(self._first_place) < self.return_radius_m
+        return {
+            "success": self._goal_reached & is_back,
+            "goal_achieved": self._in_goal(),
+            "goal_reached_status": self._goal_reached.clone(),
+            "is_robot_static": self.is_static(),
+        }
+
+    def moving_bodies(self) -> dict[str, Body]:
+        """Return `cube`, `goal` and `first_place`."""
+        return {
+            "cube": moving_body(self.cube.pose.p, self.cube.linear_velocity),
+            "goal": resting_body(self._goal_position),
+            "first_place": resting_body(self._first_place),
+        }
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return (B, 3): where the cube's centre was at the start, m, world frame."""
+        return self._first_place
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Push the cube to the goal; once it was there, pull it back."""
+        back = self._goal_reached
+        offset_x = torch.where(back, PULL_AHEAD_M, -PUSH_BEHIND_M)
+        contact = self.cube.pose.p.clone()
+        contact[:, 0] += offset_x
+        distance = torch.linalg.norm(contact - self.tcp_position_m(), dim=1)
+        place = torch.where(back[:, None], self._first_place, self._goal_position)
+        there = distance < CONTACT_M
+        return {
+            "reaching": torch.where(back, 10.0, 2.0) * nearness(5.0, distance),
+            "moving": torch.where(back, 15.0, 5.0) * nearness(5.0, self._cube_distance_m(place)) * there,
+        }
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        return {
+            "goal_pos": self._goal_position,
+            "cube_pose": self.cube.pose.raw_pose,
+            "oracle_info": self.oracle_info(),
+            "goal_reached_status": self._goal_reached[:, None],
+        }
