@@ -1,0 +1,194 @@
+"""Expert for Rotate: grasp the peg by its middle, turn it on the spot.
+
+The fingers are put across the peg, so that two grasps are possible, half a turn apart; the one with the
+shorter way in all is taken. The wrist turns on the way down. Turning is what takes time: 0.039 rad per
+control step at most.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import PrivilegedState
+from vla_eval.oracles.arm_model import (
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    ArmState,
+    Vector,
+    action_row,
+    advance,
+    advance_gripper,
+    gripper_state,
+    towards,
+    turn_towards,
+    wrapped_rad,
+)
+
+# Joint 7 stands at π/4 and goes to ±2.9 rad: the wrist can turn farther to the left than to the right.
+WRIST_RANGE_RAD = (-1.95, 3.4)
+HOVER_M = 0.10
+GRASP_M = 0.022
+OVER_M = 0.015  # the arm goes down within this horizontal distance of the peg's middle,
+DESCEND_RAD = 0.35  # once the fingers are so far aligned: 8 cm between them leave room around 5 cm,
+CLOSE_RAD = 0.12  # and closes once they are so far aligned
+AT_GRASP_M = 0.008
+DESCENT = (
+    0.5  # of full speed: faster, the arm swerves by 1 cm per step, which an open-loop plan cannot correct
+)
+PEG_WIDTH_M = 0.05
+HELD_WIDTH_M = 0.052
+AT_ANGLE_RAD = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Play:
+    """The model's world: arm, peg, and where the peg shall go.
+
+    `may_descend` is what was seen, not what the model expects: the arm comes down only if it truly stands
+    over the peg when the plan is made. Going there and down in one plan, it would now and then land on it.
+    """
+
+    arm: ArmState
+    peg_m: Vector
+    peg_yaw_rad: float
+    goal_m: Vector
+    grasp_yaw_rad: float
+    left_rad: float
+    closing: bool
+    may_descend: bool = False
+
+
+class TurnExpert:
+    """One episode's expert; `imagined` makes it turn the peg by an angle of its own invention."""
+
+    def __init__(self, *, imagined_angle_rad: float | None) -> None:
+        """Take the angle to turn by, if it is not the one asked for."""
+        self._imagined_angle_rad = imagined_angle_rad
+        self._goal_yaw_rad: float | None = None
+        self._grasp_offset_rad: float | None = None
+        self._closing = False
+
+    def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7), planned from this state and from the grasp that was chosen at first."""
+        play = self._present(state)
+        rows = []
+        for index in range(n_actions):
+            play = _decide(play)
+            if index == 0:
+                self._closing = play.closing
+            translation, turn, gripper = _command(play)
+            rows.append(action_row(translation, gripper, turn))
+            play = _advance(play, translation, turn, gripper)
+        return np.stack(rows)
+
+    def _present(self, state: PrivilegedState) -> _Play:
+        arm = gripper_state(state)
+        peg, goal = state.bodies["peg"], state.bodies["goal"]
+        if self._goal_yaw_rad is None:
+            by_rad = self._imagined_angle_rad
+            self._goal_yaw_rad = goal.yaw_rad if by_rad is None else peg.yaw_rad + by_rad
+        left_rad = wrapped_rad(self._goal_yaw_rad - peg.yaw_rad)
+        if self._grasp_offset_rad is None:
+            grasp_yaw_rad = _grasp_yaw_rad(arm.yaw_rad, peg.yaw_rad, left_rad)
+            self._grasp_offset_rad = grasp_yaw_rad - peg.yaw_rad
+        # Unwrapped around the wrist's own yaw: the way round was decided with the grasp.
+        wanted_rad = peg.yaw_rad + self._grasp_offset_rad
+        play = _Play(
+            arm=arm,
+            peg_m=peg.position_m,
+            peg_yaw_rad=peg.yaw_rad,
+            goal_m=goal.position_m,
+            grasp_yaw_rad=arm.yaw_rad + wrapped_rad(wanted_rad - arm.yaw_rad),
+            left_rad=left_rad,
+            closing=self._closing,
+        )
+        return replace(play, may_descend=_is_over(play))
+
+
+def _grasp_yaw_rad(wrist_rad: float, peg_rad: float, left_rad: float) -> float:
+    """Return the wrist's yaw at the grasp that gives the shortest way within the wrist's range."""
+    nearest = wrist_rad + wrapped_rad(peg_rad - wrist_rad, math.pi)
+    least, most = WRIST_RANGE_RAD
+
+    def way(yaw_rad: float) -> tuple[bool, float]:
+        ends = (yaw_rad, yaw_rad + left_rad)
+        return max(ends) > most or min(ends) < least, abs(yaw_rad - wrist_rad)
+
+    return min((nearest, nearest + math.pi, nearest - math.pi), key=way)
+
+
+def _decide(play: _Play) -> _Play:
+    """Close the fingers, for good, where they stand around the peg."""
+    around = _over_m(play) < OVER_M and abs(play.arm.position_m[2] - GRASP_M) < AT_GRASP_M
+    aligned = abs(play.grasp_yaw_rad - play.arm.yaw_rad) < CLOSE_RAD
+    return replace(play, closing=play.closing or (around and aligned))
+
+
+def _over_m(play: _Play) -> float:
+    return float(np.linalg.norm((play.peg_m - play.arm.position_m)[:2]))
+
+
+def _is_over(play: _Play) -> bool:
+    """Whether the fingers would go to either side of the peg, were they to go down."""
+    return _over_m(play) < OVER_M and abs(play.grasp_yaw_rad - play.arm.yaw_rad) < DESCEND_RAD
+
+
+def _command(play: _Play) -> tuple[Vector, float, float]:
+    """Return translation, turn and gripper command."""
+    arm = play.arm
+    if not play.closing:
+        down = play.may_descend and _is_over(play)
+        goal = np.array([*play.peg_m[:2], GRASP_M if down else HOVER_M])
+        translation = towards(goal, arm)
+        if down:
+            translation[2] = max(translation[2], -DESCENT)
+        return translation, turn_towards(play.grasp_yaw_rad, arm), GRIPPER_OPEN
+    held = arm.width_m < HELD_WIDTH_M
+    # The middle goes back to where it was, should the grasp have moved it.
+    shift = (play.goal_m - play.peg_m)[:2] if held else np.zeros(2)
+    goal = np.array([*(arm.position_m[:2] + shift), GRASP_M])
+    turns = held and abs(play.left_rad) > AT_ANGLE_RAD
+    turn = turn_towards(arm.yaw_rad + play.left_rad, arm) if turns else 0.0
+    return towards(goal, arm), turn, GRIPPER_CLOSED
+
+
+def _advance(play: _Play, translation: Vector, turn: float, gripper: float) -> _Play:
+    """Return the model's world one control step later: what is held turns and moves with the hand."""
+    held = play.closing and play.arm.width_m < HELD_WIDTH_M
+    arm = advance_gripper(advance(play.arm, translation), turn, gripper, held_width_m=PEG_WIDTH_M)
+    if not held:
+        return replace(play, arm=arm)
+    turned_rad = arm.yaw_rad - play.arm.yaw_rad
+    moved = arm.position_m - play.arm.position_m
+    return replace(
+        play,
+        arm=arm,
+        peg_m=play.peg_m + moved,
+        peg_yaw_rad=play.peg_yaw_rad + turned_rad,
+        grasp_yaw_rad=play.grasp_yaw_rad + turned_rad,
+        left_rad=play.left_rad - turned_rad,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PegTurns:
+    """Makes the expert of an episode.
+
+    Attributes:
+        angle_range_rad: what the blind arm's angle is drawn from, and `signed` whether it has a sign.
+    """
+
+    angle_range_rad: tuple[float, float]
+    signed: bool
+
+    def __call__(self, *, rng: np.random.Generator, imagined: bool) -> TurnExpert:
+        """Draw the imagined angle now, before anything is seen."""
+        angle_rad = rng.uniform(*self.angle_range_rad)
+        sign = -1.0 if self.signed and rng.integers(2) else 1.0
+        return TurnExpert(imagined_angle_rad=sign * angle_rad if imagined else None)
+
+
+PEG = PegTurns(angle_range_rad=(0.1, math.pi / 2), signed=False)
+PEG_SIGNED = PegTurns(angle_range_rad=(0.1, math.pi / 4), signed=True)

@@ -1,0 +1,215 @@
+"""Rotate: turn a peg by a given angle, counted from how it lay at the start."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.structs import Pose
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
+from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive, check_range
+from vla_eval.tasks.streams import Stream
+
+PEG_RANGE_M = 0.1  # the peg's middle is within ± this in x and y
+PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
+LENIENT_REACH_M = 0.1
+STRICT_REACH_M = 0.04
+OFFICIAL_SIGN_SPLIT = 0.5
+
+
+class RotateEnv(OnePhaseEnv):
+    """Rotate: turn the peg by the angle asked for; strictly, without moving its middle.
+
+    Description: a blue peg lies on the table, turned in any way. It must be turned about the vertical by
+    an angle that is told at each step; how it lay at first is to be remembered.
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, `extra/task_cue`: the
+    angle asked for, rad, counterclockwise seen from above; two cameras) or `state` (besides qpos, qvel,
+    tcp pose: angle still to be turned 1, peg pose 7).
+
+    Rewards: dense, lenient: 1 for nearing the peg's middle; near it up to 15 for the angle; 5 at the
+    angle, 2 at rest there; 25 where solved. Strict: 0.5; near it up to 10 for the place and 35 for the
+    angle; 10 and 5; 100 where solved.
+
+    Starting state: middle in ±10 cm, yaw uniform.
+
+    Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases.
+
+    Arguments: `angle_range_rad` (least, most) of what is asked for; `signed` (either direction);
+    `official_signs` (only the larger half of the angles positive, the smaller half negative, as in the
+    official code); `angle_threshold_rad`; `position_threshold_m` for the middle's x and y, None: it may go
+    anywhere; `tilt_threshold_rad` for how far the peg's top may lean from the vertical, None: not looked at;
+    `peg_half_length_m`, `peg_half_width_m`; and those of `OnePhaseEnv`.
+
+    Chance level: to be measured (`cue_blind`); there are no candidates.
+
+    Version history: 1, first version.
+    """
+
+    FAMILY = 11
+    PROMPT_DIMS = ("target_angle",)
+    HUMAN_CAMERA_EYE = (0.6, 0.7, 0.6)
+    HUMAN_CAMERA_TARGET = (0.0, 0.0, 0.35)
+
+    def __init__(
+        self,
+        *args: Any,
+        angle_range_rad: Sequence[float] = (0.1, math.pi / 2),
+        signed: bool = False,
+        official_signs: bool = False,
+        angle_threshold_rad: float = 0.1,
+        position_threshold_m: float | None = None,
+        tilt_threshold_rad: float | None = None,
+        peg_half_length_m: float = 0.12,
+        peg_half_width_m: float = 0.025,
+        **kwargs: Any,
+    ) -> None:
+        """Check the numbers and build the scene."""
+        check_positive(
+            angle_threshold_rad=angle_threshold_rad,
+            peg_half_length_m=peg_half_length_m,
+            peg_half_width_m=peg_half_width_m,
+        )
+        for name, limit in (
+            ("position_threshold_m", position_threshold_m),
+            ("tilt_threshold_rad", tilt_threshold_rad),
+        ):
+            if limit is not None:
+                check_positive(**{name: limit})
+        self.angle_range_rad = check_range(
+            "angle_range_rad", angle_range_rad, least=angle_threshold_rad, unit="rad"
+        )
+        if self.angle_range_rad[1] > math.pi:
+            raise TaskArgumentError(f"angle_range_rad={angle_range_rad!r}: expected at most π.")
+        if official_signs and not signed:
+            raise TaskArgumentError("official_signs without signed: all angles are positive then.")
+        self.signed, self.official_signs = signed, official_signs
+        self.angle_threshold_rad = angle_threshold_rad
+        self.position_threshold_m = position_threshold_m
+        self.tilt_threshold_rad = tilt_threshold_rad
+        self.peg_half_sizes_m = (peg_half_length_m, peg_half_width_m, peg_half_width_m)
+        self.MAX_REWARD = 25.0 if position_threshold_m is None else 100.0
+        super().__init__(*args, **kwargs)
+
+    def stream_key(self) -> tuple[int, ...]:
+        """Return the family's number, whether angles have signs, and whether the place matters."""
+        return (self.FAMILY, int(self.signed), int(self.position_threshold_m is not None))
+
+    def _load_items(self) -> None:
+        builder = self.scene.create_actor_builder()
+        half_sizes = list(self.peg_half_sizes_m)
+        builder.add_box_collision(half_size=half_sizes)
+        if self.scene.can_render():
+            material = sapien.render.RenderMaterial(base_color=PEG_RGBA)
+            builder.add_box_visual(half_size=half_sizes, material=material)
+        builder.initial_pose = sapien.Pose(p=[0, 0, half_sizes[2]])
+        self.peg = builder.build(name="peg")
+        self._first_position = torch.zeros(self.num_envs, 3, device=self.device)
+        self._first_yaw = torch.zeros(self.num_envs, device=self.device)
+        self._target_angle = torch.zeros(self.num_envs, device=self.device)
+
+    def _sample_episode(self, env: int) -> None:
+        layout = self.episode_generator(env, Stream.LAYOUT)
+        x, y = layout.uniform(-PEG_RANGE_M, PEG_RANGE_M, 2)
+        self._first_position[env] = torch.tensor((x, y, self.peg_half_sizes_m[2]))
+        self._first_yaw[env] = float(wrapped_rad(torch.tensor(layout.uniform(0, 2 * math.pi))))
+        self._target_angle[env] = self._draw_angle_rad(self.episode_generator(env, Stream.TARGET))
+
+    def _draw_angle_rad(self, rng: np.random.Generator) -> float:
+        least, most = self.angle_range_rad
+        share = rng.uniform()
+        angle = least + share * (most - least)
+        if not self.signed:
+            return angle
+        positive = share > OFFICIAL_SIGN_SPLIT if self.official_signs else rng.integers(2) == 1
+        return angle if positive else -angle
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        zero = torch.zeros_like(self._first_yaw)
+        half = self._first_yaw / 2
+        turned = torch.stack([half.cos(), zero, zero, half.sin()], dim=1)
+        self.move(self.peg, mask, Pose.create_from_pq(self._first_position, turned))
+
+    def prompt(self) -> torch.Tensor:
+        """Return (B, 1): the angle to turn the peg by, rad, counterclockwise seen from above."""
+        return self._target_angle[:, None]
+
+    def _turned_rad(self) -> torch.Tensor:
+        return wrapped_rad(yaw_rad(self.peg.pose.q) - self._first_yaw)
+
+    def _remaining_rad(self) -> torch.Tensor:
+        return wrapped_rad(self._target_angle - self._turned_rad())
+
+    def _shift_m(self) -> torch.Tensor:
+        shift: torch.Tensor = (self.peg.pose.p - self._first_position)[:, :2].abs()
+        return shift
+
+    def _is_in_place(self) -> torch.Tensor:
+        if self.position_threshold_m is None:
+            return torch.ones_like(self._first_yaw, dtype=torch.bool)
+        return (self._shift_m() < self.position_threshold_m).all(dim=1)
+
+    def _is_level(self) -> torch.Tensor:
+        if self.tilt_threshold_rad is None:
+            return torch.ones_like(self._first_yaw, dtype=torch.bool)
+        upwards: torch.Tensor = self.peg.pose.to_transformation_matrix()[:, 2, 2]  # of the peg's top
+        return upwards > math.cos(self.tilt_threshold_rad)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success: turned as asked for, in place, level, arm at rest; changes nothing."""
+        remaining, static = self._remaining_rad(), self.is_static()
+        at_angle = remaining.abs() < self.angle_threshold_rad
+        shift = self._shift_m()
+        return {
+            "success": at_angle & self._is_in_place() & self._is_level() & static,
+            "is_robot_static": static,
+            "relative_angle": self._turned_rad(),
+            "y_angle_error": remaining.abs(),
+            "x_pos_error": shift[:, 0],
+            "y_pos_error": shift[:, 1],
+        }
+
+    def moving_bodies(self) -> dict[str, Body]:
+        """Return `peg`, and `goal`: its first place and the yaw asked for."""
+        peg = self.peg.pose
+        goal_yaw = wrapped_rad(self._first_yaw + self._target_angle)
+        return {
+            "peg": moving_body(peg.p, self.peg.linear_velocity, yaw_rad(peg.q)),
+            "goal": resting_body(self._first_position, goal_yaw),
+        }
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return (B,): the angle by which the peg must still be turned, rad."""
+        return self._remaining_rad()
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Reach the peg's middle, keep the peg in place where that matters, turn it, rest."""
+        distance = torch.linalg.norm(self.peg.pose.p - self.tcp_position_m(), dim=1)
+        error = info["y_angle_error"]
+        at_angle = error < self.angle_threshold_rad
+        resting = at_angle & info["is_robot_static"]
+        if self.position_threshold_m is None:
+            return {
+                "reaching": torch.exp(-5 * distance),
+                "turning": 15 * torch.exp(-1.5 * error) * (distance < LENIENT_REACH_M),
+                "at_angle": 5.0 * at_angle,
+                "resting": 2.0 * resting,
+            }
+        near = distance < STRICT_REACH_M
+        near_and_placed = near & self._is_in_place()
+        return {
+            "reaching": 0.5 * torch.exp(-3 * distance),
+            "placing": 5 * torch.exp(-5 * self._shift_m()).sum(dim=1) * near,
+            "turning": 35 * torch.exp(-error) * near_and_placed,
+            "at_angle": 10.0 * (at_angle & near_and_placed),
+            "resting": 5.0 * (resting & near_and_placed),
+        }
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        return {"oracle_info": self.oracle_info(), "peg_pose": self.peg.pose.raw_pose}
