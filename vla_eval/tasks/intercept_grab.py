@@ -1,0 +1,111 @@
+"""InterceptGrab: a ball rolls by; catch it with the gripper."""
+
+from typing import Any
+
+import torch
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.ball import RollingBallEnv
+from vla_eval.tasks.memory_env import nearness
+
+GRIP_HALF_PLANE_M = (
+    0.04  # the ball lies between the fingers: within this in x and in y of the tool centre point,
+)
+GRIP_HALF_HEIGHT_M = 0.03  # within this in z,
+GRIP_RADIUS_M = 0.04  # within this altogether,
+BALL_DIAMETER_WIDTH_M = 0.04  # and the fingers are at least so far apart.
+SNUG_M = 0.02
+NARROW_WIDTH_M = 0.06
+TOUCH_RADIUS_M = 0.025
+
+
+class InterceptGrabEnv(RollingBallEnv):
+    """InterceptGrab: grasp the rolling ball and come to rest with it.
+
+    Description: a red ball rolls along y past the robot, which has to catch it between its fingers.
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: ball pose 7, initial velocity 3, grasped 1, linear and angular velocity 3 + 3, tcp
+    to ball 3, gripper width 1, velocity of the ball relative to the tcp 3).
+
+    Rewards: dense: 10 for nearing the ball; 10 and up to 135 more while it lies between the fingers; up
+    to 30 within 2.5 cm of it; 100 while it is grasped; 300 where solved.
+
+    Starting state: as Intercept; the ball begins on the table.
+
+    Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases.
+
+    Arguments: `lift_height_m` (0: the ball need not be lifted, as in the official code), and those of
+    `RollingBallEnv` and `OnePhaseEnv`.
+
+    Chance level: to be measured (`cue_blind`); there are no candidates.
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 300.0
+    FAMILY = 9
+    BALL_DROP_M = 0.0
+
+    def __init__(self, *args: Any, lift_height_m: float = 0.0, **kwargs: Any) -> None:
+        """Check the height and build the scene."""
+        if not 0 <= lift_height_m <= 0.5:
+            raise TaskArgumentError(
+                f"lift_height_m={lift_height_m}: expected 0 to 0.5, what the arm reaches."
+            )
+        self.lift_height_m = lift_height_m
+        super().__init__(*args, **kwargs)
+
+    def _is_grasped(self) -> torch.Tensor:
+        """Return (B,) bool: both fingers press the ball with at least 0.5 N (ManiSkill's rule)."""
+        grasped: torch.Tensor = self.agent.is_grasping(self.ball)
+        return grasped
+
+    def gripper_width_m(self) -> torch.Tensor:
+        """Return the (B,) gap between the fingers."""
+        width: torch.Tensor = self.agent.robot.get_qpos()[:, -2:].sum(dim=1)
+        return width
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success: the ball is grasped, high enough, and the arm at rest; changes nothing."""
+        grasped, static = self._is_grasped(), self.is_static()
+        # The tolerance is for a ball that lies on the table: it sinks in by micrometres.
+        lifted = self.ball.pose.p[:, 2] >= self.ball_radius_m + self.lift_height_m - 1e-3
+        return {
+            "success": grasped & static & lifted,
+            "is_ball_grasped": grasped,
+            "is_robot_static": static,
+        }
+
+    def _in_grip(self) -> torch.Tensor:
+        offset = self._tcp_to_ball_m().abs()
+        inside = (offset[:, :2] <= GRIP_HALF_PLANE_M).all(dim=1) & (offset[:, 2] <= GRIP_HALF_HEIGHT_M)
+        near = torch.linalg.norm(offset, dim=1) <= GRIP_RADIUS_M
+        return inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Get to the ball, have it between the fingers, close them, hold it."""
+        distance = torch.linalg.norm(self._tcp_to_ball_m(), dim=1)
+        width = self.gripper_width_m()
+        loose_m = ((width - BALL_DIAMETER_WIDTH_M).abs() - SNUG_M).clamp(min=0)
+        closing = 10 + 90 * torch.exp(-5 * loose_m) + 45 * (width <= NARROW_WIDTH_M)
+        return {
+            "reaching": 10 * nearness(3.0, distance),
+            "closing": closing * self._in_grip(),
+            "touching": 30 * (1 - distance / 0.06) * (distance <= TOUCH_RADIUS_M),
+            "holding": 100.0 * info["is_ball_grasped"],
+        }
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        return {
+            "ball_pose": self.ball.pose.raw_pose,
+            "oracle_info": self.oracle_info(),
+            "is_ball_grasped": self._is_grasped()[:, None],
+            "ball_linear_velocity": self.ball.linear_velocity,
+            "ball_angular_velocity": self.ball.angular_velocity,
+            "tcp_to_ball_pos": self._tcp_to_ball_m(),
+            "gripper_width": self.gripper_width_m()[:, None],
+            "relative_velocity": self.ball.linear_velocity - self.agent.tcp.linear_velocity,
+        }
