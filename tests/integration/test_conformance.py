@@ -18,7 +18,16 @@ from vla_eval.specs import PolicySpec
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.testing import check_env, check_policy, check_task
 
-SAMPLE = ("RememberColor9-v0", "RememberShapeAndColor3x2-v0", "ShellGameTouch-v0", "InterceptMedium-v0")
+SAMPLE = (
+    "RememberColor9-v0",
+    "RememberShapeAndColor3x2-v0",
+    "ShellGameTouch-v0",
+    "ShellGamePick-v0",
+    "InterceptMedium-v0",
+    "InterceptGrabMedium-v0",
+    "RotateStrictPosNeg-v0",
+    "TakeItBack-v0",
+)
 SAMPLED_TASKS = [
     pytest.param(task, marks=() if task in SAMPLE else pytest.mark.slow) for task in sorted(TASKS)
 ]

@@ -34,11 +34,30 @@ FACTORIES = {
     "cue_blind": scripted.make_cue_blind,
     "tour": scripted.make_tour,
 }
-SAMPLE = ("RememberColor9-v0", "RememberShapeAndColor3x2-v0", "ShellGameTouch-v0", "InterceptMedium-v0")
+SAMPLE = (
+    "RememberColor9-v0",
+    "RememberShapeAndColor3x2-v0",
+    "ShellGameTouch-v0",
+    "ShellGamePick-v0",
+    "InterceptMedium-v0",
+    "InterceptGrabMedium-v0",
+    "RotateStrictPosNeg-v0",
+    "TakeItBack-v0",
+)
 SAMPLED_TASKS = [
     pytest.param(task, marks=() if task in SAMPLE else pytest.mark.slow) for task in sorted(TASKS)
 ]
 """Each family in every run, the rest of the catalogue under the marker `slow`."""
+
+
+def promised(task: str) -> float:
+    """The least success rate that the expert of a task must have."""
+    if task.startswith(("Rotate", "InterceptGrab")):
+        return 0.90
+    if task.startswith(("Intercept", "TakeItBack", "ShellGamePush", "ShellGamePick")):
+        return 0.95
+    return 0.99
+
 
 ENVS: dict[str, Any] = {}
 
@@ -105,9 +124,9 @@ def n_successes(records: list[EpisodeRecord]) -> int:
 @pytest.mark.parametrize("task", SAMPLED_TASKS)
 def test_oracle_is_a_ceiling_at_each_chunk_length(task: str, n_action_steps: int) -> None:
     records = run(task, "oracle", range(1, 16), n_action_steps=n_action_steps)
-    # 0.95 for Intercept: 15 episodes may then hold two failures; the choice tasks none.
-    assert n_successes(records) >= (13 if task.startswith("Intercept") else 15)
-    if not task.startswith("Intercept"):
+    # 0.95 where there is nothing to choose: 15 episodes may then hold two failures; by touch, none.
+    assert n_successes(records) >= (15 if promised(task) > 0.95 else 13)
+    if TASKS[task].candidates:
         assert all(record.first_choice_success and record.n_wrong_choices == 0 for record in records)
     assert {record.n_frames for record in records} == {-(-records[0].n_steps // n_action_steps)}  # type: ignore[operator]
 
@@ -115,7 +134,7 @@ def test_oracle_is_a_ceiling_at_each_chunk_length(task: str, n_action_steps: int
 @pytest.mark.slow
 @pytest.mark.parametrize("task", sorted(TASKS))
 def test_oracle_reaches_its_promised_success_on_the_evaluation_seeds(task: str) -> None:
-    assert n_successes(run(task, "oracle", range(1, 101))) >= (95 if task.startswith("Intercept") else 99)
+    assert n_successes(run(task, "oracle", range(1, 101))) >= 100 * promised(task)
 
 
 @pytest.mark.parametrize("n_action_steps", [1, 4])

@@ -4,6 +4,7 @@ Horizons, phases and instructions: the paper, appendix "VLA experiments", and `d
 """
 
 from vla_eval.errors import unknown_name
+from vla_eval.tasks.spatial_catalog import SPATIAL_TASKS
 from vla_eval.tasks.spec import TaskSpec
 
 _REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."
@@ -66,44 +67,56 @@ _REMEMBER = (
     ),
 )
 
+
+def _shell_game(mode: str, *, asks: str, success: str, oracle: str, max_reward: float) -> TaskSpec:
+    module = "shell_game" if mode == "Touch" else "shell_game_moves"
+    return TaskSpec(
+        id=f"ShellGame{mode}-v0",
+        version=1,
+        entry_point=f"vla_eval.tasks.{module}:ShellGame{mode}Env",
+        horizon_steps=90,
+        memory="object",
+        instruction_key=f"ShellGame{mode}",
+        description=f"A ball lies at one of three places, then a mug stands on each of them: {asks}",
+        success=success,
+        oracle=oracle,
+        oracle_sees="poses of all mugs and which one is right; moves once the mugs have appeared",
+        candidates="mugs",
+        chance_success=1 / 3,
+        max_reward=max_reward,
+    )
+
+
+_SHELL_GAME = (
+    _shell_game(
+        "Touch",
+        asks="reach the mug that hides the ball.",
+        success="The tool centre point is within 8 cm of the right mug and the arm is at rest.",
+        oracle="vla_eval.oracles.hover:MUGS",
+        max_reward=3.0,
+    ),
+    _shell_game(
+        "Push",
+        asks="push the mug that hides the ball forwards.",
+        success="The right mug is within 8 cm of a point 10 cm ahead of the ball and the arm is at rest.",
+        oracle="vla_eval.oracles.push:MUGS",
+        max_reward=4.0,
+    ),
+    _shell_game(
+        "Pick",
+        asks="lift the mug that hides the ball.",
+        success="The right mug's centre has risen by 10 cm and the arm is at rest.",
+        oracle="vla_eval.oracles.pick:MUGS",
+        max_reward=75.0,
+    ),
+)
+
 TASKS: dict[str, TaskSpec] = {
     spec.id: spec
     for spec in (
         *_REMEMBER,
-        TaskSpec(
-            id="ShellGameTouch-v0",
-            version=1,
-            entry_point="vla_eval.tasks.shell_game:ShellGameTouchEnv",
-            horizon_steps=90,
-            memory="object",
-            instruction_key="ShellGameTouch",
-            description=(
-                "A ball lies at one of three places, then a mug stands on each of them: reach the mug "
-                "that hides the ball."
-            ),
-            success="The tool centre point is within 8 cm of the right mug and the arm is at rest.",
-            oracle="vla_eval.oracles.hover:MUGS",
-            oracle_sees="poses of all mugs and which one is right; moves once the mugs have appeared",
-            candidates="mugs",
-            chance_success=1 / 3,
-            max_reward=3.0,
-        ),
-        TaskSpec(
-            id="InterceptMedium-v0",
-            version=1,
-            entry_point="vla_eval.tasks.intercept:InterceptEnv",
-            kwargs={"velocity_range_m_s": (0.5, 0.75)},
-            horizon_steps=90,
-            memory="spatial",
-            instruction_key="InterceptMedium",
-            description="A ball rolls across the table: deflect it so that it passes over the target disc.",
-            success="The ball is within 10 cm of the target's centre, measured in the table's plane.",
-            oracle="vla_eval.oracles.cradle:CradleExpert",
-            oracle_sees="positions and velocity of ball and target, once the base camera could see the ball",
-            candidates=None,
-            chance_success=None,
-            max_reward=30.0,
-        ),
+        *_SHELL_GAME,
+        *SPATIAL_TASKS,
     )
 }
 

@@ -28,6 +28,7 @@ class TaskSpec:
         chance_success: success rate of a perfect arm that ignores the cue; None where it has to be
             measured (there is no choice among candidates).
         max_reward: the dense reward at success, which `normalized_dense` divides by.
+        idle_success: how often doing nothing succeeds, as measured; 0 for all tasks but a few.
     """
 
     id: str
@@ -44,6 +45,7 @@ class TaskSpec:
     candidates: str | None
     chance_success: float | None
     max_reward: float
+    idle_success: float = 0.0
 
     @property
     def gym_id(self) -> str:

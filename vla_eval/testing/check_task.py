@@ -28,8 +28,9 @@ def check_task(
 ) -> None:
     """Raise `ConformanceError` unless the task keeps its promises; nothing is rendered.
 
-    The environment keeps its contract (`check_env`), doing nothing never succeeds, the oracle succeeds in
-    at least nine of ten episodes and finds the right candidate first, and the phases come in order.
+    The environment keeps its contract (`check_env`), doing nothing never succeeds (but where the row says
+    so), the oracle succeeds in at least nine of ten episodes and finds the right candidate first, and the
+    phases come in order.
 
     Args:
         task: task id.
@@ -43,7 +44,9 @@ def check_task(
     try:
         _check_phases(env)
         idle = _play(env, task, "hold", n_episodes)
-        claim(not any(record.success_once for record in idle), f"{task}: doing nothing never succeeds.")
+        idle_wins = any(record.success_once for record in idle)
+        may_idle = task_spec(task).idle_success > 0
+        claim(may_idle or not idle_wins, f"{task}: doing nothing never succeeds.")
         expert = _play(env, task, "oracle", n_episodes)
         rate = sum(bool(record.success_once) for record in expert) / n_episodes
         claim(rate >= MIN_ORACLE_SUCCESS, f"{task}: the oracle succeeds.", f"{rate:.2f} of {n_episodes}")
