@@ -38,7 +38,10 @@ class PrivilegedState:
         gripper_width_m: gap between the fingers, 0 to 0.08.
         candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
             be), world frame, in candidate order; (0, 3) for a task without candidates.
-        target: index of the right candidate, or None for a task without candidates.
+        target: index of the right candidate; None for a task without candidates or with several right ones.
+        right_candidates: indices of all right candidates, in the order shown; empty without candidates.
+        in_order: whether several right candidates must be touched in that order.
+        touched_candidates: indices of those touched so far, in the order of first touch.
         bodies: bodies and places by name, as the task names them: `ball`, `goal` …
         state_vector: (D,) the simulator's own flat state observation, for experts that are learned on it.
         tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
@@ -51,6 +54,9 @@ class PrivilegedState:
     gripper_width_m: float
     candidate_positions_m: NDArray[np.float64]
     target: int | None
+    right_candidates: tuple[int, ...] = ()
+    in_order: bool = False
+    touched_candidates: tuple[int, ...] = ()
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
     state_vector: FloatArray = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
     tcp_yaw_rad: float = 0.0
@@ -139,10 +145,13 @@ class TaskStatus:
         phase: the phase at this step.
         success: the success rule holds at this very step.
         fail: the episode is lost for good (`strict_choice`, first wrong candidate).
-        target: index of the right candidate; None for a task without candidates.
+        target: index of the right candidate; None for a task without candidates or with several right ones.
+        right_first_choices: the candidates that it is right to touch first; empty without candidates.
         n_candidates: how many candidates there are; 0 for a task without candidates.
         first_choice: index of the candidate that was touched first in the response phase, if any.
         n_wrong_choices: how many different wrong candidates have been touched in the response phase.
+        chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
+            environment; None where it has to be measured.
     """
 
     phase: Phase
@@ -152,6 +161,8 @@ class TaskStatus:
     n_candidates: int
     first_choice: int | None
     n_wrong_choices: int
+    right_first_choices: tuple[int, ...] = ()
+    chance_success: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

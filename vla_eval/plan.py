@@ -20,7 +20,8 @@ from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to
 from vla_eval.registry import check_adapter
 from vla_eval.results.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.families import check_open_arguments
 from vla_eval.tasks.spec import TaskSpec
 
 
@@ -101,6 +102,7 @@ def make_plan(config: EvalConfig) -> Plan:
         UnknownNameError: a task, policy, adapter or prompt set does not exist.
         RecipeError: a recipe is wrong, or two policies have the same name.
         MissingInstructionError: a task has no instruction in the prompt set.
+        TaskArgumentError: a family of tasks is named, but not which of its tasks.
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
@@ -111,6 +113,7 @@ def make_plan(config: EvalConfig) -> Plan:
     groups: list[Group] = []
     left_out: list[str] = []
     for task in tasks:
+        check_open_arguments(task, config.env, TASKS.values())
         instruction = instruction_for(task, config.prompt_set)
         for policy in policies:
             check_adapter(policy.value.adapter)

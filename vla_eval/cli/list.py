@@ -1,4 +1,4 @@
-"""`mikasa-vla list`: which tasks, policies, configurations, prompts and dataset recipes there are."""
+"""`mikasa-vla list`: which tasks, families of tasks, policies, configs, prompts, datasets there are."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.prompts import load_prompts
 from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
 from vla_eval.registry import policy_adapters
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 Row = Sequence[str]
 
@@ -17,7 +17,7 @@ Row = Sequence[str]
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
-        "list", help="list tasks, policies, configs, prompts, datasets", allow_abbrev=False
+        "list", help="list tasks, families, policies, configs, prompts, datasets", allow_abbrev=False
     )
     parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
 
@@ -53,8 +53,16 @@ def _tasks() -> list[Row]:
     ]
 
 
+def _families() -> list[Row]:
+    rows: list[Row] = []
+    for spec in FAMILIES.values():
+        needed = ", ".join(f"env.{name}" for name in spec.open_arguments)
+        rows.append((spec.id, f"needs {needed}" if needed else "needs no argument"))
+    return rows
+
+
 def _chance(chance: float | None) -> str:
-    return "measured" if chance is None else f"{chance:.2f}"
+    return "measured" if chance is None else f"{chance:.2g}"
 
 
 def _policies() -> list[Row]:
@@ -87,6 +95,7 @@ def _recipes(folder: Folder, cls: type[PolicyRecipe] | type[EvalConfig] | type[D
 
 _LISTS: dict[str, Callable[[], list[Row]]] = {
     "tasks": _tasks,
+    "families": _families,
     "policies": _policies,
     "configs": _configs,
     "prompts": _prompts,

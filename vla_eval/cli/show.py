@@ -41,15 +41,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what is known of the task without starting a simulator."""
     spec = task_spec(args.task)
-    chance = "has to be measured: there is no choice among candidates"
-    if spec.chance_success is not None:
-        chance = f"{spec.chance_success:.3f} for a perfect arm that ignores the cue"
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
     _print("asks", spec.description)
     _print("instruction", f"“{instruction_for(spec, args.prompt_set)}” (prompts/{args.prompt_set})")
     _print("success", spec.success)
-    _print("chance", chance)
-    _print("horizon", f"{spec.horizon_steps} control steps at 20 Hz = {spec.horizon_steps / 20:g} s")
+    _print("chance", _chance(spec))
+    _print("horizon", _horizon(spec))
     arguments = {argument.name: argument for argument in task_arguments(spec)}
     _print("phases", _phases(spec, arguments))
     _print("oracle", spec.oracle)
@@ -60,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{'':{INDENT}}horizon_steps = {spec.horizon_steps}  (every task)")
     for argument in arguments.values():
         default = spec.kwargs.get(argument.name, argument.default)
+        if argument.name in spec.open_arguments:
+            default = "… (must be given)"
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
     return 0
 
@@ -68,15 +67,37 @@ def _print(label: str, text: str) -> None:
     print(textwrap.fill(text, WIDTH, initial_indent=f"{label:{INDENT}}", subsequent_indent=" " * INDENT))
 
 
+def _chance(spec: TaskSpec) -> str:
+    if spec.chance_success is not None:
+        return f"{spec.chance_success:.3g} for a perfect arm that ignores the cue"
+    if spec.candidates is not None:
+        return "as the arguments say; each record has it"
+    return "has to be measured: there is no choice among candidates"
+
+
+def _horizon(spec: TaskSpec) -> str:
+    fixed = f"{spec.horizon_steps} control steps at 20 Hz = {spec.horizon_steps / 20:g} s"
+    if spec.min_response_steps is None:
+        return fixed
+    return f"{fixed}, or longer: at least {spec.min_response_steps} steps after cue and delay"
+
+
 def _phases(spec: TaskSpec, arguments: dict[str, TaskArgument]) -> str:
     if spec.candidates is None:
         return "none: what matters is in view, but changes"
     lengths = [
-        f"{name} {arguments[f'{name}_steps'].default} steps"
+        f"{name} {_in_turn(spec, name)}{arguments[f'{name}_steps'].default} steps"
         for name in ("cue", "delay")
         if f"{name}_steps" in arguments
     ]
     return ", then ".join([*lengths, f"response: choose among the {spec.candidates} until the horizon"])
+
+
+def _in_turn(spec: TaskSpec, phase: str) -> str:
+    """Return `3 × ` for a cue of three things one after another."""
+    if phase != "cue" or not spec.shows_one_by_one:
+        return ""
+    return f"{spec.kwargs.get('n_shown', 'n_shown')} × "
 
 
 def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:

@@ -12,7 +12,7 @@ import yaml
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
 from vla_eval.results.durable import replace_file
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import find_task
 
 CARD_FILE = Path("README.md")
 SHEET_FILE = Path("images/contact_sheet.png")
@@ -71,7 +71,7 @@ def _title(summary: DatasetSummary) -> str:
 
 
 def _introduction(summary: DatasetSummary) -> str:
-    task = TASKS.get(summary.facts.task) if summary.facts else None
+    task = find_task(summary.facts.task) if summary.facts else None
     about = f"{task.description} " if task else ""
     sentences = "\n".join(f"> {sentence}" for sentence in summary.instructions)
     return (

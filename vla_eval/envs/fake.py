@@ -24,7 +24,10 @@ from vla_eval.core import (
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.chance import chance_of_several
+from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.spec import TaskSpec
 
 M_PER_STEP = 0.039  # what ManiSkill's pd_ee_delta_pose really moves per step at action 1
 CONTROL_HZ = 20.0
@@ -37,6 +40,7 @@ GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
 CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5}
+SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75)}
 CAMERAS = tuple(
     CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
@@ -67,7 +71,7 @@ class _Episode:
 
     seed: int
     candidates_m: Vector
-    target: int | None
+    targets: tuple[int, ...]
     ball_m: Vector
     ball_velocity_m_s: Vector
     goal_m: Vector
@@ -83,20 +87,23 @@ class FakeEnv:
     """Implements `SimEnv`; `n_renders` counts the observations that were rendered.
 
     Args:
-        settings: `kwargs` may hold `horizon_steps`; `n_items`, `cue_steps`, `delay_steps` for tasks with
-            candidates; `velocity_range_m_s` for the others.
+        settings: `kwargs` may hold `horizon_steps`; `n_items`, `n_shown`, `cue_steps`, `delay_steps` for
+            tasks with candidates; `velocity_range_m_s` for the others.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
         """Check the arguments."""
         task = task_spec(settings.task)
-        known = ("horizon_steps", *(CHOICE_DEFAULTS if task.candidates else BALL_DEFAULTS))
+        check_open_arguments(task, settings.kwargs, TASKS.values())
+        defaults = _defaults(task)
+        known = ("horizon_steps", *defaults)
         for name in settings.kwargs:
             if name not in known:
                 raise unknown_name("argument", name, known, where=task.id)
-        defaults: Mapping[str, Any] = CHOICE_DEFAULTS if task.candidates else BALL_DEFAULTS  # Any: numbers
-        arguments = {"horizon_steps": task.horizon_steps, **defaults, **task.kwargs, **settings.kwargs}
+        arguments = {**defaults, **task.kwargs, **settings.kwargs}
         self._n_items: int = arguments.get("n_items", 0)
+        self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
+        self._in_order = task.memory == "sequential"
         self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
         self._cue_steps: int = arguments.get("cue_steps", 0)
         self._response_step: int = self._cue_steps + arguments.get("delay_steps", 0)
@@ -109,7 +116,7 @@ class FakeEnv:
             cameras=CAMERAS,
             states=STATES,
             action=ACTION,
-            horizon_steps=arguments["horizon_steps"],
+            horizon_steps=arguments.get("horizon_steps", task.default_horizon_steps(self._response_step)),
             control_hz=CONTROL_HZ,
         )
 
@@ -149,11 +156,16 @@ class FakeEnv:
         return _Episode(
             seed=seed,
             candidates_m=candidates,
-            target=int(rng.integers(self._n_items)) if self._n_items else None,
+            targets=self._draw_targets(rng),
             ball_m=np.array([rng.uniform(-0.1, 0.1), -0.6, CANDIDATE_Z_M]),
             ball_velocity_m_s=np.array([0.0, rng.uniform(*self._speeds_m_s), 0.0]),
             goal_m=np.array([rng.uniform(0.15, 0.2), 0.3, 0.0]),
         )
+
+    def _draw_targets(self, rng: np.random.Generator) -> tuple[int, ...]:
+        if self._n_items and self._n_shown == 1:
+            return (int(rng.integers(self._n_items)),)
+        return tuple(int(i) for i in rng.permutation(self._n_items)[: self._n_shown])
 
     def _advance(self, episode: _Episode, action: Vector) -> None:
         moved = action[:3] * M_PER_STEP
@@ -163,7 +175,7 @@ class FakeEnv:
         episode.gripper_width_m = float((action[-1] + 1) / 2 * GRIPPER_MAX_M)
         episode.is_static = bool(np.all(np.abs(action[:3]) < STATIC_ACTION))
         # The arm comes from above: a ball that rolls under a lifted point is not caught.
-        if episode.target is None and np.linalg.norm(episode.ball_m - episode.tcp_m) <= REACH_M:
+        if not episode.targets and np.linalg.norm(episode.ball_m - episode.tcp_m) <= REACH_M:
             episode.ball_velocity_m_s = episode.tcp_velocity_m_s * (1, 1, 0)
         episode.ball_m = episode.ball_m + episode.ball_velocity_m_s / CONTROL_HZ
         touched = self._touched(episode)
@@ -178,6 +190,18 @@ class FakeEnv:
         nearest = int(np.argmin(distances))
         return nearest if distances[nearest] <= REACH_M else None
 
+    def _is_complete(self, episode: _Episode) -> bool:
+        """Whether all right candidates have been touched; where there are several, nothing else may be."""
+        if len(episode.targets) == 1:
+            return True
+        touched = tuple(episode.touched)
+        return touched == episode.targets if self._in_order else set(touched) == set(episode.targets)
+
+    def _chance(self) -> float | None:
+        if not self._n_items:
+            return None
+        return chance_of_several(self._n_items, self._n_shown, in_order=self._in_order)
+
     def _phase(self, episode: _Episode) -> Phase:
         if episode.step >= self._response_step:
             return "response"
@@ -185,18 +209,20 @@ class FakeEnv:
 
     def _result(self, slot: int, *, render: bool) -> StepResult:
         episode = self._episodes[slot]
-        if episode.target is None:
+        if not episode.targets:
             success = bool(np.linalg.norm((episode.ball_m - episode.goal_m)[:2]) <= GOAL_RADIUS_M)
         else:
-            success = self._touched(episode) == episode.target
+            success = self._touched(episode) in episode.targets and self._is_complete(episode)
         status = TaskStatus(
             phase=self._phase(episode),
             success=success,
             fail=False,
-            target=episode.target,
+            target=_only(episode.targets),
+            right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
+            chance_success=self._chance(),
             n_candidates=self._n_items,
             first_choice=episode.touched[0] if episode.touched else None,
-            n_wrong_choices=sum(choice != episode.target for choice in episode.touched),
+            n_wrong_choices=sum(choice not in episode.targets for choice in episode.touched),
         )
         return StepResult(
             observation=self._observe(episode, render=render), status=status, reward=float(success)
@@ -225,14 +251,13 @@ class FakeEnv:
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
         picture = rng.integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
-        picture[:8] = (
-            20 * (episode.target + 1) if self._phase(episode) == "cue" and episode.target is not None else 0
-        )
+        in_cue = self._phase(episode) == "cue" and episode.targets
+        picture[:8] = 20 * (episode.targets[0] + 1) if in_cue else 0
         return picture
 
     def _privileged(self, episode: _Episode) -> PrivilegedState:
         bodies = {}
-        if episode.target is None:
+        if not episode.targets:
             bodies["ball"] = BodyState(
                 position_m=episode.ball_m.copy(), velocity_m_s=episode.ball_velocity_m_s.copy()
             )
@@ -244,7 +269,10 @@ class FakeEnv:
             tcp_velocity_m_s=episode.tcp_velocity_m_s.copy(),
             gripper_width_m=episode.gripper_width_m,
             candidate_positions_m=episode.candidates_m.copy(),
-            target=episode.target,
+            target=_only(episode.targets),
+            right_candidates=episode.targets,
+            in_order=self._in_order,
+            touched_candidates=tuple(episode.touched),
             bodies=bodies,
             state_vector=np.concatenate(
                 [episode.tcp_m, [episode.gripper_width_m], self._wanted_m(episode), episode.ball_m]
@@ -254,8 +282,19 @@ class FakeEnv:
     @staticmethod
     def _wanted_m(episode: _Episode) -> Vector:
         """Return where the point has to go: the right candidate, or the ball's goal."""
-        wanted: Vector = episode.goal_m if episode.target is None else episode.candidates_m[episode.target]
+        wanted: Vector = episode.candidates_m[episode.targets[0]] if episode.targets else episode.goal_m
         return wanted
+
+
+def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them
+    if task.candidates is None:
+        return BALL_DEFAULTS
+    several = "n_shown" in (*task.kwargs, *task.open_arguments)
+    return SEVERAL_DEFAULTS if several else CHOICE_DEFAULTS
+
+
+def _only(targets: tuple[int, ...]) -> int | None:
+    return targets[0] if len(targets) == 1 else None
 
 
 def make_fake_env(settings: EnvSettings) -> FakeEnv:

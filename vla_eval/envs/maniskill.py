@@ -26,11 +26,13 @@ from vla_eval.core import (
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
+from vla_eval.tasks.families import check_open_arguments
 from vla_eval.tasks.memory_env import CAMERA_FOV_RAD, CAMERA_SIZE_PX, PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
+from vla_eval.tasks.spec import TaskSpec
 
 CONTROL_MODE = "pd_ee_delta_pose"
 ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
@@ -85,22 +87,13 @@ class ManiSkillEnv:
     def __init__(self, settings: EnvSettings) -> None:
         """Build the scenes."""
         row = task_spec(settings.task)
+        check_open_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}
-        horizon_steps = kwargs.pop("horizon_steps", row.horizon_steps)
-        if not isinstance(horizon_steps, int) or horizon_steps < 1:
-            raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
+        wanted_steps = kwargs.pop("horizon_steps", None)
         _check_arguments(env_class(row), kwargs, row.id)
         for camera in settings.cameras:
             if camera not in {known.name for known in CAMERAS}:
                 raise unknown_name("camera", camera, [c.name for c in CAMERAS], where=row.id)
-        self.spec = EnvSpec(
-            task=row.id,
-            cameras=CAMERAS,
-            states=_states(env_class(row)),
-            action=ACTION,
-            horizon_steps=horizon_steps,
-            control_hz=CONTROL_HZ,
-        )
         self._settings = settings
         self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
         batched = settings.sim_backend == "gpu"
@@ -108,7 +101,14 @@ class ManiSkillEnv:
         self._envs: list[Any] = [
             _build(env_class(row), settings, kwargs, self._slots_per_env) for _ in range(n_envs)
         ]
-        _check_phases(self._envs[0], row.id, horizon_steps)
+        self.spec = EnvSpec(
+            task=row.id,
+            cameras=CAMERAS,
+            states=_states(env_class(row)),
+            action=ACTION,
+            horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
+            control_hz=CONTROL_HZ,
+        )
         self.n_candidates = len(self._envs[0].candidates) if isinstance(self._envs[0], ChoiceEnv) else 0
         self.device = _describe(self._envs[0], settings)
 
@@ -240,13 +240,22 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
             raise unknown_name("argument", name, known, where=task)
 
 
-def _check_phases(env: Any, task: str, horizon_steps: int) -> None:
-    longest = env.cue_steps_range[1] + env.delay_steps_range[1]
-    if longest >= horizon_steps:
+def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> int:
+    """Return the length of an episode: as wanted, or as the row says.
+
+    Raises:
+        TaskArgumentError: no number, or none that leaves a step for the choice.
+    """
+    horizon_steps = row.default_horizon_steps(longest_wait_steps) if wanted is None else wanted
+    if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
+        raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
+    if longest_wait_steps >= horizon_steps:
         raise TaskArgumentError(
-            f"{task}: cue_steps + delay_steps can be {longest}, but the episode ends after horizon_steps="
-            f"{horizon_steps}: no step is left for the choice. Raise horizon_steps or shorten the phases."
+            f"{row.id}: cue_steps and delay_steps can be {longest_wait_steps} together, but the episode ends "
+            f"after horizon_steps={horizon_steps}: no step is left for the choice. Raise horizon_steps or "
+            "shorten the phases."
         )
+    return horizon_steps
 
 
 def _describe(env: Any, settings: EnvSettings) -> dict[str, str]:
@@ -293,10 +302,12 @@ def _status(env: Any, info: Any, row: int) -> TaskStatus:
         phase=PHASES[int(info["phase"][row])],
         success=bool(info["success"][row]),
         fail=bool(info["fail"][row]) if "fail" in info else False,
-        target=int(env.target_index()[row]) if is_choice else None,
+        target=_only(env.right_candidates(row)) if is_choice else None,
         n_candidates=len(env.candidates) if is_choice else 0,
         first_choice=None if first == NO_CHOICE else first,
         n_wrong_choices=int(info["n_wrong_choices"][row]) if is_choice else 0,
+        right_first_choices=env.right_first_choices(row) if is_choice else (),
+        chance_success=env.chance_success() if is_choice else None,
     )
 
 
@@ -310,7 +321,10 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
         tcp_velocity_m_s=_vector(env.agent.tcp.linear_velocity[row]),
         gripper_width_m=float(env.agent.robot.get_qpos()[row, -2:].sum()),
         candidate_positions_m=positions,
-        target=int(env.target_index()[row]) if is_choice else None,
+        target=_only(env.right_candidates(row)) if is_choice else None,
+        right_candidates=env.right_candidates(row) if is_choice else (),
+        in_order=env.in_order if is_choice else False,
+        touched_candidates=env.touched_candidates(row) if is_choice else (),
         bodies={
             name: BodyState(
                 position_m=_vector(body.position_m[row]),
@@ -322,6 +336,10 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
         state_vector=_array(env.state_vector()[row]),
         tcp_yaw_rad=float(env.tcp_yaw_rad()[row]),
     )
+
+
+def _only(right_candidates: tuple[int, ...]) -> int | None:
+    return right_candidates[0] if len(right_candidates) == 1 else None
 
 
 def _array(tensor: Any) -> FloatArray:

@@ -16,7 +16,7 @@ from vla_eval.results.estimates import (
 from vla_eval.results.grouping import RowGroup, RowKey, Run
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.table import ChanceSource, IntervalKind
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import find_task
 
 CHANCE_POLICY = "cue_blind"
 CEILING_POLICY = "oracle"
@@ -113,22 +113,26 @@ def chance_of(
 ) -> Chance | None:
     """Return what a policy without memory gets where this row was measured.
 
-    The cue-blind arm on the same task, variant and `n_action_steps`, if it was run; else 1/N for N
-    candidates, as the records or the catalogue say; None where there is no choice among candidates.
+    The cue-blind arm on the same task, variant and `n_action_steps`, if it was run; else what the records
+    or the catalogue say (1/N for N candidates); None where there is no choice among candidates.
     """
     cue_blind = measured.get(key._replace(policy=CHANCE_POLICY))
     if cue_blind is not None and cue_blind.success_once is not None:
         return Chance(rate=cue_blind.success_once, source="cue_blind", interval=cue_blind.interval)
-    n_candidates = {
-        record.n_candidates
+    records = [
+        record
         for other, group in groups.items()
         if (other.task, other.variant) == (key.task, key.variant)
         for record in group.results
-        if record.n_candidates
-    }
+    ]
+    by_luck = {record.chance_success for record in records if record.chance_success is not None}
+    if len(by_luck) == 1:
+        return Chance(rate=by_luck.pop(), source="1/N")
+    # Records of earlier versions do not say; their tasks had one right candidate.
+    n_candidates = {record.n_candidates for record in records if record.n_candidates}
     if len(n_candidates) == 1:
         return Chance(rate=1 / n_candidates.pop(), source="1/N")
-    spec = TASKS.get(key.task)
+    spec = find_task(key.task)
     if n_candidates or spec is None or spec.chance_success is None:
         return None
     return Chance(rate=spec.chance_success, source="catalogue")

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from vla_eval.results.grouping import RowGroup
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import find_task
+from vla_eval.tasks.spec import total_cue_steps
 
 DEFAULT_CUE_STEPS = 5  # `cue_steps` of `MemoryTableEnv` and of the fake simulator; a test compares
 
@@ -33,11 +34,15 @@ def cue_frames(group: RowGroup, env: Mapping[str, Any]) -> CueFrames | None:  # 
     Returns:
         None for a task without a cue phase, and where nothing was rendered for the policy to be told.
     """
-    spec = TASKS.get(group.key.task)
+    spec = find_task(group.key.task)
     if spec is None or spec.candidates is None or not group.results:
         return None
-    steps = {**spec.kwargs, **env}.get("cue_steps", DEFAULT_CUE_STEPS)
-    fewest, most = (steps, steps) if isinstance(steps, int) else (min(steps), max(steps))
+    arguments = {**spec.kwargs, **env}
+    steps = arguments.get("cue_steps", DEFAULT_CUE_STEPS)
+    n_in_turn = arguments.get("n_shown", 1) if spec.shows_one_by_one else 1
+    gap_steps = arguments.get("gap_steps", 0)
+    lengths = [steps] if isinstance(steps, int) else steps
+    fewest, most = (total_cue_steps(f(lengths), n_in_turn, gap_steps) for f in (min, max))
     if _reads_every_frame(group):
         return CueFrames(fewest, most)
     k = group.key.n_action_steps

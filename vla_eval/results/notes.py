@@ -10,7 +10,7 @@ from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
 from vla_eval.results.run_file import leaves
 from vla_eval.results.store import StoredRun
 from vla_eval.results.table import Row
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import find_task
 
 MAX_NAMED = 6
 
@@ -85,8 +85,8 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
         notes.append("chance: `cue_blind` as measured on the same task at the same n_action_steps.")
     if any(row.chance_source in ("1/N", "catalogue") for row in rows):
         notes.append(
-            "† chance is 1/N for N candidates, not measured: `cue_blind` has no result there at this "
-            "n_action_steps."
+            "† chance is 1/N for N candidates (by arithmetic where several are right), not measured: "
+            "`cue_blind` has no result there at this n_action_steps."
         )
     missing = _unique(
         f"{row.task} K={row.n_action_steps}" for row in rows if row.chance is None and row.n_episodes
@@ -194,7 +194,8 @@ def _planned(run: StoredRun, there: Mapping[Group, int]) -> list[Group]:
 
 
 def _has_no_candidates(task: str) -> bool:
-    return task in TASKS and TASKS[task].candidates is None
+    spec = find_task(task)
+    return spec is not None and spec.candidates is None
 
 
 def _continued_elsewhere(run: StoredRun) -> list[str]:

@@ -57,7 +57,9 @@ class EpisodeRecord:
         target, n_candidates, first_choice, first_choice_success, n_wrong_choices: which candidate was
             right, how many there were, which one was touched first and whether that was right, and how
             many different wrong ones were touched; None for a task without candidates.
-            first_choice_success is False if no candidate was touched.
+            first_choice_success is False if no candidate was touched; target is None where several are.
+        chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
+            episode; None where it has to be measured.
         episode_return: sum of rewards.
         n_inferences: calls of the policy; n_frames: observations given to it.
         n_clipped_steps: steps whose action went beyond the action space and was clipped.
@@ -80,6 +82,7 @@ class EpisodeRecord:
     first_choice: int | None = None
     first_choice_success: bool | None = None
     n_wrong_choices: int | None = None
+    chance_success: float | None = None
     episode_return: float | None = None
     n_inferences: int | None = None
     n_frames: int | None = None

@@ -4,6 +4,8 @@ Horizons, phases and instructions: the paper, appendix "VLA experiments", and `d
 """
 
 from vla_eval.errors import unknown_name
+from vla_eval.tasks.families import make_families
+from vla_eval.tasks.sequence_catalog import SEQUENCE_TASKS
 from vla_eval.tasks.spatial_catalog import SPATIAL_TASKS
 from vla_eval.tasks.spec import TaskSpec
 
@@ -115,22 +117,33 @@ TASKS: dict[str, TaskSpec] = {
     spec.id: spec
     for spec in (
         *_REMEMBER,
+        *SEQUENCE_TASKS,
         *_SHELL_GAME,
         *SPATIAL_TASKS,
     )
 }
 
 
+FAMILIES = make_families(TASKS)
+"""Family id -> its row: tasks of which arguments say which one it is, `RememberColor` with `n_items=4`."""
+
+
+def find_task(task_id: str) -> TaskSpec | None:
+    """Return the row of a task or a family, or None if there is none of this id."""
+    name = task_id.removeprefix("vla_eval/")
+    return TASKS.get(name) or FAMILIES.get(name)
+
+
 def task_spec(task_id: str) -> TaskSpec:
-    """Return the row of a task.
+    """Return the row of a task or a family.
 
     Args:
-        task_id: `RememberColor3-v0`, with or without the `vla_eval/` namespace.
+        task_id: `RememberColor3-v0` or `RememberColor`, with or without the `vla_eval/` namespace.
 
     Raises:
         UnknownNameError: there is no such task; the message suggests the closest one.
     """
-    name = task_id.removeprefix("vla_eval/")
-    if name not in TASKS:
-        raise unknown_name("task", name, TASKS)
-    return TASKS[name]
+    spec = find_task(task_id)
+    if spec is None:
+        raise unknown_name("task", task_id.removeprefix("vla_eval/"), [*TASKS, *FAMILIES])
+    return spec

@@ -28,6 +28,8 @@ class ChoiceEnv(MemoryTableEnv):
 
     REACH_SCALE_PER_M: float
     candidates: list[Actor]
+    in_order = False
+    """Whether right candidates, if there are several, must be touched in the order of `right_candidates`."""
 
     def __init__(
         self, *args: Any, goal_threshold_m: float, strict_choice: bool = False, **kwargs: Any
@@ -45,11 +47,14 @@ class ChoiceEnv(MemoryTableEnv):
         self._target = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._slots = torch.zeros(self.num_envs, n_candidates, 3, device=self.device)
         self._first_choice = torch.full_like(self._target, NO_CHOICE)
-        self._touched = torch.zeros(self.num_envs, n_candidates, dtype=torch.bool, device=self.device)
+        # 1 for the candidate that was touched first, 2 for the second …, 0 for those never touched.
+        self._touch_rank = torch.zeros(self.num_envs, n_candidates, dtype=torch.long, device=self.device)
+        self._touched_wrongly = torch.zeros_like(self._touch_rank, dtype=torch.bool)
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         self._first_choice[mask] = NO_CHOICE
-        self._touched[mask] = False
+        self._touch_rank[mask] = 0
+        self._touched_wrongly[mask] = False
 
     def candidate_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
@@ -61,22 +66,51 @@ class ChoiceEnv(MemoryTableEnv):
         positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
         return positions
 
+    def touch_points_m(self) -> torch.Tensor:
+        """Return (B, N, 3): the points that the tool centre point must come near, world frame."""
+        return self.candidate_positions_m()
+
     def target_index(self) -> torch.Tensor:
-        """Return (B,) the index of the right candidate."""
+        """Return (B,) the index of the candidate that is right now."""
         return self._target
 
+    def right_candidates(self, env: int) -> tuple[int, ...]:
+        """Return the right candidates of one environment's episode, in the order shown."""
+        return (int(self._target[env]),)
+
+    def right_first_choices(self, env: int) -> tuple[int, ...]:
+        """Return the candidates that it is right to touch first."""
+        right = self.right_candidates(env)
+        return right[:1] if self.in_order else right
+
+    def touched_candidates(self, env: int) -> tuple[int, ...]:
+        """Return the candidates touched so far in one environment's episode, in the order of first touch."""
+        ranks = self._touch_rank[env].tolist()
+        return tuple(sorted((i for i, rank in enumerate(ranks) if rank), key=lambda i: ranks[i]))
+
+    def chance_success(self) -> float:
+        """Return the success rate of a perfect arm that ignores the cue."""
+        return 1 / len(self.candidates)
+
     def target_distance_m(self) -> torch.Tensor:
-        """Return (B,) the distance from the tool centre point to the right candidate's centre."""
+        """Return (B,) the distance from the tool centre point to the point to touch."""
         return self._of_target(self._distances_m())
 
     def _distances_m(self) -> torch.Tensor:
-        offsets = self.candidate_positions_m() - self.tcp_position_m()[:, None, :]
+        offsets = self.touch_points_m() - self.tcp_position_m()[:, None, :]
         distances: torch.Tensor = torch.linalg.norm(offsets, dim=2)
         return distances
 
     def _of_target(self, per_candidate: torch.Tensor) -> torch.Tensor:
+        return self._of_candidate(per_candidate, self.target_index())
+
+    def _of_candidate(self, per_candidate: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
         rows = torch.arange(self.num_envs, device=self.device)
-        return per_candidate[rows, self._target]
+        return per_candidate[rows, index]
+
+    def _is_wrong(self, candidate: torch.Tensor) -> torch.Tensor:
+        """Return (B,) whether it would be wrong to touch these candidates, (B,) indices, now."""
+        return candidate != self._target
 
     def _update_latches(self, step: torch.Tensor) -> None:
         distance, nearest = self._distances_m().min(dim=1)
@@ -88,8 +122,12 @@ class ChoiceEnv(MemoryTableEnv):
         self._first_choice = torch.where(
             touches & (self._first_choice == NO_CHOICE), candidate, self._first_choice
         )
+        first_time = touches & (self._of_candidate(self._touch_rank, candidate) == 0)
+        wrong = first_time & self._is_wrong(candidate)
+        rank = (self._touch_rank > 0).sum(dim=1) + 1
         rows = torch.arange(self.num_envs, device=self.device)
-        self._touched[rows, candidate] |= touches
+        self._touch_rank[rows, candidate] += rank * first_time
+        self._touched_wrongly[rows, candidate] |= wrong
 
     def is_placed(self) -> torch.Tensor:
         """Return (B,) bool: the success rule holds, but for the arm being at rest."""
@@ -100,7 +138,7 @@ class ChoiceEnv(MemoryTableEnv):
         placed = self.is_placed()
         static = self.is_static()
         success = self.gated(placed & static)
-        n_wrong = self._touched.sum(dim=1) - self._of_target(self._touched.long())
+        n_wrong = self._touched_wrongly.sum(dim=1)
         lost = (n_wrong > 0) if self.strict_choice else torch.zeros_like(success)
         return {
             "success": success & ~lost,

@@ -14,6 +14,8 @@ import sapien
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor
 
+from vla_eval.errors import TaskArgumentError
+
 S = 0.02  # m, the official scale: half the edge of a cube
 BAR = 0.375 * S
 Z_UP_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # SAPIEN's cylinders lie along x; turn them up
@@ -84,11 +86,30 @@ def _star_point(angle_rad: float) -> Primitive:
     )
 
 
+CUBE_HALF_SIZE_M = S
+CUBE_HALF_SIZE_RANGE_M = (0.01, 0.03)  # cubes lie at least 6 cm apart: larger ones would overlap
+
+
+def cube(half_size_m: float) -> Shape:
+    """Return a cube of another size.
+
+    Raises:
+        TaskArgumentError: smaller than the arm can aim at, or so large that neighbours would overlap.
+    """
+    least, most = CUBE_HALF_SIZE_RANGE_M
+    if not least <= half_size_m <= most:
+        raise TaskArgumentError(
+            f"cube_half_size_m={half_size_m}: expected {least} to {most}; neighbours may lie 6 cm apart."
+        )
+    half = float(half_size_m)
+    return Shape(name="cube", parts=(Primitive(kind="box", size=(half, half, half)),), rest_height_m=half)
+
+
 TAU = 2 * math.pi
 SHAPES = {
     shape.name: shape
     for shape in (
-        Shape(name="cube", parts=(Primitive(kind="box", size=(S, S, S)),), rest_height_m=S),
+        cube(CUBE_HALF_SIZE_M),
         Shape(name="sphere", parts=(Primitive(kind="sphere", size=(S,)),), rest_height_m=S),
         Shape(
             name="cylinder",

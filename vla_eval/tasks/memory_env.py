@@ -157,7 +157,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             noise = self.episode_generator(env, Stream.ROBOT).normal(0, QPOS_NOISE_RAD, N_ARM_JOINTS)
             qpos[row, :N_ARM_JOINTS] += noise
             phases = self.episode_generator(env, Stream.PHASES)
-            self._cue_end_step[env] = int(phases.integers(*self.cue_steps_range, endpoint=True))
+            cue_steps = int(phases.integers(*self.cue_steps_range, endpoint=True))
+            self._cue_end_step[env] = self.total_cue_steps(cue_steps)
             delay = int(phases.integers(*self.delay_steps_range, endpoint=True))
             self._response_step[env] = self._cue_end_step[env] + delay
         self.agent.reset(qpos.astype(np.float32))
@@ -190,6 +191,14 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return (self.FAMILY,)
 
     # ---------------------------------------------------------------- phases
+
+    def total_cue_steps(self, cue_steps: int) -> int:
+        """Return how long the cue phase lasts; a task that shows several things in turn takes longer."""
+        return cue_steps
+
+    def longest_wait_steps(self) -> int:
+        """Return the most steps that cue and delay can take together."""
+        return self.total_cue_steps(self.cue_steps_range[1]) + self.delay_steps_range[1]
 
     def phase_index(self, step: torch.Tensor) -> torch.Tensor:
         """Return (B,) indices into `PHASES` for observations after `step` control steps."""

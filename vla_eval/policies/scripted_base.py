@@ -1,0 +1,67 @@
+"""What scripted controls share: their spec, their random generators, and how to hold still."""
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import EpisodeStart, ObservationWindow, PrivilegedState
+from vla_eval.errors import SpecMismatchError
+from vla_eval.policies.context import PolicyContext
+from vla_eval.specs import PolicySpec
+from vla_eval.tasks.streams import Stream, generator
+
+# ManiSkill's Panda: the gripper command in [-1, 1] is mapped to finger positions in this range.
+FINGER_LOW_M, FINGER_HIGH_M = -0.01, 0.04
+
+
+def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArray[np.float32]:
+    """Return (n_actions, n_dims) that move nothing and keep the fingers `gripper_width_m` apart."""
+    rows = np.zeros((n_actions, n_dims), dtype=np.float32)
+    finger_m = gripper_width_m / 2
+    command = (finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1
+    rows[:, -1] = np.clip(command, -1, 1)
+    return rows
+
+
+class ScriptedPolicy:
+    """What all controls share: their spec, and one random generator per running episode."""
+
+    privileged = False
+    states: tuple[str, ...] = ()
+
+    def __init__(self, context: PolicyContext) -> None:
+        """Plan just as many actions as one inference has to give."""
+        self._context = context
+        self._n_actions = context.chunking.min_chunk_size
+        self._n_dims = len(context.env.action.dims)
+        self._rng: dict[int, np.random.Generator] = {}
+        self.spec = PolicySpec(
+            name=context.name,
+            reads="last",
+            cameras=(),
+            states=self.states,
+            chunk_size=self._n_actions,
+            privileged=self.privileged,
+        )
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Seed each episode's generator by its task, seed and run."""
+        for episode in episodes:
+            task_key = zlib.crc32(episode.task.encode())  # else luck would be the same luck in every task
+            self._rng[episode.slot] = generator(episode.seed, Stream.POLICY, task_key, episode.run)
+
+    def privileged_state(self, window: ObservationWindow) -> PrivilegedState:
+        """Return the true state of the world at the last observation.
+
+        Raises:
+            SpecMismatchError: the environment was made without it.
+        """
+        state = window.last.privileged
+        if state is None:
+            raise SpecMismatchError(
+                f"policy '{self.spec.name}' reads the true state of the world, but the observations of "
+                f"{self._context.env.task} carry none. Make the environment with privileged=True."
+            )
+        return state

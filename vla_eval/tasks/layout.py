@@ -1,0 +1,76 @@
+"""Where items lie on the table: a row or an arc of places, each shifted a little per episode.
+
+Knows nothing of what lies there, of phases or of a simulator.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+JITTER_STD_M = 0.01
+MIN_DISTANCE_M = 0.06
+MAX_JITTER_TRIES = 50
+MIXED_MIN_DISTANCE_M = 0.061  # a cross is 6 cm wide
+# The official arc is squeezed in y by so much per place, for these numbers of items only.
+SQUEEZE_M = {5: 0.025, 9: 0.025}
+
+Plane = NDArray[np.float64]
+"""Positions in the table's plane, (…, 2), m."""
+
+
+def slot_centres_m(n_items: int) -> Plane:
+    """Return (N, 2) xy of the places on the table, world frame, before jitter.
+
+    A row for three items, otherwise an arc around the robot. Source: official task code, constants as
+    measured in the task table of `docs/tasks.md`; numbers of items that it does not have follow the same
+    rule with the squeeze of five and nine.
+    """
+    if n_items == 3:
+        return np.array([[0.0, 0.1], [0.0, 0.0], [0.0, -0.1]])
+    official_without_squeeze = n_items in (6, 15)
+    squeeze_m = 0.0 if official_without_squeeze else SQUEEZE_M.get(n_items, 0.025)
+    offset = 0.5 if n_items == 6 else 0.0
+    ranks = [k - n_items // 2 + offset for k in range(n_items)]
+    angles = [math.pi * rank / n_items for rank in ranks]
+    return np.array(
+        [
+            (0.3 * math.cos(angle) - 0.25, 0.3 * math.sin(angle) - squeeze_m * rank)
+            for rank, angle in zip(ranks, angles, strict=True)
+        ]
+    )
+
+
+def jittered(centres_m: Plane, rng: np.random.Generator) -> Plane:
+    """Shift each place by N(0, 1 cm) in x and y, one after another, at least 6 cm from those before.
+
+    A place for which `MAX_JITTER_TRIES` draws fail stays where it is, as in the official code.
+    """
+    placed: list[Plane] = []
+    for centre in centres_m:
+        for _ in range(MAX_JITTER_TRIES):
+            draft = centre + rng.normal(0, JITTER_STD_M, 2)
+            if all(np.linalg.norm(draft - other) >= MIN_DISTANCE_M for other in placed):
+                break
+        else:
+            draft = centre
+        placed.append(draft)
+    return np.stack(placed)
+
+
+def jittered_apart(centres_m: Plane, rng: np.random.Generator) -> Plane:
+    """Shift each place by N(0, 1 cm), at least 6.1 cm from all others, shifted already or still to come.
+
+    So no two items ever overlap. The official code shifts all at once and keeps the best of 20 draws; of
+    its 15 places some then lie 4.7 cm apart, and items 6 cm wide are thrown off when they are revealed
+    (measured: by up to 10 cm).
+    """
+    places = centres_m.copy()
+    for index, centre in enumerate(centres_m):
+        others = np.delete(places, index, axis=0)
+        for _ in range(MAX_JITTER_TRIES):
+            draft = centre + rng.normal(0, JITTER_STD_M, 2)
+            if np.linalg.norm(others - draft, axis=1).min() >= MIXED_MIN_DISTANCE_M:
+                places[index] = draft
+                break
+    return places

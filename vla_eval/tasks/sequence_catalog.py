@@ -1,0 +1,59 @@
+"""The rows of BunchOfColors, SeqOfColors and ChainOfColors. Importing it starts no simulator."""
+
+from vla_eval.tasks.chance import chance_of_several
+from vla_eval.tasks.spec import MemoryType, TaskSpec
+
+N_CUBES = 9
+HORIZON_STEPS = 120
+
+
+def _several(
+    family: str, n_shown: int, *, shown: str, memory: MemoryType, one_by_one: bool, in_order: bool
+) -> TaskSpec:
+    order = "in the order shown" if in_order else "in any order"
+    return TaskSpec(
+        id=f"{family}{n_shown}-v0",
+        version=1,
+        entry_point=f"vla_eval.tasks.sequences:{family}Env",
+        kwargs={"n_shown": n_shown},
+        horizon_steps=HORIZON_STEPS,
+        memory=memory,
+        instruction_key=family,
+        description=(
+            f"{n_shown} cubes of different colours are shown {shown}, the table is empty for a while, then "
+            f"{N_CUBES} cubes lie there: touch those that were shown, {order}."
+        ),
+        success=(
+            f"All cubes that were shown, and no other, have been touched {order}: the tool centre point was "
+            "within 2 cm of the point 5 mm over the cube's top and the arm at rest."
+        ),
+        oracle="vla_eval.oracles.visit:CUBES",
+        oracle_sees=(
+            "poses of all cubes, which ones are right and which have been touched; moves once the choice "
+            "has appeared"
+        ),
+        candidates="cubes",
+        chance_success=chance_of_several(N_CUBES, n_shown, in_order=in_order),
+        max_reward=100.0,
+        shows_one_by_one=one_by_one,
+    )
+
+
+SEQUENCE_TASKS = (
+    *(
+        _several("BunchOfColors", n, shown="together", memory="capacity", one_by_one=False, in_order=False)
+        for n in (3, 5, 7)
+    ),
+    *(
+        _several(
+            "SeqOfColors", n, shown="one after another", memory="capacity", one_by_one=True, in_order=False
+        )
+        for n in (3, 5, 7)
+    ),
+    *(
+        _several(
+            "ChainOfColors", n, shown="one after another", memory="sequential", one_by_one=True, in_order=True
+        )
+        for n in (3, 5, 7)
+    ),
+)

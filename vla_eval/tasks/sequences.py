@@ -1,0 +1,279 @@
+"""BunchOfColors, SeqOfColors, ChainOfColors: several cubes are shown, and all of them must be found again.
+
+What differs is how they are shown (together, or one after another) and whether the order counts.
+"""
+
+import math
+from typing import Any
+
+import sapien
+import torch
+
+from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.chance import chance_of_several
+from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
+from vla_eval.tasks.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
+from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.spec import total_cue_steps
+from vla_eval.tasks.streams import Stream
+
+TOUCH_ABOVE_TOP_M = 0.005  # the point to touch: official 2.5 cm over the centre of a cube of 4 cm
+TOUCH_RADIUS_M = 0.02
+# Where cubes that are shown together lie: an arc, squeezed in y by so much per place (official constants).
+BUNCH_RADIUS_M = 0.22
+BUNCH_SQUEEZE_M = 0.015
+MAX_STEPS = 10_000  # of anything: 500 s
+FOUND_REWARD = 90.0
+MISTAKE_REWARD = -10.0
+
+
+def bunch_place_m(color: int, n_colors: int) -> tuple[float, float]:
+    """Return (x, y) where the cube of this colour lies while cubes are shown together, world frame.
+
+    Source: official task code, constants as measured (`docs/tasks.md`); numbers of colours that it does
+    not have follow the same rule.
+    """
+    rank = color - n_colors // 2
+    angle = math.pi * rank / n_colors
+    return BUNCH_RADIUS_M * math.cos(angle), BUNCH_RADIUS_M * math.sin(angle) - BUNCH_SQUEEZE_M * rank
+
+
+class SeveralColorsEnv(ItemChoiceEnv):
+    """Find all cubes that were shown before, and no other.
+
+    Description: some of N cubes lie on the table, together or one after another (cue), then the table is
+    empty (delay), then all N lie on an arc in random order (response).
+
+    A cube is touched when, in the response phase, the tool centre point is within `goal_threshold_m` of
+    the point half a centimetre over the cube's top, with the arm at rest, for `dwell_steps` steps. All
+    that were shown must be touched, in the order shown if the family says so. The first touch of a wrong
+    cube, or out of turn, spoils the episode; touching a cube again changes nothing.
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (besides: vector to the next cube 3, sequence L, and per cube: position 3, touched 1, right 1,
+    next 1).
+
+    Rewards: dense, from the response phase on: reach the next cube 1 + slow down 0.5 + 90 per share found
+    - 10 per mistake, or 100 where solved; see `docs/tasks.md`.
+
+    Starting state: arm at rest with joint noise of 0.02 rad; colours shown and places drawn uniformly.
+
+    Episode end: 120 control steps; success and failure are reported but end nothing by themselves.
+
+    Arguments: `n_items` 2 to 9 cubes, `n_shown` 1 to `n_items`, `cue_steps` (for each cube, or for all
+    together), `gap_steps` of empty table between two of them, `dwell_steps`, `cube_half_size_m`, and
+    those of `ChoiceEnv` and `MemoryTableEnv`. `strict_choice` ends the episode at the first mistake.
+
+    Chance level: for L of N, 1 / C(N, L); in order, 1 / (N (N - 1) … (N - L + 1)).
+
+    Version history: 1, first version.
+    """
+
+    MAX_REWARD = 100.0
+    REACH_SCALE_PER_M = 10.0
+    SLOWING_WEIGHT = 0.5
+    ONE_BY_ONE: bool
+    """Whether the cubes are shown one after another at the same place."""
+
+    def __init__(
+        self,
+        *args: Any,
+        n_items: int = 9,
+        n_shown: int = 3,
+        gap_steps: int = 0,
+        dwell_steps: int = 1,
+        goal_threshold_m: float = TOUCH_RADIUS_M,
+        cube_half_size_m: float = CUBE_HALF_SIZE_M,
+        phase_gate_success: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        """Check the numbers and build the scene."""
+        check_count("n_items", n_items, len(COLORS), "colour")
+        check_count("n_shown", n_shown, n_items, "cube on the table", least=1)
+        check_count("gap_steps", gap_steps, MAX_STEPS, "step", least=0)
+        check_count("dwell_steps", dwell_steps, MAX_STEPS, "step", least=1)
+        if gap_steps and not self.ONE_BY_ONE:
+            raise TaskArgumentError(f"gap_steps={gap_steps}: the cubes of this task are shown together.")
+        if not phase_gate_success:
+            raise TaskArgumentError(
+                "phase_gate_success=False: touches count in the response phase only in these tasks, in the "
+                "official code, too. Leave the argument out."
+            )
+        self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
+        self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
+        shape = cube(cube_half_size_m)
+        items = tuple(Item(shape, color) for color in COLORS[:n_items])
+        super().__init__(*args, items=items, goal_threshold_m=goal_threshold_m, **kwargs)
+
+    def stream_key(self) -> tuple[int, ...]:
+        """Return the family's number, how many cubes there are and how many are shown."""
+        return (self.FAMILY, self.n_items, self.n_shown)
+
+    def total_cue_steps(self, cue_steps: int) -> int:
+        """Return how long the cue phase lasts if each cube is shown for `cue_steps`."""
+        return total_cue_steps(cue_steps, self.n_shown if self.ONE_BY_ONE else 1, self.gap_steps)
+
+    def chance_success(self) -> float:
+        """Return the success rate of a perfect arm that knows how many cubes were shown, not which."""
+        return chance_of_several(self.n_items, self.n_shown, in_order=self.in_order)
+
+    # ---------------------------------------------------------------- episode
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        super()._load_scene(options)
+        self._sequence = torch.zeros(self.num_envs, self.n_shown, dtype=torch.long, device=self.device)
+        self._is_shown = torch.zeros_like(self._touch_rank, dtype=torch.bool)
+        self._near = torch.full_like(self._target, -1)
+        self._near_steps = torch.zeros_like(self._target)
+
+    def _sample_episode(self, env: int) -> None:
+        drawn = self.episode_generator(env, Stream.TARGET).permutation(self.n_items)[: self.n_shown]
+        self._sequence[env] = torch.as_tensor(drawn)
+        self._is_shown[env] = False
+        self._is_shown[env, self._sequence[env]] = True
+        self._sample_slots(env)
+
+    def _on_episode_start(self, mask: torch.Tensor) -> None:
+        super()._on_episode_start(mask)
+        self._near_steps[mask] = 0
+
+    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+        in_cue = mask & (step < self._cue_end_step)
+        cue_ends = mask & (step == self._cue_end_step) & (step > 0)
+        choice_begins = mask & (step == self._response_step)
+        if self.ONE_BY_ONE:
+            moved = self._show_in_turn(step, in_cue)
+        else:
+            moved = in_cue & (step == 0)
+            self._show_together(moved)
+        self._park_all(cue_ends)
+        self._reveal_all(choice_begins)
+        return bool((moved | cue_ends | choice_begins).any())
+
+    def _show_together(self, mask: torch.Tensor) -> None:
+        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
+            x, y = bunch_place_m(index, self.n_items)
+            place = sapien.Pose(p=[x, y, item.shape.rest_height_m])
+            self.move(actor, mask & self._is_shown[:, index], place)
+
+    def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """Show and hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
+        # `total_cue_steps` solved for the steps of one cube, which may be drawn per episode.
+        turn_steps = (self._cue_end_step + self.gap_steps) // self.n_shown
+        turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(max=self.n_shown - 1)
+        since = step - turn * turn_steps
+        begins = mask & (since == 0)
+        ends = mask & (since == turn_steps - self.gap_steps)
+        self._park_all((begins & (step > 0)) | ends)
+        shown = self._of_sequence(turn.long())
+        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
+            self.move(actor, begins & (shown == index), sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
+        return begins | ends
+
+    def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:
+        return self._sequence.gather(1, position[:, None])[:, 0]
+
+    # ---------------------------------------------------------------- touches
+
+    def touch_points_m(self) -> torch.Tensor:
+        """Return (B, N, 3): half a centimetre over the tops of the cubes, world frame."""
+        points = self.candidate_positions_m()
+        points[:, :, 2] += self._touch_height_m
+        return points
+
+    def right_candidates(self, env: int) -> tuple[int, ...]:
+        """Return the cubes that were shown, in the order shown."""
+        return tuple(int(i) for i in self._sequence[env])
+
+    def _n_found(self) -> torch.Tensor:
+        """Return (B,) how many cubes were touched rightly."""
+        n_found: torch.Tensor = ((self._touch_rank > 0) & ~self._touched_wrongly).sum(dim=1)
+        return n_found
+
+    def target_index(self) -> torch.Tensor:
+        """Return (B,) the cube to touch next; where the order is free, the first by colour (official)."""
+        if self.in_order:
+            return self._of_sequence(self._n_found().clamp(max=self.n_shown - 1))
+        left = self._is_shown & (self._touch_rank == 0)
+        first_left = left.long().argmax(dim=1)
+        return torch.where(left.any(dim=1), first_left, self._sequence[:, -1])
+
+    def _is_wrong(self, candidate: torch.Tensor) -> torch.Tensor:
+        if self.in_order:
+            return (candidate != self.target_index()) | (self._n_found() == self.n_shown)
+        return ~self._of_candidate(self._is_shown, candidate)
+
+    def _latch_touch(self, touches: torch.Tensor, candidate: torch.Tensor) -> None:
+        same = touches & (self._near_steps > 0) & (candidate == self._near)
+        self._near_steps = torch.where(same, self._near_steps + 1, touches.long())
+        self._near = candidate
+        super()._latch_touch(touches & (self._near_steps >= self.dwell_steps), candidate)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Read success, failure and choices; changes nothing."""
+        static = self.is_static()
+        n_wrong = self._touched_wrongly.sum(dim=1)
+        found = self._n_found() == self.n_shown
+        spoilt = n_wrong > 0
+        return {
+            "success": self.gated(found & static & ~spoilt),
+            "fail": spoilt if self.strict_choice else torch.zeros_like(spoilt),
+            "is_obj_placed": self.target_distance_m() <= self.goal_threshold_m,
+            "is_robot_static": static,
+            "obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m(),
+            "first_choice": self._first_choice.clone(),
+            "n_found": self._n_found(),
+            "n_wrong_choices": n_wrong,
+        }
+
+    def oracle_info(self) -> torch.Tensor:
+        """Return (B, L) uint8: the cubes that were shown, in the order shown."""
+        return self._sequence.to(torch.uint8)
+
+    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Reach the next cube, slow down, find cubes, make no mistake; nothing before the response phase."""
+        begun = self._elapsed_steps >= self._response_step
+        return {
+            "reaching": nearness(self.REACH_SCALE_PER_M, self.target_distance_m()) * begun,
+            "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * begun,
+            "found": FOUND_REWARD * info["n_found"] / self.n_shown,
+            "mistakes": MISTAKE_REWARD * info["n_wrong_choices"],
+        }
+
+    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+        positions = self.candidate_positions_m()
+        following = self.target_index()
+        extra = {
+            "obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m(),
+            "oracle_info": self.oracle_info(),
+        }
+        for index in range(self.n_items):
+            extra[f"cube_{index}_pose"] = positions[:, index]
+            extra[f"cube_{index}_touched"] = self._touch_rank[:, index, None] > 0
+            extra[f"cube_{index}_is_right"] = self._is_shown[:, index, None]
+            extra[f"cube_{index}_is_next"] = (following == index)[:, None]
+        return extra
+
+
+class BunchOfColorsEnv(SeveralColorsEnv):
+    """BunchOfColors: touch the cubes that were shown together, in any order; see `SeveralColorsEnv`."""
+
+    FAMILY = 6
+    ONE_BY_ONE = False
+
+
+class SeqOfColorsEnv(SeveralColorsEnv):
+    """SeqOfColors: touch the cubes that were shown one by one, in any order; see `SeveralColorsEnv`."""
+
+    FAMILY = 7
+    ONE_BY_ONE = True
+
+
+class ChainOfColorsEnv(SeveralColorsEnv):
+    """ChainOfColors: touch the cubes that were shown one by one, in that order; see `SeveralColorsEnv`."""
+
+    FAMILY = 8
+    ONE_BY_ONE = True
+    in_order = True
