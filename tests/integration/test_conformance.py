@@ -21,6 +21,8 @@ from vla_eval.testing import check_env, check_policy, check_task
 SAMPLE = (
     "RememberColor9-v0",
     "RememberShapeAndColor3x2-v0",
+    "BunchOfColors3-v0",
+    "ChainOfColors3-v0",
     "ShellGameTouch-v0",
     "ShellGamePick-v0",
     "InterceptMedium-v0",

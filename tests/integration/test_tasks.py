@@ -18,6 +18,8 @@ CHOICE_TASKS = [task for task, spec in TASKS.items() if spec.candidates]
 SAMPLE = (
     "RememberColor9-v0",
     "RememberShapeAndColor3x2-v0",
+    "BunchOfColors3-v0",
+    "ChainOfColors3-v0",
     "ShellGameTouch-v0",
     "ShellGamePick-v0",
     "InterceptMedium-v0",
@@ -77,6 +79,10 @@ def visible(env: Any) -> list[int]:
         ("RememberShape5-v0", 25 + 1 + 3 * 5),
         ("RememberShapeAndColor3x2-v0", 25 + 2 + 3 * 6),
         ("RememberShapeAndColor5x3-v0", 25 + 2 + 3 * 15),
+        # Vector to the next cube 3, sequence L, and 3 + 3 per cube: 85, 87, 89.
+        ("BunchOfColors3-v0", 25 + 3 + 3 + 9 * 6),
+        ("SeqOfColors5-v0", 25 + 3 + 5 + 9 * 6),
+        ("ChainOfColors7-v0", 25 + 3 + 7 + 9 * 6),
         ("ShellGameTouch-v0", 25 + 7 + 7 + 1),
         ("ShellGamePush-v0", 25 + 3 + 7 + 7 + 1),
         ("ShellGamePick-v0", 25 + 3 + 7 + 7 + 1 + 1),
