@@ -46,7 +46,7 @@ class TestMistakes:
         assert "unrecognized arguments: --episods 3" in mistake(capsys, "eval", "demo", "--episods", "3")
 
     def test_an_unknown_task(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "Did you mean 'ShellGameTouch-v0'" in mistake(capsys, "show", "ShellGame")
+        assert "Did you mean 'ShellGameTouch-v0'" in mistake(capsys, "show", "ShellGameTuch-v0")
 
     def test_an_unknown_configuration(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert "no configs/*.yaml 'dmeo'. Did you mean 'demo'" in mistake(capsys, "eval", "dmeo")
