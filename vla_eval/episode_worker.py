@@ -1,4 +1,4 @@
-"""The inside of a worker process: keep an environment and a policy at hand, run one episode at a time.
+"""The inside of a worker process: keep an environment and a policy at hand, run one batch at a time.
 
 It is told what to run over a pipe, says in shared memory what it is busy with, and writes no file but
 its log. After an error it is replaced by a new process: a native library or a GPU context may be left
@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,6 +25,7 @@ from vla_eval.core import EpisodeStart, Policy, SimEnv, Stage
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
+from vla_eval.job_queue import EpisodeBatch
 from vla_eval.plan import EpisodeJob, Group, GroupKey
 from vla_eval.policies.context import PolicyContext
 from vla_eval.registry import policy_factory
@@ -34,7 +35,6 @@ from vla_eval.specs import EnvSpec, check_compatible
 
 STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
 MAX_DETAILS = 20_000  # characters of a traceback; the log has it all
-SLOT = 0  # a worker runs one episode at a time
 PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
 
 logger = logging.getLogger(__name__)
@@ -45,15 +45,15 @@ SharedStage = ctypes.Array[ctypes.c_double]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finished:
-    """An episode came to its end."""
+    """The episodes of a batch came to their ends; records and timings in the order of its jobs."""
 
-    record: EpisodeRecord
-    timing: EpisodeTiming
+    records: tuple[EpisodeRecord, ...]
+    timings: tuple[EpisodeTiming, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failed:
-    """An episode could not be run.
+    """An episode, or one of a batch, could not be run.
 
     Attributes:
         error: what happened.
@@ -105,21 +105,25 @@ class Heartbeat:
         if self._stage is not None:
             self.seconds[self._stage] += now - self._since
 
-    def begin_episode(self) -> None:
-        """Forget the times of the last episode."""
+    def begin_batch(self) -> None:
+        """Forget the times of the last batch."""
         self._stage = None
         self.seconds = dict.fromkeys(STAGES, 0.0)
 
-    def timing(self, job: EpisodeJob) -> EpisodeTiming:
-        """Return the times of the episode that has just ended."""
+    def timings(self, jobs: Sequence[EpisodeJob]) -> tuple[EpisodeTiming, ...]:
+        """Return the times of the batch that has just ended, an equal share for each episode."""
         self._add_up(time.monotonic())
         self._stage = None
-        return EpisodeTiming(
-            key=job.key,
-            total_seconds=sum(self.seconds.values()),
-            reset_seconds=self.seconds["reset"],
-            step_seconds=self.seconds["step"],
-            inference_seconds=self.seconds["inference"],
+        share = {stage: seconds / len(jobs) for stage, seconds in self.seconds.items()}
+        return tuple(
+            EpisodeTiming(
+                key=job.key,
+                total_seconds=sum(share.values()),
+                reset_seconds=share["reset"],
+                step_seconds=share["step"],
+                inference_seconds=share["inference"],
+            )
+            for job in jobs
         )
 
 
@@ -152,20 +156,20 @@ class EpisodeRunner:
         self._loaded: GroupKey | None = None
         self._facts: dict[str, EnvFacts] = {}  # by task: all else is the same in one run
 
-    def answer(self, job: EpisodeJob) -> Finished | Failed:
-        """Run the episode; whatever goes wrong becomes a `Failed`."""
-        self._heartbeat.begin_episode()
+    def answer(self, job: EpisodeBatch) -> Finished | Failed:
+        """Run the episodes; whatever goes wrong becomes a `Failed`."""
+        self._heartbeat.begin_batch()
         refused = False
         try:
             self._heartbeat("setup")
             try:
-                env, policy = self._prepare(job)
+                env, policy = self._prepare(job.jobs[0])
             except VlaEvalError as exc:
                 refused = not isinstance(exc, InvalidActionError)
                 raise
             return self._run(env, policy, job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
-            logger.exception("%s, stage %s", job.key, self._heartbeat.stage)
+            logger.exception("%s, stage %s", [one.key for one in job.jobs], self._heartbeat.stage)
             return Failed(error=describe_error(exc, self._heartbeat.stage), refused=refused)
 
     def close(self) -> None:
@@ -174,19 +178,23 @@ class EpisodeRunner:
             self._env.close()
         self._env = self._env_settings = self._policy = self._loaded = None
 
-    def _run(self, env: SimEnv, policy: Policy, job: EpisodeJob) -> Finished:
-        start = EpisodeStart(
-            slot=SLOT,
-            task=job.group.key.task,
-            seed=job.seed,
-            run=job.run,
-            instruction=job.group.instruction,
-            horizon_steps=env.spec.horizon_steps,
-        )
-        (record,) = rollout(env, policy, [start], job.group.rollout, heartbeat=self._heartbeat)
+    def _run(self, env: SimEnv, policy: Policy, batch: EpisodeBatch) -> Finished:
+        group = batch.group
+        starts = [
+            EpisodeStart(
+                slot=job.slot,
+                task=group.key.task,
+                seed=job.seed,
+                run=job.run,
+                instruction=group.instruction,
+                horizon_steps=env.spec.horizon_steps,
+            )
+            for job in batch.jobs
+        ]
+        records = rollout(env, policy, starts, group.rollout, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are told apart by it.
-        record = dataclasses.replace(record, policy=job.group.key.policy)
-        return Finished(record=record, timing=self._heartbeat.timing(job))
+        named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
+        return Finished(records=named, timings=self._heartbeat.timings(batch.jobs))
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
@@ -212,7 +220,7 @@ class EpisodeRunner:
             # Privileged, as scripted controls need it: theirs is then already made.
             env = self._make_env(dataclasses.replace(job.group.env, privileged=True))
             self._heartbeat("reset")
-            status = env.reset({SLOT: job.seed}, render=False)[SLOT].status
+            status = env.reset({job.slot: job.seed}, render=False)[job.slot].status
             self._facts[task] = EnvFacts(env.spec, status.n_candidates)
         return self._facts[task]
 
@@ -241,6 +249,7 @@ def make_policy(group: Group, facts: EnvFacts) -> Policy:
         env=facts.spec,
         chunking=group.rollout.chunking,
         n_candidates=facts.n_candidates,
+        n_slots=group.env.n_slots,
     )
     try:
         inspect.signature(factory).bind(context, **group.args)

@@ -13,10 +13,10 @@ from typing import Protocol
 from vla_eval import errors
 from vla_eval.episode_worker import DeviceFound, Failed, Finished, worker_main
 from vla_eval.errors import TooManyErrorsError, VlaEvalError
+from vla_eval.job_queue import EpisodeBatch, JobQueue
 from vla_eval.plan import (
     EpisodeJob,
     GroupKey,
-    JobQueue,
     Plan,
     fingerprint,
     make_plan,
@@ -112,10 +112,10 @@ def evaluate(
     ) as folder:
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)
+        n_open = queue.n_episodes
         n_workers = worker_count(config, plan, n_jobs=len(queue))
-        observer.on_start(plan, n_finished=len(plan.jobs) - len(queue), n_workers=n_workers)
-        bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer)
-        n_open = len(queue)
+        observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
+        bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
         was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers)
     return EvaluationSummary(
         out=path,
@@ -159,7 +159,7 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
     logs = bookkeeper.path / "logs"
     logs.mkdir(exist_ok=True)
     config = bookkeeper.config
-    new_pool = WorkerPool[EpisodeJob, Finished]
+    new_pool = WorkerPool[EpisodeBatch, Finished]
     with new_pool(worker_main, size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
         for event in pool.run(queue):
             if isinstance(event, Answered):
@@ -179,25 +179,30 @@ class _Bookkeeper:
     path: Path
     config: EvalConfig
     observer: EvaluationObserver
+    queue: JobQueue
     n_results: int = 0
     n_errors: int = 0
     n_consecutive_errors: int = 0
     proven: set[GroupKey] = field(default_factory=set)  # groups with an episode that ran to its end
 
-    def take(self, answered: Answered[EpisodeJob, Finished]) -> None:
-        """Store a result, or the error in its place."""
-        job, answer = answered.job, answered.answer
+    def take(self, answered: Answered[EpisodeBatch, Finished]) -> None:
+        """Store the results, or the error in their place."""
+        batch, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
             # What has worked before and now does not is no mistake of the user's: a GPU was lost, say.
-            if answer.refused and job.group.key not in self.proven:
+            if answer.refused and batch.group.key not in self.proven:
                 raise as_exception(answer.error)
-            self._take_error(job, answer.error)
+            if len(batch.jobs) > 1:
+                self.queue.put_back_alone(batch)
+            else:
+                self._take_error(batch.jobs[0], answer.error)
             return
-        self.folder.append(answer.record, answer.timing)
-        self.proven.add(job.group.key)
-        self.n_results += 1
+        self.proven.add(batch.group.key)
         self.n_consecutive_errors = 0
-        self.observer.on_record(answer.record)
+        for record, timing in zip(answer.records, answer.timings, strict=True):
+            self.folder.append(record, timing)
+            self.n_results += 1
+            self.observer.on_record(record)
 
     def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:
         record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)

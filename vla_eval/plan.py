@@ -6,8 +6,7 @@ found here, before the first episode. Knows nothing of processes or files of res
 
 import hashlib
 import json
-from collections import deque
-from collections.abc import Collection, Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -56,21 +55,24 @@ class Group:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeJob:
-    """One episode to run."""
+    """One episode to run.
+
+    Attributes:
+        group: what it shares with others.
+        run, seed: what tells it apart from them.
+        slot: where in a worker it runs. Fixed by the plan, since a network that infers for several
+            episodes in one pass gives a row the same bits only in the same place.
+    """
 
     group: Group
     run: int
     seed: int
+    slot: int = 0
 
     @property
     def key(self) -> EpisodeKey:
         """The identity of the episode within its run folder."""
         return EpisodeKey(*self.group.key, self.run, self.seed)
-
-    @property
-    def setup_key(self) -> GroupKey:
-        """Jobs with the same one can be run with the same environment and policy."""
-        return self.group.key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,10 +128,12 @@ def make_plan(config: EvalConfig) -> Plan:
     limits = [policy.value.max_workers for policy in policies if policy.value.max_workers is not None]
     return Plan(
         jobs=tuple(
-            EpisodeJob(group=group, run=run, seed=seed)
+            EpisodeJob(
+                group=group, run=run, seed=config.seed_start + index, slot=index % config.slots_per_worker
+            )
             for group in groups
             for run in range(config.runs)
-            for seed in range(config.seed_start, config.seed_start + config.episodes)
+            for index in range(config.episodes)
         ),
         recipe_hashes={
             f"prompts/{prompts.name}": prompts.sha256,
@@ -146,6 +150,8 @@ def make_plan(config: EvalConfig) -> Plan:
 def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     """Return the part of a configuration that results depend on; compared when a run is continued."""
     data: dict[str, Any] = to_data(config)
+    if config.slots_per_worker == 1:  # runs of versions that knew nothing else can be continued
+        del data["slots_per_worker"]
     return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
 
 
@@ -159,49 +165,6 @@ def fingerprint(config: EvalConfig) -> str:
     """Return the sha256 of the part of a configuration that results depend on."""
     text = json.dumps(results_config(config), sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-class JobQueue:
-    """Hands out episodes so that mistakes show early and workers seldom have to rebuild.
-
-    The first episode of each group that has no result yet comes before all others: what is wrong with
-    the last policy of the list shows in the first minutes, not at the end of the night. After that a
-    worker stays with the group that it has loaded. The order moves no result.
-    """
-
-    def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
-        """Queue the jobs that are not finished."""
-        begun = {GroupKey(*key[:3]) for key in finished}
-        self._heads: deque[EpisodeJob] = deque()
-        self._rest: dict[GroupKey, deque[EpisodeJob]] = {}
-        for job in jobs:
-            if job.key in finished:
-                continue
-            if job.group.key not in begun:
-                begun.add(job.group.key)
-                self._heads.append(job)
-            else:
-                self._rest.setdefault(job.group.key, deque()).append(job)
-
-    def __len__(self) -> int:
-        """How many jobs have not been handed out."""
-        return len(self._heads) + sum(len(jobs) for jobs in self._rest.values())
-
-    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> EpisodeJob | None:
-        """Return the next job for a worker, or None if there is no more.
-
-        Args:
-            loaded: the group whose environment and policy the worker has at hand.
-            taken: groups that other workers have at hand; avoided while there are others.
-        """
-        if self._heads:
-            return self._heads.popleft()
-        waiting = [key for key, jobs in self._rest.items() if jobs]
-        if not waiting:
-            return None
-        free = [key for key in waiting if key not in taken]
-        chosen = next((key for key in waiting if key == loaded), (free or waiting)[0])
-        return self._rest[chosen].popleft()
 
 
 def _weights_hashes(policies: Iterable[Recipe[PolicyRecipe]]) -> dict[str, str]:
@@ -240,6 +203,7 @@ def _groups(
                 simulator=config.simulator,
                 sim_backend=config.sim_backend,
                 render=config.render,
+                n_slots=config.slots_per_worker,
             ),
             rollout=RolloutSettings(
                 chunking=config.chunking.spec(n_action_steps),

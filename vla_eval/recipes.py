@@ -136,6 +136,7 @@ class EvalConfig:
     sim_backend: SimBackend = "cpu"
     stop_at_success: bool = False
     eager_rendering: bool = False
+    slots_per_worker: int = 1
     workers: int | Literal["auto"] = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: int = 10
@@ -143,7 +144,7 @@ class EvalConfig:
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
         check_run_name(self.name)
-        for name in ("episodes", "runs", "max_consecutive_errors"):
+        for name in ("episodes", "runs", "slots_per_worker", "max_consecutive_errors"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "a number ≥ 1")
         _require(self.seed_start >= 0, "seed_start", self.seed_start, "a seed ≥ 0")
         _require(

@@ -95,6 +95,45 @@ def make(context, *, faults={}, pause=0.0, cameras=()):
     return Policy(context, faults, pause, cameras)
 """
 
+# Counts its inferences and draws numbers, each slot its own: what would show if episodes mixed.
+PAIR_MODULE = """
+from pathlib import Path
+import numpy as np
+from vla_eval.core import ActionChunk
+from vla_eval.specs import PolicySpec
+
+HERE = Path(__file__).parent
+
+
+class Policy:
+    def __init__(self, context, fails_at):
+        self.spec = PolicySpec(name="pair", reads="last", cameras=(), states=("qpos",),
+                               chunk_size=context.chunking.min_chunk_size)
+        self.fails_at, self.slots = fails_at, {}
+
+    def reset(self, episodes):
+        for e in episodes:
+            self.slots[e.slot] = {"seed": e.seed, "n": 0, "rng": np.random.default_rng([e.seed, e.run])}
+
+    def act_batch(self, windows):
+        with (HERE / "passes").open("a") as file:
+            file.write(f"{len(windows)} ")
+        return [self.act(window) for window in windows]
+
+    def act(self, window):
+        slot = self.slots[window.slot]
+        slot["n"] += 1
+        if slot["seed"] == self.fails_at and not (HERE / "mended").exists():
+            raise ZeroDivisionError("a mistake in the policy")
+        actions = slot["rng"].uniform(-1, 1, (self.spec.chunk_size, 7)).astype(np.float32)
+        actions[:, 0] = 0.1 * slot["n"]
+        return ActionChunk(actions=actions)
+
+
+def make(context, *, fails_at=None):
+    return Policy(context, fails_at)
+"""
+
 
 class Bench:
     """A folder with the policy's module, its recipe, and what is needed to run it."""
@@ -102,10 +141,11 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         (folder / "night_policy.py").write_text(POLICY_MODULE)
+        (folder / "pair_policy.py").write_text(PAIR_MODULE)
         self.write_policy()
 
-    def write_policy(self, **args: Any) -> None:
-        recipe = {"version": 1, "description": "d", "adapter": "night_policy:make", "args": args}
+    def write_policy(self, adapter: str = "night_policy:make", **args: Any) -> None:
+        recipe = {"version": 1, "description": "d", "adapter": adapter, "args": args}
         (self.folder / "night.yaml").write_text(json.dumps(recipe))  # JSON is YAML
 
     def mend(self) -> None:
@@ -162,6 +202,42 @@ def wait_until(claim: Callable[[], bool], *, seconds: float = 10.0) -> bool:
             return True
         time.sleep(0.02)
     return claim()
+
+
+# ------------------------------------------------------------------------------------------ side by side
+
+
+class TestSlots:
+    def test_records_do_not_depend_on_how_many_episodes_run_side_by_side(self, bench: Bench) -> None:
+        bench.write_policy("pair_policy:make")
+
+        bench.run("alone", runs=2)
+        bench.run("beside", runs=2, slots_per_worker=4)
+
+        assert len(bench.lines("alone")) == 12
+        assert bench.lines("beside") == bench.lines("alone")
+        # 12 control steps each: 12 episodes one by one; then, per run, 4 side by side and 2 side by side.
+        passes = (bench.folder / "passes").read_text().split()
+        assert passes == ["1"] * 12 * 12 + (["4"] * 12 + ["2"] * 12) * 2
+
+    def test_an_error_is_the_error_of_one_episode_and_not_of_its_neighbours(self, bench: Bench) -> None:
+        bench.write_policy("pair_policy:make")
+        bench.run("alone")
+        bench.write_policy("pair_policy:make", fails_at=3)
+
+        summary = bench.run("beside", slots_per_worker=4)
+
+        records = bench.records("beside")
+        assert (summary.n_errors, summary.n_open) == (1, 1)
+        assert {seed for seed, record in records.items() if record.error is not None} == {3}
+        bench.mend()
+        assert bench.run("beside", slots_per_worker=4).n_open == 0
+        assert bench.lines("beside") == bench.lines("alone")
+
+    def test_a_run_is_not_continued_with_another_number_of_slots(self, bench: Bench) -> None:
+        bench.run("out")
+        with pytest.raises(RunChangedError, match="slots_per_worker"):
+            bench.run("out", slots_per_worker=2)
 
 
 # ------------------------------------------------------------------------------------------ faults

@@ -159,6 +159,19 @@ def window(slot: int = 0, *frames: Observation) -> ObservationWindow:
     return ObservationWindow(slot=slot, frames=frames or (observation(),))
 
 
+def _count_passes(policy: Any) -> list[int]:
+    """Return a list that gets the number of rows of each forward pass."""
+    rows: list[int] = []
+    predict = policy._loaded.policy.predict_action_chunk
+
+    def counting(batch: dict[str, Any], **extra: Any) -> Any:
+        rows.append(len(batch["observation.state"]))
+        return predict(batch, **extra)
+
+    policy._loaded.policy.predict_action_chunk = counting
+    return rows
+
+
 class TestContract:
     def test_a_policy_passes_the_kit_bit_for_bit(self, make: Any, env: EnvSpec) -> None:
         check_policy(make, env)
@@ -173,6 +186,29 @@ class TestContract:
             answers.append(np.stack([chunk.actions for chunk in policy.act_batch(windows)]))
         assert np.abs(answers[0][0] - answers[0][1]).max() > 1e-3  # the slots do differ
         np.testing.assert_allclose(answers[1], answers[0], atol=BATCH_TOLERANCE)
+
+    @pytest.mark.parametrize("family", ["act", "pi0"])
+    def test_in_one_pass_an_episodes_bits_are_its_own_whoever_is_beside_it(
+        self, request: pytest.FixtureRequest, env: EnvSpec, family: str
+    ) -> None:
+        maker: Any = make_lerobot if family == "act" else make_tiny_pi0
+        checkpoint = str(request.getfixturevalue(family))
+        policy = maker(dataclasses.replace(context_for(env), n_slots=3), checkpoint=checkpoint)
+        passes = _count_passes(policy)
+
+        def actions(*slots: int) -> dict[int, Any]:
+            policy.reset([start(slot, seed=slot + 1) for slot in slots])
+            windows = [window(slot, observation(level=60 * slot)) for slot in slots]
+            return {slot: chunk.actions for slot, chunk in zip(slots, policy.act_batch(windows), strict=True)}
+
+        together, some, one = actions(0, 1, 2), actions(2, 0), actions(1)
+        assert passes == [3, 3, 3]  # rows of each pass
+        assert [together[slot].tobytes() for slot in (2, 0)] == [some[slot].tobytes() for slot in (2, 0)]
+        assert together[1].tobytes() == one[1].tobytes()
+        alone = maker(context_for(env), checkpoint=checkpoint)
+        alone.reset([start(1, seed=2)])
+        expected = alone.act(window(1, observation(level=60))).actions
+        np.testing.assert_allclose(together[1], expected, atol=BATCH_TOLERANCE)
 
     def test_it_runs_through_the_loop_with_fewer_actions_than_its_chunk(self, make: Any) -> None:
         fake = make_env(FAKE)

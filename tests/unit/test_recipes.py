@@ -9,7 +9,8 @@ import pytest
 from vla_eval import recipes
 from vla_eval.decoding import decode, load_yaml
 from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
-from vla_eval.plan import JobQueue, fingerprint, make_plan, results_config
+from vla_eval.job_queue import JobQueue
+from vla_eval.plan import fingerprint, make_plan, results_config
 from vla_eval.recipes import (
     EvalConfig,
     PolicyRecipe,
@@ -292,9 +293,9 @@ class TestQueue:
 
         order = []
         loaded = None
-        while job := queue.take(loaded):
-            loaded = job.group.key
-            order.append((job.key.policy, job.key.seed))
+        while batch := queue.take(loaded):
+            loaded = batch.group.key
+            order += [(job.key.policy, job.key.seed) for job in batch.jobs]
 
         assert order == [("random", 1), ("hold", 1), ("hold", 2), ("hold", 3), ("random", 2), ("random", 3)]
 
@@ -303,17 +304,45 @@ class TestQueue:
         first, _, _, other, *_ = plan.jobs
         queue = JobQueue(plan.jobs, finished={first.key, other.key})
 
-        job = queue.take(None, taken={first.group.key})
+        batch = queue.take(None, taken={first.group.key})
 
-        assert job is not None
-        assert job.group.key == other.group.key
+        assert batch is not None
+        assert batch.group.key == other.group.key
 
     def test_finished_episodes_are_not_handed_out(self) -> None:
         plan = make_plan(config(episodes=3))
         queue = JobQueue(plan.jobs, finished={plan.jobs[1].key})
 
         assert len(queue) == 2
-        assert [job.seed for job in iter(lambda: queue.take(None), None) if job] == [1, 3]
+        batches = [batch for batch in iter(lambda: queue.take(None), None) if batch]
+        assert [[job.seed for job in batch.jobs] for batch in batches] == [[1], [3]]
+
+    def test_a_slot_is_the_seeds_own_whoever_else_is_in_the_batch(self) -> None:
+        plan = make_plan(config(episodes=5, slots_per_worker=3))
+        queue = JobQueue(plan.jobs, finished={plan.jobs[1].key})
+
+        batches = [batch for batch in iter(lambda: queue.take(None), None) if batch]
+
+        # Seeds 1 … 5 have the slots 0 1 2 0 1; seed 2 is finished.
+        assert [[(job.seed, job.slot) for job in batch.jobs] for batch in batches] == [
+            [(1, 0), (3, 2)],
+            [(4, 0), (5, 1)],
+        ]
+
+    def test_a_batch_that_failed_comes_again_one_by_one(self) -> None:
+        queue = JobQueue(make_plan(config(episodes=4, slots_per_worker=2)).jobs, finished=())
+        failed = queue.take(None)
+        assert failed is not None
+
+        queue.put_back_alone(failed)
+
+        assert (len(queue), queue.n_episodes) == (3, 4)
+        order = [[job.seed for job in batch.jobs] for batch in iter(lambda: queue.take(None), None) if batch]
+        assert order == [[1], [2], [3, 4]]
+
+    def test_one_slot_leaves_no_trace_in_what_runs_are_compared_by(self) -> None:
+        assert "slots_per_worker" not in results_config(config())
+        assert results_config(config(slots_per_worker=2))["slots_per_worker"] == 2
 
 
 def test_every_task_has_its_instruction_in_the_paper_s_prompts() -> None:

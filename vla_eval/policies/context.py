@@ -15,9 +15,11 @@ class PolicyContext:
         env: what the environment offers.
         chunking: how its chunks will be executed; a scripted policy plans `min_chunk_size` actions.
         n_candidates: how many candidates the task has; 0 for a task without candidates.
+        n_slots: how many episodes will run side by side, in slots 0 … n_slots - 1.
     """
 
     name: str
     env: EnvSpec
     chunking: ChunkingSpec
     n_candidates: int
+    n_slots: int = 1

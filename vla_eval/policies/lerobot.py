@@ -66,23 +66,37 @@ class LeRobotPolicy:
         name: for messages.
         loaded: policy and processors.
         inputs: how observations become inputs.
-        batch: infer for all due slots in one forward pass. Sums are then made in another order, so that
-            actions agree with those of a pass of its own only up to rounding.
+        batch: infer for all due slots in one forward pass; None: if there are several slots and the
+            policy can. Sums are then made in another order, so that actions agree with those of a pass
+            of its own only up to rounding.
+        n_slots: how many slots there are. A pass then has a row for each, due or not: with the same
+            shape and the same place in it, an episode's actions are the same bits whoever is beside it.
     """
 
-    def __init__(self, name: str, loaded: LoadedPolicy, inputs: InputMap, *, batch: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        loaded: LoadedPolicy,
+        inputs: InputMap,
+        *,
+        batch: bool | None = False,
+        n_slots: int = 1,
+    ) -> None:
         self._loaded, self._inputs = loaded, inputs
         self._remembers = callable(getattr(loaded.policy, "remember", None))
         self._deltas = _history(loaded.config)
         self._noise_shape = noise_shape(loaded.config)
         draws_nothing = loaded.config.type in DETERMINISTIC or getattr(loaded.policy, "draws_nothing", False)
-        if batch and self._noise_shape is None and not draws_nothing:
+        can_batch = draws_nothing or self._noise_shape is not None
+        if batch and not can_batch:
             raise SpecMismatchError(
                 f"policy '{name}' (type '{loaded.config.type}') draws random numbers that cannot be given "
                 f"from outside: in one pass the episodes would depend on each other. Leave `batch` out of "
                 "its recipe."
             )
-        self._batch = batch and not self._remembers
+        wants_batch = n_slots > 1 and can_batch if batch is None else batch
+        self._batch = wants_batch and not self._remembers
+        self._n_slots = n_slots
         self._slots: dict[int, _Slot] = {}
         self.spec = PolicySpec(
             name=name,
@@ -105,8 +119,14 @@ class LeRobotPolicy:
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
         """Infer for each window; the draws of an episode are its own."""
         slots = [self._take(window) for window in windows]
-        groups = [slots] if self._batch else [[slot] for slot in slots]
-        return [chunk for group in groups for chunk in self._infer(group)]
+        if not self._batch:
+            return [self._infer([slot])[0] for slot in slots]
+        if self._n_slots == 1:
+            return self._infer(slots)
+        # A row that nobody is due for repeats another one, and its answer is dropped.
+        due = {slot.start.slot: slot for slot in slots}
+        chunks = self._infer([due.get(row, slots[0]) for row in range(self._n_slots)])
+        return [chunks[slot.start.slot] for slot in slots]
 
     def _take(self, window: ObservationWindow) -> _Slot:
         slot = self._slots[window.slot]
@@ -166,7 +186,7 @@ def make_lerobot(
     dtype: Literal["float32", "bfloat16"] | None = None,
     tokenizer: str | None = None,
     base_checkpoint: str | None = None,
-    batch: bool = False,
+    batch: bool | None = None,
 ) -> LeRobotPolicy:
     """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments.
 
@@ -196,7 +216,7 @@ def make_lerobot(
         context.env,
         policy=context.name,
     )
-    return LeRobotPolicy(context.name, loaded, inputs, batch=batch)
+    return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)
 
 
 def choose_device(device: str) -> str:
