@@ -1,6 +1,7 @@
 """`mikasa-vla finetune`: fine-tune a policy on a dataset, or go on with it."""
 
 import argparse
+import contextlib
 import shlex
 import sys
 from typing import Any
@@ -12,8 +13,8 @@ from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
 DESCRIPTION = """Train a policy on a dataset: lerobot's training loop, the recipe in policies/NAME.yaml.
 
-CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`; or name --policy
-and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
+CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `evaluation`; or name
+--policy and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
 `finetune` section (--set policy.chunk_size=8). The same command again goes on after a kill, exactly.
 Then: mikasa-vla eval --policy RUN --task TASK"""
 
@@ -36,6 +37,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--run-seed", type=int, metavar="S", help="seed of weights, order and noise (0)")
     parser.add_argument("--base-checkpoint", metavar="DIR", help="weights to start from")
     parser.add_argument("--device", metavar="D", help="auto, cpu, cuda")
+    parser.add_argument(
+        "--eval-every", type=int, metavar="N", help="evaluate a checkpoint every N steps, on held-out seeds"
+    )
+    parser.add_argument("--eval-episodes", type=int, metavar="E", help="episodes of each evaluation (20)")
     parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-DATASET-SEED)")
     parser.add_argument(
         "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
@@ -56,7 +61,8 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.training.finetune import finetune
 
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
-    summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
+    with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
+        summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
     print(summary.checkpoint)
     return 0
 
@@ -70,6 +76,10 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
                 data[name] = getattr(args, name)
         if args.allow_unreplayed:
             data["allow_unreplayed"] = True
+        evaluation = {"every_steps": args.eval_every, "episodes": args.eval_episodes}
+        given = {name: value for name, value in evaluation.items() if value is not None}
+        if given:
+            data["evaluation"] = {**(data.get("evaluation") or {}), **given}
         changes: dict[str, Any] = data.setdefault("finetune", {})
         for name in ("steps", "batch_size", "base_checkpoint"):
             if getattr(args, name) is not None:

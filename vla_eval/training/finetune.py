@@ -26,10 +26,12 @@ from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
 from vla_eval.results.durable import FolderLock
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.description import describe_model
-from vla_eval.training.loop import LoopHooks, run_loop
+from vla_eval.training.held_out import HeldOut, check_held_out
+from vla_eval.training.loop import LoopHooks, append_metrics, run_loop
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
-from vla_eval.training.run_folder import METRICS_FILE, TRAIN_FOLDER, open_folder
+from vla_eval.training.run_folder import METRICS_FILE, TRAIN_FOLDER, open_folder, read_metrics
+from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 
 LOCK_FILE = "finetune.lock"
 TOKENIZER_STEP = "TokenizerProcessorStep"
@@ -41,6 +43,15 @@ class FinetuneSummary:
 
     out: Path
     checkpoint: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Listeners:
+    """Who is told of a training: a person, a tracker of metrics, and whoever evaluates checkpoints."""
+
+    say: Callable[[str], None]
+    track: Log
+    held_out: HeldOut | None
 
 
 def default_out(config: FinetuneConfig) -> Path:
@@ -82,6 +93,9 @@ def finetune(
     """
     recipe = load_finetune_recipe(config)
     dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    task = None
+    if config.evaluation is not None:
+        task = check_held_out(config.evaluation, recipe.value, dataset)
     device = choose_device(config.device)
     policy = policy_config(recipe.value, dataset, device=device)
     frames = used_frames(policy, dataset)
@@ -99,7 +113,13 @@ def finetune(
     with _lock(out):
         resume_from = _open(out, recipe, dataset, config, command)
         say(f"run: {out}" + (f", going on from step {int(resume_from.name)}" if resume_from else ""))
-        _train(recipe.value, dataset, policy, config, out, resume_from, say)
+        project = recipe.value.trackio_project if _is_first_process() else None
+        with trackio_run(project, name=out.resolve().name, settings=to_data(recipe.value)) as track:
+            held_out = _held_out(config, recipe.value, task, out, say, track)
+            if held_out is not None:
+                held_out.catch_up(read_metrics(out))
+            listeners = _Listeners(say=say, track=track, held_out=held_out)
+            _train(recipe.value, dataset, policy, config, out, resume_from, listeners)
     return FinetuneSummary(out=out, checkpoint=find_checkpoint(out))
 
 
@@ -110,7 +130,7 @@ def _train(
     config: FinetuneConfig,
     out: Path,
     resume_from: Path | None,
-    say: Callable[[str], None],
+    listeners: "_Listeners",
 ) -> None:
     if resume_from is not None and int(resume_from.name) >= recipe.steps:
         return
@@ -121,7 +141,19 @@ def _train(
 
     def describe(model: Any) -> None:
         for line in describe_model(model).lines():
-            say(line)
+            listeners.say(line)
+
+    def report(line: Mapping[str, float]) -> None:
+        listeners.say(
+            f"step {int(line['step'])}/{recipe.steps}  loss {line['loss']:.4f}  lr {line['lr']:.2e}  "
+            f"{line['update_s'] + line['dataloading_s']:.3f} s/step"
+        )
+        listeners.track(line)
+
+    def evaluate(checkpoint: Path) -> None:
+        held_out = listeners.held_out
+        if held_out is not None and held_out.is_due(int(checkpoint.name)):
+            held_out.evaluate(checkpoint)
 
     hooks = LoopHooks(
         facts=_facts(dataset, policy, config, out),
@@ -133,14 +165,37 @@ def _train(
         decode_ahead=recipe.decode_ahead,
         tokenizer=recipe.tokenizer,
         on_model=describe,
-        on_metrics=lambda line: say(
-            f"step {int(line['step'])}/{recipe.steps}  loss {line['loss']:.4f}  lr {line['lr']:.2e}  "
-            f"{line['update_s'] + line['dataloading_s']:.3f} s/step"
-        ),
+        on_metrics=report,
+        on_checkpoint=evaluate,
     )
     loop_config = _loop_config(recipe, dataset, policy, config.run_seed, out, resume=resume_from is not None)
     with _tokenizer_from(recipe.tokenizer, recipe.type):
         run_loop(loop_config, hooks, resume_from=resume_from)
+
+
+def _held_out(
+    config: FinetuneConfig,
+    recipe: FinetuneRecipe,
+    task: str | None,
+    out: Path,
+    say: Callable[[str], None],
+    track: Log,
+) -> HeldOut | None:
+    if config.evaluation is None or task is None or not _is_first_process():
+        return None
+
+    def report(line: Mapping[str, float | str]) -> None:
+        append_metrics(out / METRICS_FILE, line)
+        track(line)
+        log_to_wandb(line)
+
+    return HeldOut(
+        settings=config.evaluation, task=task, out=out, last_step=recipe.steps, on_metrics=report, say=say
+    )
+
+
+def _is_first_process() -> bool:
+    return os.environ.get("RANK", "0") == "0"  # of several that accelerate has started
 
 
 def _loop_config(
@@ -195,8 +250,10 @@ def _open(
     out: Path, recipe: Recipe[FinetuneRecipe], dataset: TrainingDataset, config: FinetuneConfig, command: str
 ) -> Path | None:
     value = recipe.value
+    section = to_data(value)
+    del section["trackio_project"]  # may be changed while a run goes on
     settings: dict[str, Any] = {  # Any: plain data
-        "finetune": to_data(value),
+        "finetune": section,
         "dataset": {"name": dataset.name, "sha256": dataset.sha256},
         "run_seed": config.run_seed,
         "base_sha256": checkpoint_sha256(Path(value.base_checkpoint)) if value.base_checkpoint else None,
@@ -213,7 +270,7 @@ def _open(
 
 @contextlib.contextmanager
 def _lock(out: Path) -> Any:
-    if os.environ.get("RANK", "0") != "0":  # accelerate: the first process has it
+    if not _is_first_process():  # the first one has it
         yield
         return
     lock = FolderLock(out / LOCK_FILE)

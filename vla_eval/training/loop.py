@@ -9,7 +9,8 @@ a test notices if one is gone):
 - `make_train_eval_datasets`: optionally, frames are decoded once and not per sample.
 - `update_policy`: all noise of a step is drawn from (run seed, step, process), so that a run that was
   killed goes on exactly as it would have; metrics are written.
-- `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on.
+- `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on; it is
+  then shown to whoever evaluates it.
 """
 
 import contextlib
@@ -18,7 +19,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -64,6 +65,7 @@ class LoopHooks:
         decode_ahead, tokenizer: see `FinetuneRecipe`.
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
+        on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
     """
 
     facts: TrainingFacts
@@ -75,7 +77,8 @@ class LoopHooks:
     decode_ahead: bool
     tokenizer: str | None
     on_model: Callable[[Any], None]
-    on_metrics: Callable[[dict[str, float]], None]
+    on_metrics: Callable[[Mapping[str, float]], None]
+    on_checkpoint: Callable[[Path], None]
 
 
 def run_loop(config: Any, hooks: LoopHooks, *, resume_from: Path | None) -> None:
@@ -152,6 +155,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         _save_tokenizer(kwargs["preprocessor"], partial / MODEL_FOLDER / TOKENIZER_FOLDER)
         _sync(partial)
         os.replace(partial, checkpoint_dir)
+        hooks.on_checkpoint(checkpoint_dir)
 
     replaced = (
         make_policy,
@@ -173,14 +177,19 @@ def seed_step(run_seed: int, step: int, process: int) -> None:
 def _write_metrics(hooks: LoopHooks, step: int, tracker: Any) -> None:
     values = {name: value for name, value in tracker.to_dict().items() if name != "steps"}
     line = {"step": step, **{name: float(value) for name, value in values.items()}}
-    with hooks.metrics_file.open("a", encoding="utf-8") as file:
-        file.write(f"{json.dumps(line)}\n")
+    append_metrics(hooks.metrics_file, line)
     hooks.on_metrics(line)
     if not np.isfinite(line["loss"]):
         raise TrainingError(
             f"step {step}: the loss is {line['loss']}. Lower the learning rate, or look for fields of the "
             f"dataset that hardly vary (docs/finetuning.md)."
         )
+
+
+def append_metrics(file: Path, line: Mapping[str, float | str]) -> None:
+    """Write one line of metrics."""
+    with file.open("a", encoding="utf-8") as lines:
+        lines.write(f"{json.dumps(dict(line))}\n")
 
 
 def _tokenizer_of(folder: Path, named: str | None) -> str | None:

@@ -4,8 +4,9 @@ Standard library only: `mikasa-vla list` reads recipes without waiting for torch
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
+from vla_eval.envs.settings import Simulator
 from vla_eval.errors import RecipeError
 
 
@@ -43,7 +44,7 @@ class FinetuneRecipe:
         num_workers: processes that load samples, at most; no more than there are cores.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
         imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
-        wandb_project: log there, too.
+        wandb_project, trackio_project: log there, too.
     """
 
     type: str
@@ -60,6 +61,7 @@ class FinetuneRecipe:
     decode_ahead: bool = True
     imagenet_statistics: bool = False
     wandb_project: str | None = None
+    trackio_project: str | None = None
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
@@ -81,6 +83,36 @@ class FinetuneRecipe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutEvaluation:
+    """Evaluate checkpoints while the training goes on. Moves no weight.
+
+    Attributes:
+        every_steps: a multiple of `save_every_steps`; the last checkpoint is evaluated in any case.
+        episodes, seed_start: on which seeds; none of those that tables or demonstrations are made from.
+        task: task id; None: the dataset's.
+        n_action_steps: actions executed per inference; None: the policy's own number.
+        env: arguments of the task.
+        simulator, slots_per_worker, workers: see `EvalConfig`.
+    """
+
+    every_steps: int
+    episodes: int = 20
+    seed_start: int = 900_000  # far above what recordings reach
+    task: str | None = None
+    n_action_steps: int | None = None
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    simulator: Simulator = "maniskill"
+    slots_per_worker: int = 1
+    workers: int | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("every_steps", "episodes", "slots_per_worker"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"evaluation.{name} is {getattr(self, name)}, expected a number ≥ 1.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneConfig:
     """One fine-tuning, as `mikasa-vla finetune CONFIG` reads it.
 
@@ -91,6 +123,7 @@ class FinetuneConfig:
         run_seed: of initial weights, order of samples and noise.
         finetune: fields of the recipe's `finetune` section, set to other values.
         device: `auto`, `cpu`, `cuda`.
+        evaluation: evaluate checkpoints on held-out seeds meanwhile; None: do not.
         allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
     """
 
@@ -100,4 +133,5 @@ class FinetuneConfig:
     run_seed: int = 0
     finetune: dict[str, Any] = field(default_factory=dict)  # Any: decoded as a FinetuneRecipe
     device: str = "auto"
+    evaluation: HeldOutEvaluation | None = None
     allow_unreplayed: bool = False

@@ -3,6 +3,7 @@
     finetune.json   recipe, dataset's digest, run seed, environment
     metrics.jsonl   one line per logged step
     train/          lerobot's: checkpoints/000100/{pretrained_model,training_state}, checkpoints/last
+    evaluations/    run folders of evaluations on held-out seeds, if asked for
 
 Standard library only.
 """
@@ -10,7 +11,7 @@ Standard library only.
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from vla_eval.results.run_file import JsonValue, find_changes
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train"
-LAST = "last"
+CHECKPOINTS_FOLDER, LAST = "checkpoints", "last"
 STATE_FOLDER = "training_state"
 COMPARED = "settings"  # what results depend on; the rest is for the record
 
@@ -70,8 +71,8 @@ def open_folder(
 
 def newest_checkpoint(path: Path) -> Path | None:
     """Return the newest checkpoint, and remove what a killed run has left half written."""
-    folder = path / TRAIN_FOLDER / "checkpoints"
-    whole = sorted(entry for entry in folder.glob("[0-9]*") if (entry / STATE_FOLDER).is_dir())
+    folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
+    whole = whole_checkpoints(path)
     if not whole:
         # Nothing to go on from: lerobot wants to make its folder itself.
         shutil.rmtree(path / TRAIN_FOLDER, ignore_errors=True)
@@ -82,6 +83,20 @@ def newest_checkpoint(path: Path) -> Path | None:
     _point(folder / LAST, whole[-1].name)
     _cut_metrics(path / METRICS_FILE, int(whole[-1].name))
     return whole[-1]
+
+
+def whole_checkpoints(path: Path) -> list[Path]:
+    """Return the folders of the checkpoints that training can go on from, oldest first."""
+    folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
+    return sorted(entry for entry in folder.glob("[0-9]*") if (entry / STATE_FOLDER).is_dir())
+
+
+def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the lines of metrics of a run folder; none if there is no file."""
+    file = path / METRICS_FILE
+    if file.is_file():
+        for line in file.read_text(encoding="utf-8").splitlines():
+            yield json.loads(line)
 
 
 def _point(link: Path, target: str) -> None:

@@ -7,10 +7,12 @@ model is being made, and nothing on disk is changed. What such a model does says
 import contextlib
 import importlib
 from collections.abc import Iterator, Mapping
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal  # lerobot and transformers are untyped
 from unittest.mock import patch
 
+from vla_eval.episode_worker import SharedStage, worker_main
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 
@@ -130,3 +132,9 @@ def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any
     """Make a policy from a tiny checkpoint; an adapter for recipes in tests."""
     with tiny_paligemma(family):
         return make_lerobot(context, **args)
+
+
+def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+    """Be a worker of an evaluation in which π0 and π0.5 are tiny; see `worker_main`."""
+    with tiny_paligemma("pi0"), tiny_paligemma("pi05"):
+        worker_main(connection, shared, log, parent_pid)

@@ -1,0 +1,258 @@
+"""Our tasks as environments of LeRobot: the names its policies expect, an episode per seed.
+
+Knows nothing of policies. `lerobot-eval` renders every step and knows neither errors apart from
+failures nor seeds in its results: for figures, `mikasa-vla eval`.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any  # lerobot and gymnasium's vector environments are untyped here
+
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from numpy.typing import NDArray
+
+from vla_eval.core import SimEnv, StepResult
+from vla_eval.data.features import (
+    ACTION_KEY,
+    ACTION_NAMES,
+    CAMERA_KEYS,
+    FPS,
+    IMAGE_SHAPE,
+    STATE_KEY,
+    STATE_NAMES,
+    StateKind,
+    proprioception,
+)
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings, RenderSettings
+from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
+from vla_eval.prompts import instruction_for
+from vla_eval.tasks.catalog import task_spec
+
+SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments
+PIXELS, AGENT_POS = "pixels", "agent_pos"
+CAMERA_NAMES = {camera: key.rpartition(".")[2] for camera, key in CAMERA_KEYS.items()}
+"""Camera of the environment -> name under `pixels`; lerobot puts `observation.images.` before it."""
+SUITE = "mikasa"
+
+
+class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
+    """One task as a Gymnasium environment, under the names that lerobot reads.
+
+    Observation: `pixels` with `base` and `wrist`, (128, 128, 3) uint8 RGB; `agent_pos`, (10,) or (25,)
+    float32, as the recorder computes it. Action: (7,) float32 in [-1, 1] of `pd_ee_delta_pose`.
+    `is_success` is in each step's info. An episode ends at its first success, when it is lost, or at
+    the task's horizon. The simulator is built at the first reset: in the process that needs it.
+
+    Args:
+        settings: the environment; cameras are added.
+        state: which proprioception `agent_pos` is.
+        prompt_set: where the instruction comes from.
+        seed_offset: added to the seeds that LeRobot gives.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  gymnasium declares it so
+
+    def __init__(
+        self, settings: EnvSettings, *, state: StateKind, prompt_set: str, seed_offset: int = 0
+    ) -> None:
+        row = task_spec(settings.task)
+        self._settings = settings
+        self._state, self._seed_offset = state, seed_offset
+        self._env: SimEnv | None = None
+        self._result: StepResult | None = None
+        self.task = row.id
+        self.task_description = instruction_for(row, prompt_set)
+        self._max_episode_steps = int(settings.kwargs.get("horizon_steps", row.horizon_steps))
+        self.render_mode = "rgb_array"
+        picture = gym.spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
+        self.observation_space = gym.spaces.Dict(
+            {
+                PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), picture)),
+                AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES[state]),), np.float32),
+            }
+        )
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin the episode of a seed; without one, of the next that follows from the last one given.
+
+        Raises:
+            SpecMismatchError: no seed was ever given: nobody could run this episode again.
+        """
+        if seed is None and self._np_random is None:
+            raise SpecMismatchError(
+                f"{self.task}: reset without a seed. An episode is a function of its seed; give lerobot one "
+                "with --seed."
+            )
+        super().reset(seed=seed)
+        drawn = int(self.np_random.integers(2**31)) if seed is None else seed + self._seed_offset
+        if self._env is None:
+            self._env = make_env(self._settings)
+        self._result = self._env.reset({SLOT: drawn}, render=True)[SLOT]
+        return self._observation(self._result), {"is_success": False}
+
+    def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Execute one control step; what lies beyond [-1, 1] is clipped."""
+        if self._env is None:
+            raise gym.error.ResetNeeded(f"{self.task}: call reset() before step().")
+        actions = {SLOT: np.asarray(action, dtype=np.float32)}
+        self._result = result = self._env.step(actions, render=frozenset({SLOT}))[SLOT]
+        success = result.status.success
+        return (
+            self._observation(result),
+            float(result.reward),
+            success or result.status.fail,
+            result.observation.step >= self._max_episode_steps,
+            {"is_success": success},
+        )
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]  # gymnasium allows for lists
+        """Return the base camera's last picture, (128, 128, 3)."""
+        if self._result is None:
+            raise gym.error.ResetNeeded(f"{self.task}: call reset() before render().")
+        return self._result.observation.images[next(iter(CAMERA_NAMES))].copy()
+
+    def close(self) -> None:
+        """Release the simulator."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _observation(self, result: StepResult) -> dict[str, Any]:
+        seen = result.observation
+        return {
+            PIXELS: {name: seen.images[camera].copy() for camera, name in CAMERA_NAMES.items()},
+            AGENT_POS: proprioception(seen.state)[self._state].astype(np.float32),
+        }
+
+
+def _features(state: StateKind) -> dict[str, PolicyFeature]:
+    pictures = {f"{PIXELS}/{name}": IMAGE_SHAPE for name in CAMERA_NAMES.values()}
+    return {
+        ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
+        AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES[state]),)),
+        **{name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name, shape in pictures.items()},
+    }
+
+
+def _features_map() -> dict[str, str]:
+    pictures = {f"{PIXELS}/{CAMERA_NAMES[camera]}": key for camera, key in CAMERA_KEYS.items()}
+    return {ACTION_KEY: ACTION_KEY, AGENT_POS: STATE_KEY, **pictures}
+
+
+@EnvConfig.register_subclass("mikasa")
+@dataclass
+class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
+    """`--env.type=mikasa`; draccus reads it, hence no frozen dataclass.
+
+    Attributes:
+        task: task id, or several with commas between them.
+        state: which proprioception `observation.state` is: `eef` (10) or `joints` (25).
+        prompt_set: name in `prompts/`.
+        seed_offset: added to lerobot's seeds, which otherwise begin with its `--seed`.
+        env_kwargs: arguments of the task, `horizon_steps` among them.
+        simulator, sim_backend, wrist_mesh, render_backend: see `EvalConfig`.
+
+    Raises:
+        RecipeError: several tasks at once in threads, which would share one policy and its queue of actions.
+        UnknownNameError: there is no such task or kind of state.
+    """
+
+    task: str | None = "RememberColor3-v0"
+    fps: int = FPS
+    state: str = "eef"
+    prompt_set: str = "paper"
+    seed_offset: int = 0
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    simulator: str = "maniskill"
+    sim_backend: str = "cpu"
+    wrist_mesh: str = "shipped"
+    render_backend: str = "auto"
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=_features_map)
+
+    def __post_init__(self) -> None:
+        """Check what draccus cannot."""
+        if self.max_parallel_tasks != 1:
+            raise RecipeError(
+                f"env.max_parallel_tasks is {self.max_parallel_tasks}, expected 1: lerobot 0.6.1 would give "
+                "the tasks' threads one policy, whose queue of actions then serves the wrong task."
+            )
+        for task in self._tasks():
+            task_spec(task)
+        if not self.features:
+            self.features = _features(_state_kind(self.state))
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Nothing: `create_envs` does not go through Gymnasium's registry."""
+        return {}
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv[Any, Any, Any]]]:
+        """Return suite -> number of the task -> vector of `n_envs` environments.
+
+        A finished episode stays as it is until lerobot begins the next one. lerobot's default begins it
+        at once, so that its first reward, and its success, count for the episode before.
+        """
+        return {
+            SUITE: {
+                index: _vector(self._maker(task), n_envs, in_processes=use_async_envs and n_envs > 1)
+                for index, task in enumerate(self._tasks())
+            }
+        }
+
+    def _tasks(self) -> list[str]:
+        return [task.strip() for task in (self.task or "").split(",")]
+
+    def _maker(self, task: str) -> Callable[[], MikasaGym]:
+        settings = EnvSettings(
+            task=task_spec(task).id,
+            kwargs=dict(self.env_kwargs),
+            simulator=self.simulator,  # type: ignore[arg-type]  # draccus knows no Literal; `make_env` checks
+            sim_backend=self.sim_backend,  # type: ignore[arg-type]  # likewise
+            render=_render_settings(self.wrist_mesh, self.render_backend),
+            cameras=tuple(CAMERA_NAMES),
+        )
+        return functools.partial(
+            MikasaGym,
+            settings,
+            state=_state_kind(self.state),
+            prompt_set=self.prompt_set,
+            seed_offset=self.seed_offset,
+        )
+
+
+def _state_kind(name: str) -> StateKind:
+    for kind in STATE_NAMES:
+        if kind == name:
+            return kind
+    raise unknown_name("kind of state", name, STATE_NAMES, where="env.state")
+
+
+def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
+    known: Mapping[str, RenderSettings] = {
+        "shipped": RenderSettings(wrist_mesh="shipped", backend=backend),
+        "simplified": RenderSettings(wrist_mesh="simplified", backend=backend),
+    }
+    if wrist_mesh not in known:
+        raise unknown_name("mesh", wrist_mesh, known, where="env.wrist_mesh")
+    return known[wrist_mesh]
+
+
+def _vector(make: Callable[[], MikasaGym], n_envs: int, *, in_processes: bool) -> Any:
+    if in_processes:
+        one = make()  # has its spaces without a simulator
+        return _LazyAsyncVectorEnv([make] * n_envs, one.observation_space, one.action_space, one.metadata)
+    return gym.vector.SyncVectorEnv(
+        [freeze_after_episode_end(make)] * n_envs, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+    )

@@ -1,0 +1,161 @@
+"""Evaluate the checkpoints of a training while it goes on, on seeds that serve nothing else.
+
+An evaluation is an ordinary one, in worker processes: it draws from none of the training's generators.
+It runs while the training waits, since both want the same processor; a training that was killed during
+one finishes it first and then goes on.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
+from vla_eval.errors import RecipeError
+from vla_eval.evaluate import evaluate
+from vla_eval.policies.checkpoint import MODEL_FOLDER
+from vla_eval.recipes import EvalConfig, to_data
+from vla_eval.results.estimates import wilson_interval
+from vla_eval.results.store import read_run
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.training.dataset import TrainingDataset
+from vla_eval.training.recipe import FinetuneRecipe, HeldOutEvaluation
+from vla_eval.training.run_folder import whole_checkpoints
+
+EVALUATIONS_FOLDER = "evaluations"
+METRIC_KEY = "held_out"
+"""Of a line of metrics: which evaluation it is of."""
+ID_DIGITS = 8
+
+_DEFAULTS = EvalConfig(name="defaults", tasks=("any",), policies=("any",))
+REPORTED_SEEDS = range(_DEFAULTS.seed_start, _DEFAULTS.seed_start + _DEFAULTS.episodes)
+"""What tables are made from. A checkpoint that was chosen by them would be praised for its luck."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOut:
+    """The evaluations of one training.
+
+    Attributes:
+        settings: what is evaluated when.
+        task: the task's id.
+        out: run folder of the training.
+        last_step: its last step, whose checkpoint is evaluated in any case.
+        on_metrics: takes one line of metrics.
+        say: is given lines for a person.
+    """
+
+    settings: HeldOutEvaluation
+    task: str
+    out: Path
+    last_step: int
+    on_metrics: Callable[[Mapping[str, float | str]], None]
+    say: Callable[[str], None]
+
+    @property
+    def identity(self) -> str:
+        """What tells evaluations with other settings apart."""
+        settings = to_data(self.settings)
+        del settings["workers"]  # moves no result
+        text = json.dumps([settings, self.task], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+
+    def is_due(self, step: int) -> bool:
+        """Whether the checkpoint of this step is evaluated."""
+        return step % self.settings.every_steps == 0 or step == self.last_step
+
+    def catch_up(self, done: Iterable[Mapping[str, object]]) -> None:
+        """Evaluate the checkpoints that are there and have no result.
+
+        Args:
+            done: lines of metrics.
+        """
+        evaluated = {line["step"] for line in done if line.get(METRIC_KEY) == self.identity}
+        for checkpoint in whole_checkpoints(self.out):
+            if self.is_due(int(checkpoint.name)) and int(checkpoint.name) not in evaluated:
+                self.evaluate(checkpoint)
+
+    def evaluate(self, checkpoint: Path) -> None:
+        """Evaluate a checkpoint (`…/000100`) and report its figure; a part that is there is not done again.
+
+        Raises:
+            VlaEvalError: no episode could be run.
+        """
+        folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
+        # Versions may change within a training of some days; the run folder notes it.
+        evaluate(self._config(checkpoint), out=folder, allow_environment_change=True)
+        records = read_run(folder).records
+        results = [bool(record.success_once) for record in records if record.error is None]
+        n_success, n_episodes, n_errors = sum(results), len(results), len(records) - len(results)
+        step, interval = int(checkpoint.name), wilson_interval(n_success, n_episodes)
+        line: dict[str, float | str] = {
+            "step": step,
+            METRIC_KEY: self.identity,
+            "n_episodes": n_episodes,
+            "n_errors": n_errors,
+        }
+        rate = "no episode came to its end"
+        if interval is not None:
+            line.update(
+                success_once=n_success / n_episodes, success_low=interval.low, success_high=interval.high
+            )
+            rate = (
+                f"success {n_success}/{n_episodes} (95 % interval {interval.low:.2f} to {interval.high:.2f})"
+            )
+        errors = f", {n_errors} errors: {folder}" if n_errors else ""
+        self.say(f"step {step}/{self.last_step}  {self.task}, held-out seeds: {rate}{errors}")
+        self.on_metrics(line)
+
+    def _config(self, checkpoint: Path) -> EvalConfig:
+        settings = self.settings
+        return EvalConfig(
+            name="held-out",
+            tasks=(self.task,),
+            policies=(str(checkpoint.resolve() / MODEL_FOLDER),),
+            n_action_steps=None if settings.n_action_steps is None else (settings.n_action_steps,),
+            episodes=settings.episodes,
+            seed_start=settings.seed_start,
+            env=settings.env,
+            simulator=settings.simulator,
+            slots_per_worker=settings.slots_per_worker,
+            workers=settings.workers,
+        )
+
+
+def check_held_out(settings: HeldOutEvaluation, recipe: FinetuneRecipe, dataset: TrainingDataset) -> str:
+    """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
+
+    Raises:
+        RecipeError: the seeds serve something else, or steps, or the task, do not fit.
+        UnknownNameError: there is no such task.
+    """
+    if settings.every_steps % recipe.save_every_steps:
+        raise RecipeError(
+            f"evaluation.every_steps is {settings.every_steps}, expected a multiple of finetune."
+            f"save_every_steps ({recipe.save_every_steps}): what is evaluated is a checkpoint."
+        )
+    seeds = range(settings.seed_start, settings.seed_start + settings.episodes)
+    for used, what in ((REPORTED_SEEDS, "tables are made from"), (_seeds_of(dataset), "were recorded from")):
+        shared = sorted(set(seeds) & set(used))
+        if shared:
+            raise RecipeError(
+                f"evaluation.seed_start={settings.seed_start}, episodes={settings.episodes}: {len(shared)} "
+                f"of these seeds ({shared[0]} … {shared[-1]}) are seeds that {what}. Held-out seeds serve "
+                f"nothing else: choose another seed_start, or leave it out."
+            )
+    task = settings.task or dataset.task
+    if not task:
+        raise RecipeError(
+            f"evaluation.task: {dataset.name} names no task; say which one to evaluate on (`mikasa-vla list "
+            "tasks`)."
+        )
+    return task_spec(task).id
+
+
+def _seeds_of(dataset: TrainingDataset) -> set[int]:
+    """Return the seeds that demonstrations were tried at; none for an import, whose seeds are not ours."""
+    if not (dataset.root / MANIFEST_FILE).is_file():
+        return set()
+    kept = {episode.seed for episode in read_manifest(dataset.root)}
+    return kept | {failed.seed for failed in read_failed(dataset.root)}
