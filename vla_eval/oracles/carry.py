@@ -28,9 +28,10 @@ AT_GRASP_M = 0.008
 CUBE_WIDTH_M = 0.04
 HELD_WIDTH_M = 0.043
 ON_DISC_M = 0.07  # within 8 cm counts
-REACH_X_M = 0.18  # so far out the tool centre point may be sent at the height of the cube
-ACTION_M = 0.1  # what an action of 1 adds to the target of the controller
-CREEP = 0.15
+# The arm freezes where the inverse kinematics finds no pose for the target, up to 10 cm ahead: near the
+# edge of its reach. An arm that stands still is asked for less and less, until it moves again.
+STALLED_M_S = 0.03
+CAUTION = 0.6
 AIM_M = 0.055  # so near to the disc's middle the cube is brought
 BACK_M = 0.02
 IMAGINED_X_M = (-0.05, 0.05)
@@ -48,6 +49,7 @@ class _Play:
     home_m: Vector
     was_there: bool
     closing: bool
+    caution: float
 
     @property
     def held(self) -> bool:
@@ -63,6 +65,7 @@ class CarryExpert:
         self._imagined_home_m = imagined_home_m
         self._was_there = False
         self._closing = False
+        self._caution = 1.0
 
     def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7), planned from this state and from what happened before."""
@@ -74,7 +77,11 @@ class CarryExpert:
             home_m=home_m if self._imagined_home_m is None else self._imagined_home_m,
             was_there=self._was_there,
             closing=self._closing,
+            caution=self._caution,
         )
+        stalled = play.held and float(np.linalg.norm(state.tcp_velocity_m_s)) < STALLED_M_S
+        self._caution = self._caution * CAUTION if stalled else 1.0
+        play = replace(play, caution=self._caution)
         # Only what was seen counts: a model that believes the cube is there would turn round too early.
         self._was_there |= float(np.linalg.norm(play.cube_m - play.goal_m)) < ON_DISC_M
         play = replace(play, was_there=self._was_there)
@@ -115,13 +122,7 @@ def _command(play: _Play) -> tuple[Vector, float]:
     elif not play.was_there:
         shift *= max(distance - AIM_M, 0.0) / max(distance, 1e-6)
     translation = towards(np.array([*(arm.position_m[:2] + shift), CARRY_M]), arm)
-    translation[0] = min(translation[0], _farthest(float(arm.position_m[0])))
-    return translation, GRIPPER_CLOSED
-
-
-def _farthest(x_m: float) -> float:
-    """Return the most that an action may ask for in x: the arm freezes if its target is out of reach."""
-    return max((REACH_X_M - x_m) / ACTION_M, CREEP)
+    return play.caution * translation, GRIPPER_CLOSED
 
 
 def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
