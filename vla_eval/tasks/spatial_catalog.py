@@ -9,7 +9,7 @@ from typing import Any
 from vla_eval.tasks.spec import TaskSpec
 
 BALL_SPEEDS_M_S = {"Slow": (0.25, 0.5), "Medium": (0.5, 0.75), "Fast": (0.75, 1.0)}
-IDLE_SUCCESS = {"Slow": 0.16}  # measured: a slow ball can roll over the disc by itself
+IDLE_SUCCESS = {"Slow": 0.12}  # of 100 episodes: a slow ball can roll over the disc by itself
 POSITIVE_RAD, EITHER_SIGN_RAD = (0.1, math.pi / 2), (0.1, math.pi / 4)
 
 
