@@ -105,6 +105,13 @@ def test_a_policy_that_reads_every_frame_sees_the_whole_cue() -> None:
     assert str(row(sweep, "p", 8).cue) == "5"
 
 
+def test_a_cue_shown_in_turn_lasts_for_all_that_is_shown() -> None:
+    groups = [episodes("p", k, "+-", task="SeqOfColors7-v0") for k in (4, 16)]
+    assert str(row(compare_runs([stored(*groups)]), "p", 16).cue) == "3"  # steps 0, 16, 32 of 0 … 34
+    sweep = compare_runs([stored(*groups, env={"cue_steps": 1, "gap_steps": 2})])
+    assert str(row(sweep, "p", 4).cue) == "5"  # steps 0, 4, … 16 of 0 … 18: 7 cubes and 6 gaps
+
+
 def test_a_cue_of_drawn_length_gives_a_range_and_no_cue_gives_none() -> None:
     env = {"cue_steps": [3, 9]}
     sweep = compare_runs([stored(episodes("p", 4, "+-"), episodes("p", 1, "+-"), env=env)])
