@@ -20,7 +20,7 @@ from vla_eval.core import (
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import SpecMismatchError
-from vla_eval.policies import scripted
+from vla_eval.policies import scripted, shortcuts
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.results.records import EpisodeRecord
@@ -33,6 +33,7 @@ FACTORIES = {
     "oracle": scripted.make_oracle,
     "cue_blind": scripted.make_cue_blind,
     "tour": scripted.make_tour,
+    "body_memory": shortcuts.make_body_memory,
 }
 SAMPLE = (
     "RememberColor9-v0",
@@ -105,8 +106,9 @@ def run(
     *,
     n_action_steps: int = 1,
     log: ActionLog | None = None,
+    env: SimEnv | None = None,
 ) -> list[EpisodeRecord]:
-    env: SimEnv = privileged_env(task)
+    env = privileged_env(task) if env is None else env
     policy = make_policy(policy_name, env, n_action_steps)
     settings = RolloutSettings(chunking=ChunkingSpec(n_action_steps=n_action_steps))
     records = []
@@ -231,6 +233,23 @@ def test_neither_luck_nor_search_finds_several_cubes(policy: str) -> None:
     assert {record.target for record in records} == {None}
     touched_all = [record.n_wrong_choices == 6 for record in records]
     assert all(touched_all) if policy == "tour" else not any(touched_all)
+
+
+def test_the_gripper_can_remember_the_colour_and_a_frozen_one_cannot() -> None:
+    free = run("RememberColor3-v0", "body_memory", range(1, 9))
+    assert n_successes(free) == 8
+    kwargs = {"freeze_until_choice": True}
+    env = make_env(EnvSettings(task="RememberColor3-v0", privileged=True, kwargs=kwargs))
+    frozen = run("RememberColor3-v0", "body_memory", range(1, 9), env=env)
+    # Its gripper says nothing any more: the same candidate every time, whatever was shown.
+    assert len({record.first_choice for record in frozen}) == 1
+    assert len({record.target for record in frozen}) == 3
+
+
+@pytest.mark.parametrize("task", ["InterceptMedium-v0", "BunchOfColors3-v0"])
+def test_a_body_that_has_nothing_to_choose_among_is_refused(task: str) -> None:
+    with pytest.raises(SpecMismatchError, match="no such choice"):
+        make_policy("body_memory", privileged_env(task), 1)
 
 
 def test_a_tour_of_a_task_without_candidates_is_refused() -> None:

@@ -83,7 +83,7 @@ class RecordingRunner:
 
     def answer(self, job: RecordingJob) -> RecordingAnswer | Failed:
         """Do the job; whatever goes wrong becomes a `Failed`."""
-        self._heartbeat.begin_episode()
+        self._heartbeat.begin_batch()
         self._heartbeat("setup")
         try:
             if isinstance(job, AttemptJob):

@@ -37,7 +37,7 @@ class ReplayRunner:
 
     def answer(self, job: ReplayJob) -> EpisodeReplayed | Failed:
         """Replay the episode; whatever goes wrong becomes a `Failed`."""
-        self._heartbeat.begin_episode()
+        self._heartbeat.begin_batch()
         self._heartbeat("setup")
         try:
             return self._replay(job)

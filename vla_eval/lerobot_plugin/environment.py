@@ -114,7 +114,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
             {"is_success": success},
         )
 
-    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]  # gymnasium allows for lists
+    def render(self) -> NDArray[np.uint8]:
         """Return the base camera's last picture, (128, 128, 3)."""
         if self._result is None:
             raise gym.error.ResetNeeded(f"{self.task}: call reset() before render().")

@@ -103,7 +103,8 @@ def _decide(play: _Play) -> _Play:
 
 
 def _grasp_place_m(play: _Play) -> Vector:
-    return play.cube_m - np.array([BEHIND_M, 0.0])
+    place_m: Vector = play.cube_m - np.array([BEHIND_M, 0.0])
+    return place_m
 
 
 def _command(play: _Play) -> tuple[Vector, float]:

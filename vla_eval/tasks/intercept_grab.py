@@ -83,7 +83,8 @@ class InterceptGrabEnv(RollingBallEnv):
         offset = self._tcp_to_ball_m().abs()
         inside = (offset[:, :2] <= GRIP_HALF_PLANE_M).all(dim=1) & (offset[:, 2] <= GRIP_HALF_HEIGHT_M)
         near = torch.linalg.norm(offset, dim=1) <= GRIP_RADIUS_M
-        return inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
+        held: torch.Tensor = inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
+        return held
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """Get to the ball, have it between the fingers, close them, hold it."""

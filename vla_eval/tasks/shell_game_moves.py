@@ -57,7 +57,8 @@ class ShellGameMoveEnv(ShellGameEnv):
 
     def is_placed(self) -> torch.Tensor:
         """Return (B,) bool: the right mug is within the threshold of its goal."""
-        return torch.linalg.norm(self._target_to_goal_m(), dim=1) <= self.goal_threshold_m
+        placed: torch.Tensor = torch.linalg.norm(self._target_to_goal_m(), dim=1) <= self.goal_threshold_m
+        return placed
 
     def _chosen_m(self) -> float:
         """Return by how much a mug must have been moved to count as chosen."""

@@ -1,0 +1,67 @@
+"""Controls that succeed without a memory of their own: they show by which road a task can be won.
+
+- `body_memory`: while the cue is there, it closes the gripper to a width that stands for the right
+  candidate; afterwards it reads the width back from its proprioception, and holds it. It keeps nothing
+  from step to step: what it does at a step follows from that step's observation alone. So any policy
+  that reads the last frame could do the same, and a task that it wins does not need a memory as long as
+  arm and gripper may move before the choice (`freeze_until_choice` forbids it).
+"""
+
+import importlib
+from typing import cast
+
+import numpy as np
+
+from vla_eval.core import ActionChunk, ObservationWindow
+from vla_eval.errors import SpecMismatchError
+from vla_eval.policies.choices import CandidateExpert
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
+from vla_eval.tasks.catalog import task_spec
+
+WIDEST_M = 0.08  # the Panda's gripper, fully open, as it is when an episode begins
+
+
+class BodyMemoryPolicy(ScriptedPolicy):
+    """Keeps the cue in the width of its gripper; see the module's text."""
+
+    privileged = True
+
+    def __init__(self, context: PolicyContext, expert: CandidateExpert) -> None:
+        """Take the expert of the task's family."""
+        super().__init__(context)
+        self._expert = expert
+        self._widths_m = WIDEST_M * (1 - np.arange(context.n_candidates) / context.n_candidates)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Write the cue into the gripper, hold it, or read it and go."""
+        state = self.privileged_state(window)
+        if state.phase == "cue":
+            candidate = state.target
+            if candidate is None:
+                raise SpecMismatchError(
+                    f"policy '{self.spec.name}' keeps one candidate in its gripper; {self._context.env.task} "
+                    f"has several right ones. Leave this task out for this policy."
+                )
+        else:
+            candidate = int(np.abs(self._widths_m - state.gripper_width_m).argmin())
+        rows = hold_rows(float(self._widths_m[candidate]), self._n_actions, self._n_dims)
+        if state.phase == "response":
+            rows[:, :-1] = self._expert.plan(state, candidate, self._n_actions)[:, :-1]
+        return ActionChunk(actions=rows)
+
+
+def make_body_memory(context: PolicyContext) -> BodyMemoryPolicy:
+    """Make the `body_memory` control.
+
+    Raises:
+        SpecMismatchError: the task has no candidates, or several have to be touched.
+    """
+    module, _, name = task_spec(context.env.task).oracle.partition(":")
+    expert = getattr(importlib.import_module(module), name)
+    if context.n_candidates == 0 or hasattr(expert, "plan_visits"):
+        raise SpecMismatchError(
+            f"policy '{context.name}' keeps in its gripper which one of several candidates is right; "
+            f"{context.env.task} has no such choice. Leave this task out for this policy."
+        )
+    return BodyMemoryPolicy(context, cast(CandidateExpert, expert))
