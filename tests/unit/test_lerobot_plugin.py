@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -66,6 +67,7 @@ class TestDiscovery:
 
         load_plugin("vla_eval.lerobot_plugin")
         assert EnvConfig.get_choice_class("mikasa") is MikasaEnvConfig
+        assert "mikasa_memory" in PreTrainedConfig.get_known_choices()
 
 
 class TestNames:
