@@ -96,9 +96,7 @@ def test_a_run_of_a_family_records_task_arguments_and_chance(
     assert code == 0
     assert run.description.config["env"] == {"n_items": 4, "delay_steps": 100}
     # 5 + 100 + 50 steps: see above.
-    assert [(r.task, r.n_steps, r.chance_success) for r in run.records.values()] == [
-        ("RememberColor", 155, 0.25)
-    ] * 2
+    assert [(r.task, r.n_steps, r.chance_success) for r in run.records] == [("RememberColor", 155, 0.25)] * 2
     assert "RememberColor" in capsys.readouterr().out
 
 
