@@ -1,5 +1,8 @@
 # The verbs a person types. Paths are relative, so that the folder may have spaces in its name.
 .DEFAULT_GOAL := help
+# Where it is set, each of the many processes of the tests would compile torch's sources again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help setup demo test test-all lint bench clean
 
 BIN := .venv/bin
