@@ -5,7 +5,6 @@ answer a failed load with random weights. Here every parameter is compared with 
 Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
 """
 
-import importlib
 import os
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
@@ -24,6 +23,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from torch import Tensor
 
+import vla_eval.policies.memory.configuration_memory  # noqa: F401  importing it registers
 from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
@@ -48,8 +48,6 @@ NEEDED_STATISTICS = {
 TOKENIZER_STEP = "tokenizer_processor"
 PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
 """Where a processor step that is named by its import path may come from; others are never imported."""
-OWN_CONFIGURATIONS = ("vla_eval.policies.memory.configuration_memory",)
-"""Modules that register policies of ours with lerobot."""
 # Fields that make a constructor fetch weights which the checkpoint is about to replace.
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
 
@@ -131,8 +129,6 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
 def config_class(kind: str, *, where: str) -> Any:
     """Return lerobot's configuration class of a type of policy; plugins (`lerobot_policy_*`) included."""
     register_third_party_plugins()
-    for module in OWN_CONFIGURATIONS:
-        importlib.import_module(module)
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
         error = unknown_name("LeRobot policy type", kind, known, where=where)

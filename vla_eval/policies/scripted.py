@@ -11,7 +11,6 @@ The last three see the true state of the world, but not the answer before the ch
 plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
 """
 
-import importlib
 from collections.abc import Sequence
 from typing import Protocol, cast
 
@@ -22,8 +21,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, Privileg
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.choices import CandidateExpert, ChoicePolicy, Mode, VisitExpert, VisitPolicy
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 
 
 class BallExpert(Protocol):
@@ -126,8 +124,7 @@ def make_tour(context: PolicyContext) -> ExpertPolicy:
 
 
 def _make_expert_policy(context: PolicyContext, mode: Mode) -> ExpertPolicy:
-    module, _, name = task_spec(context.env.task).oracle.partition(":")
-    expert = getattr(importlib.import_module(module), name)
+    expert = task_expert(context)
     if hasattr(expert, "plan_visits"):
         return VisitPolicy(context, cast(VisitExpert, expert), mode)
     if context.n_candidates > 0:

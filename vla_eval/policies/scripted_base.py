@@ -1,19 +1,20 @@
 """What scripted controls share: their spec, their random generators, and how to hold still."""
 
+import importlib
 import zlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.core import EpisodeStart, ObservationWindow, PrivilegedState
 from vla_eval.errors import SpecMismatchError
+from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.policies.context import PolicyContext
 from vla_eval.specs import PolicySpec
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.streams import Stream, generator
-
-# ManiSkill's Panda: the gripper command in [-1, 1] is mapped to finger positions in this range.
-FINGER_LOW_M, FINGER_HIGH_M = -0.01, 0.04
 
 
 def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArray[np.float32]:
@@ -23,6 +24,12 @@ def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArra
     command = (finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1
     rows[:, -1] = np.clip(command, -1, 1)
     return rows
+
+
+def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts have a protocol of their own
+    """Return the scripted expert that the catalogue names for the task of the context."""
+    module, _, name = task_spec(context.env.task).oracle.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 class ScriptedPolicy:

@@ -7,19 +7,16 @@
   arm and gripper may move before the choice (`freeze_until_choice` forbids it).
 """
 
-import importlib
 from typing import cast
 
 import numpy as np
 
 from vla_eval.core import ActionChunk, ObservationWindow
 from vla_eval.errors import SpecMismatchError
+from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.policies.choices import CandidateExpert
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
-from vla_eval.tasks.catalog import task_spec
-
-WIDEST_M = 0.08  # the Panda's gripper, fully open, as it is when an episode begins
+from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 
 
 class BodyMemoryPolicy(ScriptedPolicy):
@@ -31,7 +28,8 @@ class BodyMemoryPolicy(ScriptedPolicy):
         """Take the expert of the task's family."""
         super().__init__(context)
         self._expert = expert
-        self._widths_m = WIDEST_M * (1 - np.arange(context.n_candidates) / context.n_candidates)
+        # The first candidate is the open gripper, as it is when an episode begins.
+        self._widths_m = GRIPPER_MAX_WIDTH_M * (1 - np.arange(context.n_candidates) / context.n_candidates)
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Write the cue into the gripper, hold it, or read it and go."""
@@ -57,8 +55,7 @@ def make_body_memory(context: PolicyContext) -> BodyMemoryPolicy:
     Raises:
         SpecMismatchError: the task has no candidates, or several have to be touched.
     """
-    module, _, name = task_spec(context.env.task).oracle.partition(":")
-    expert = getattr(importlib.import_module(module), name)
+    expert = task_expert(context)
     if context.n_candidates == 0 or hasattr(expert, "plan_visits"):
         raise SpecMismatchError(
             f"policy '{context.name}' keeps in its gripper which one of several candidates is right; "

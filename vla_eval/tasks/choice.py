@@ -62,7 +62,7 @@ class ChoiceEnv(MemoryTableEnv):
 
     def final_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""
-        revealed = (self._elapsed_steps >= self._response_step)[:, None, None]
+        revealed = self.response_begun()[:, None, None]
         positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
         return positions
 

@@ -296,12 +296,16 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         speed: torch.Tensor = torch.linalg.norm(self.agent.robot.get_qvel()[:, :N_ARM_JOINTS], dim=1)
         return speed
 
+    def response_begun(self) -> torch.Tensor:
+        """Return (B,) bool: the response phase has begun."""
+        begun: torch.Tensor = self._elapsed_steps >= self._response_step
+        return begun
+
     def gated(self, success: torch.Tensor) -> torch.Tensor:
         """Return success where it may count: in the response phase, or always if the gate is open."""
         if not self.phase_gate_success:
             return success
-        begun: torch.Tensor = self._elapsed_steps >= self._response_step
-        return success & begun
+        return success & self.response_begun()
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return name -> body of what an expert may see besides candidates."""

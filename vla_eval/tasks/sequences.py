@@ -234,7 +234,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """Reach the next cube, slow down, find cubes, make no mistake; nothing before the response phase."""
-        begun = self._elapsed_steps >= self._response_step
+        begun = self.response_begun()
         return {
             "reaching": nearness(self.REACH_SCALE_PER_M, self.target_distance_m()) * begun,
             "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * begun,

@@ -115,11 +115,6 @@ class ShellGameEnv(ChoiceEnv):
         self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
         return bool((choice_begins | hidden | covered).any())
 
-    def _begun(self) -> torch.Tensor:
-        """Return (B,) bool: the mugs stand there."""
-        begun: torch.Tensor = self._elapsed_steps >= self._response_step
-        return begun
-
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         poses = torch.stack([actor.pose.raw_pose for actor in self.candidates], dim=1)
         return {
@@ -151,4 +146,4 @@ class ShellGameTouchEnv(ShellGameEnv):
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
-        return {name: term * self._begun() for name, term in super().reward_terms(info).items()}
+        return {name: term * self.response_begun() for name, term in super().reward_terms(info).items()}

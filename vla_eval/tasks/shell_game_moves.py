@@ -135,7 +135,7 @@ class ShellGamePushEnv(ShellGameMoveEnv):
         to_goal_m = torch.linalg.norm(self._target_to_goal_m(), dim=1)
         terms = super().reward_terms(info)
         terms["pushing"] = 2 * nearness(5.0, to_goal_m) * (reach_m <= PUSH_REACH_M)
-        return {name: term * self._begun() for name, term in terms.items()}
+        return {name: term * self.response_begun() for name, term in terms.items()}
 
 
 class ShellGamePickEnv(ShellGameMoveEnv):
@@ -192,7 +192,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         if self.goal_is_a_point:
             return super().is_placed()
         risen_m = self._of_target(self.candidate_positions_m() - self._slots)[:, 2]
-        return self._begun() & (risen_m >= self.lift_height_m)
+        return self.response_begun() & (risen_m >= self.lift_height_m)
 
     def _chosen_m(self) -> float:
         needed_m = self.lift_height_m - (self.goal_threshold_m if self.goal_is_a_point else 0.0)
@@ -221,7 +221,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
             "slowing": 5 * nearness(5.0, self.arm_speed()) * (placed & near),
             "resting": 5.0 * (info["is_robot_static"] & placed & near),
         }
-        return {name: term * self._begun() for name, term in terms.items()}
+        return {name: term * self.response_begun() for name, term in terms.items()}
 
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         return {**super()._privileged_extra(), "is_grasped": self._is_grasped()[:, None]}

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
+from vla_eval.data.recipe import EVALUATION_SEEDS
 from vla_eval.errors import RecipeError
 from vla_eval.evaluate import evaluate
 from vla_eval.policies.checkpoint import MODEL_FOLDER
@@ -27,10 +28,6 @@ EVALUATIONS_FOLDER = "evaluations"
 METRIC_KEY = "held_out"
 """Of a line of metrics: which evaluation it is of."""
 ID_DIGITS = 8
-
-_DEFAULTS = EvalConfig(name="defaults", tasks=("any",), policies=("any",))
-REPORTED_SEEDS = range(_DEFAULTS.seed_start, _DEFAULTS.seed_start + _DEFAULTS.episodes)
-"""What tables are made from. A checkpoint that was chosen by them would be praised for its luck."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +133,11 @@ def check_held_out(settings: HeldOutEvaluation, recipe: FinetuneRecipe, dataset:
             f"save_every_steps ({recipe.save_every_steps}): what is evaluated is a checkpoint."
         )
     seeds = range(settings.seed_start, settings.seed_start + settings.episodes)
-    for used, what in ((REPORTED_SEEDS, "tables are made from"), (_seeds_of(dataset), "were recorded from")):
+    # A checkpoint that was chosen by the seeds of the tables would be praised for its luck.
+    for used, what in (
+        (EVALUATION_SEEDS, "tables are made from"),
+        (_seeds_of(dataset), "were recorded from"),
+    ):
         shared = sorted(set(seeds) & set(used))
         if shared:
             raise RecipeError(

@@ -87,7 +87,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         shape = state.shape[:2]
         sight = self.network.see(pictures.flatten(0, 1), state.flatten(0, 1))
         before = self.network.begin(shape[0]) if memory is None else memory
-        after = self.network.write(by_episode(sight.things, shape), by_episode(sight.summary, shape), before)
+        after = self.network.write(sight, shape, before)
         return Memory(after.things[:, -1], after.rest[:, -1])
 
     @torch.no_grad()
@@ -104,9 +104,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         pictures, state = self._pictures(batch), batch[STATE_KEY]
         sight = self.network.see(pictures, state)
         if memory is None:
-            after = self.network.write(
-                sight.things[:, None], sight.summary[:, None], self.network.begin(len(state))
-            )
+            after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
             memory = Memory(after.things[:, 0], after.rest[:, 0])
         return self.network.act(sight, memory, state)[0].clamp(-1, 1)
 

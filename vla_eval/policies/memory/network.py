@@ -245,8 +245,15 @@ class MemoryNetwork(nn.Module):
         known = torch.cat([things.flatten(1), *strongest, state * STATE_SCALE], dim=-1)
         return Sight(places, keys, things, self.summary(known))
 
-    def write(self, things: Tensor, summaries: Tensor, memory: Memory) -> Memory:
-        """Return the memories (B, T, …) after each of the steps (B, T, …)."""
+    def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
+        """Return the memories (B, T, …) after each step of what was seen at B · T steps.
+
+        Args:
+            sight: of all steps, episode by episode.
+            shape: (B, T).
+            memory: before the first of these steps.
+        """
+        things, summaries = by_episode(sight.things, shape), by_episode(sight.summary, shape)
         gates, candidates = self.gates(summaries).sigmoid(), self.candidate(summaries)
         n_things = things.shape[2]
         memories = []
@@ -288,9 +295,7 @@ class MemoryNetwork(nn.Module):
         shape, sizes = state.shape[:2], self.sizes
         flat_state = state.flatten(0, 1)
         sight = self.see(pictures.flatten(0, 1), flat_state)
-        memories = self.write(
-            by_episode(sight.things, shape), by_episode(sight.summary, shape), self.begin(shape[0])
-        )
+        memories = self.write(sight, shape, self.begin(shape[0]))
         flat = Memory(memories.things.flatten(0, 1), memories.rest.flatten(0, 1))
         actions, goal = self.act(sight, flat, flat_state)
         thumbnails = self.recalls(torch.cat([flat.things.flatten(1), flat.rest], dim=-1))

@@ -1,0 +1,28 @@
+"""Which tasks the tests of all tasks run on."""
+
+import pytest
+
+from vla_eval.tasks.catalog import TASKS
+
+SAMPLE = (
+    "RememberColor9-v0",
+    "RememberShapeAndColor3x2-v0",
+    "BunchOfColors3-v0",
+    "ChainOfColors3-v0",
+    "ShellGameTouch-v0",
+    "ShellGamePick-v0",
+    "InterceptMedium-v0",
+    "InterceptGrabMedium-v0",
+    "RotateStrictPosNeg-v0",
+    "TakeItBack-v0",
+)
+SAMPLED_TASKS = [
+    pytest.param(task, marks=() if task in SAMPLE else pytest.mark.slow) for task in sorted(TASKS)
+]
+"""Each family in every run, the rest of the catalogue under the marker `slow`."""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that takes `sampled_task` on every task of the catalogue."""
+    if "sampled_task" in metafunc.fixturenames:
+        metafunc.parametrize("sampled_task", SAMPLED_TASKS)
