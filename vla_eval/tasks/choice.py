@@ -6,6 +6,7 @@ candidates are and how the cue is shown is the family's affair.
 
 from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.utils.structs import Actor, Pose
 
@@ -58,7 +59,11 @@ class ChoiceEnv(MemoryTableEnv):
 
     def candidate_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
-        return torch.stack([actor.pose.p for actor in self.candidates], dim=1)
+        if self.gpu_sim_enabled:
+            return torch.stack([actor.pose.p for actor in self.candidates], dim=1)
+        # The same numbers without two tensors for each candidate: this is asked for several times a step.
+        positions = [[body.pose.p for body in actor._objs] for actor in self.candidates]
+        return torch.as_tensor(np.array(positions, dtype=np.float32).swapaxes(0, 1))
 
     def final_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""

@@ -16,6 +16,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.common import flatten_state_dict
@@ -127,6 +128,14 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     def _default_human_render_camera_configs(self) -> CameraConfig:
         pose = sapien_utils.look_at(list(self.HUMAN_CAMERA_EYE), list(self.HUMAN_CAMERA_TARGET))
         return CameraConfig("render_camera", pose, 512, 512, 1.0, 0.01, 100)
+
+    def _reconfigure(self, options: dict[str, Any]) -> None:
+        # Shapes have materials even where nothing is rendered, and SAPIEN starts its renderer for a material
+        # and stops it with the last one: without this one, once for every shape. It must not stay, because
+        # there is one renderer in a process, and whoever renders chooses its device.
+        kept = None if can_render(self._render_device) else sapien.render.RenderMaterial()
+        super()._reconfigure(options)
+        del kept
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(p=[ROBOT_BASE_X_M, 0, 0]))
