@@ -6,6 +6,9 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help setup demo test test-all lint bench clean
 
 BIN := .venv/bin
+# Each takes some 2 GB and 10 s to begin.
+TEST_PROCESSES ?= 2
+PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 help:  ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -17,10 +20,10 @@ demo: setup  ## evaluate scripted policies on one task and print the table
 	$(BIN)/mikasa-vla eval configs/demo.yaml
 
 test: setup  ## run the tests that need neither GPU, network nor much time
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-all: setup  ## run every test this machine can run
-	$(BIN)/python -m pytest -m "not network and not parity"
+	$(PYTEST) -m "not network and not parity"
 
 lint: setup  ## ruff and mypy --strict
 	$(BIN)/python -m ruff check .
