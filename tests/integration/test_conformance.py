@@ -20,8 +20,9 @@ from vla_eval.testing import check_env, check_policy, check_task
 FAKE = EnvSettings(task="RememberColor3-v0", simulator="fake", cameras=("base_camera", "hand_camera"))
 
 
-def test_our_tasks_pass(sampled_task: str) -> None:
-    check_task(sampled_task, n_episodes=5)
+@pytest.mark.parametrize("n_episodes", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_our_tasks_pass(sampled_task: str, n_episodes: int) -> None:
+    check_task(sampled_task, n_episodes=n_episodes)
 
 
 def test_the_fake_environment_passes() -> None:

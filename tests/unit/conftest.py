@@ -1,6 +1,7 @@
 """Fixtures of several test files."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -79,3 +80,14 @@ def recorded(_recorded: Path, tmp_path: Path) -> Path:
     copy = tmp_path / "recorded" / _recorded.name
     shutil.copytree(_recorded, copy)
     return copy
+
+
+@pytest.fixture
+def small_act(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """ACT with a small network for its eyes, here and in workers: most of a training's time went there."""
+    from vla_eval import evaluate
+    from vla_eval.training.tiny_models import tiny_resnet, tiny_worker_main
+
+    monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
+    with tiny_resnet():
+        yield

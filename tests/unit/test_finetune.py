@@ -39,6 +39,8 @@ from vla_eval.training.tiny_models import (
     write_tiny_tokenizer,
 )
 
+pytestmark = pytest.mark.usefixtures("small_act")
+
 TASK = "RememberColor3-v0"
 TINY_ACT = {
     "chunk_size": 4,

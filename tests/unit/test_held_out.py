@@ -25,6 +25,8 @@ from vla_eval.training.finetune import finetune
 from vla_eval.training.held_out import check_held_out
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation
 
+pytestmark = pytest.mark.usefixtures("small_act")
+
 TASK = "RememberColor3-v0"
 TINY_ACT = {
     **{"chunk_size": 4, "n_action_steps": 4, "dim_model": 32, "n_heads": 2, "dim_feedforward": 32},

@@ -62,6 +62,7 @@ class Bandit:
         return LockstepResult(states, rewards, rewards > -0.05, nothing)
 
 
+@pytest.mark.slow
 def test_it_learns() -> None:
     learner = _Learner(dataclasses.replace(SETTINGS, n_envs=32, n_epochs=8), n_state=3)
     rewards = []
@@ -290,11 +291,11 @@ def test_the_command_line_trains_and_the_policy_can_be_evaluated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "expert"
-    arguments = ["train-expert", "--task", TASK, "--steps", "100", "--out", str(out)]
+    arguments = ["train-expert", "--task", TASK, "--steps", "60", "--out", str(out)]
     assert main([*arguments, "--simulator", "fake", "--envs", "2"]) == 0
     shown = capsys.readouterr()
-    # Two environments of 60 steps are 120 ≥ 100.
-    assert "120 steps" in shown.out and "120/100 steps after" in shown.err
+    # Two environments of 60 steps are 120 ≥ 60.
+    assert "120 steps" in shown.out and "120/60 steps after" in shown.err
 
     policy = str(out / "ppo_expert.yaml")
     code = main(

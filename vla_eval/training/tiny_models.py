@@ -1,6 +1,6 @@
-"""π0, π0.5 and SmolVLA with few random weights, for tests: the whole way without network or GPU.
+"""π0, π0.5, SmolVLA and ACT with few random weights, for tests: the whole way without network or GPU.
 
-lerobot 0.6.1 builds these models in full size only, so three names of its modules are replaced while a
+lerobot 0.6.1 builds these models in full size only, so some names of its modules are replaced while a
 model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
 """
 
@@ -64,6 +64,20 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
         patch.object(modeling, "PaliGemmaForConditionalGenerationWithPiGemma", make_vlm),
         patch.object(modeling, "PiGemmaForCausalLM", make_expert),
     ):
+        yield
+
+
+@contextlib.contextmanager
+def tiny_resnet() -> Iterator[None]:
+    """Make lerobot's ACT take one convolution instead of ResNet-18 (11 M parameters) within the context."""
+    torchvision: Any = importlib.import_module("torchvision")
+    nn: Any = importlib.import_module("torch").nn
+
+    def make_resnet(**_: Any) -> Any:
+        layers = {"layer4": nn.Conv2d(3, 8, kernel_size=32, stride=32), "fc": nn.Linear(8, 1)}
+        return nn.ModuleDict(layers)  # an attribute of each name, which is all that is read
+
+    with patch.object(torchvision.models, "resnet18", make_resnet):
         yield
 
 
@@ -135,6 +149,6 @@ def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any
 
 
 def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
-    """Be a worker of an evaluation in which π0 and π0.5 are tiny; see `worker_main`."""
-    with tiny_paligemma("pi0"), tiny_paligemma("pi05"):
+    """Be a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
+    with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
         worker_main(connection, shared, log, parent_pid)
