@@ -26,6 +26,7 @@ POLICIES = {
     "cue_blind": "vla_eval.policies.scripted:make_cue_blind",
     "tour": "vla_eval.policies.scripted:make_tour",
     "body_memory": "vla_eval.policies.shortcuts:make_body_memory",
+    "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
     "ppo_expert": "vla_eval.policies.ppo_expert:make_ppo_expert",
 }

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from vla_eval.audit import STRICT
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,
@@ -34,6 +35,7 @@ FACTORIES = {
     "cue_blind": scripted.make_cue_blind,
     "tour": scripted.make_tour,
     "body_memory": shortcuts.make_body_memory,
+    "cue_touch": shortcuts.make_cue_touch,
 }
 
 
@@ -108,13 +110,16 @@ def n_successes(records: list[EpisodeRecord]) -> int:
     return sum(bool(record.success_once) for record in records)
 
 
+@pytest.mark.parametrize("n_episodes", [2, pytest.param(15, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("n_action_steps", [1, 8])
-def test_oracle_is_a_ceiling_at_each_chunk_length(sampled_task: str, n_action_steps: int) -> None:
-    records = run(sampled_task, "oracle", range(1, 16), n_action_steps=n_action_steps)
+def test_oracle_is_a_ceiling_at_each_chunk_length(
+    sampled_task: str, n_action_steps: int, n_episodes: int
+) -> None:
+    records = run(sampled_task, "oracle", range(1, n_episodes + 1), n_action_steps=n_action_steps)
     # 0.95 where there is nothing to choose: 15 episodes may then hold two failures; by touch, none. A chain
     # is tight where touches must be predicted for a whole chunk.
     is_sure = promised(sampled_task) > 0.95 or (sampled_task.startswith("Chain") and n_action_steps == 1)
-    assert n_successes(records) >= (15 if is_sure else 13)
+    assert n_successes(records) >= n_episodes - (0 if is_sure else min(2, n_episodes - 1))
     if TASKS[sampled_task].candidates:
         solved = [record for record in records if record.success_once]
         assert all(record.first_choice_success and record.n_wrong_choices == 0 for record in solved)
@@ -162,9 +167,16 @@ def _window_with_target(result: StepResult, target: int) -> Any:
     return ObservationWindow(slot=0, frames=(replace(result.observation, privileged=privileged),))
 
 
-@pytest.mark.parametrize("task", ["RememberColor3-v0", "RememberColor9-v0", "ShellGameTouch-v0"])
-def test_a_blind_arm_chooses_at_chance(task: str) -> None:
-    records = run(task, "cue_blind", range(1, 61))
+@pytest.mark.parametrize(
+    ("task", "n_episodes"),
+    [
+        ("RememberColor3-v0", 20),
+        pytest.param("RememberColor9-v0", 60, marks=pytest.mark.slow),
+        pytest.param("ShellGameTouch-v0", 60, marks=pytest.mark.slow),
+    ],
+)
+def test_a_blind_arm_chooses_at_chance(task: str, n_episodes: int) -> None:
+    records = run(task, "cue_blind", range(1, n_episodes + 1))
     n_candidates = records[0].n_candidates
     assert n_candidates is not None
     # A fair coin of 1/N fails this once in 10,000 times; an arm that knows or never arrives always does.
@@ -188,7 +200,7 @@ def test_runs_differ_for_a_blind_arm_and_seeds_alone_decide_within_a_run() -> No
 
 def test_random_actions_do_not_solve_the_tasks() -> None:
     for task in ("RememberColor3-v0", "ShellGameTouch-v0", "InterceptMedium-v0"):
-        records = run(task, "random", range(1, 11))
+        records = run(task, "random", range(1, 4))
         assert n_successes(records) == 0
         assert all(record.n_clipped_steps == 0 for record in records)
 
@@ -201,16 +213,17 @@ def test_hold_keeps_arm_and_gripper_where_they_are() -> None:
 
 
 def test_a_tour_finds_the_mug_without_memory_and_begins_at_chance() -> None:
-    records = run("ShellGameTouch-v0", "tour", range(1, 21))
-    assert n_successes(records) == 20
-    assert sum(bool(record.first_choice_success) for record in records) < 15
+    records = run("ShellGameTouch-v0", "tour", range(1, 9))
+    assert n_successes(records) == 8
+    # An arm that knew would be right 8 times; by chance that many come once in 3^8 = 6,561 times.
+    assert sum(bool(record.first_choice_success) for record in records) < 8
     assert any((record.n_wrong_choices or 0) == 2 for record in records)
 
 
 @pytest.mark.parametrize("policy", ["cue_blind", "tour"])
 def test_neither_luck_nor_search_finds_several_cubes(policy: str) -> None:
     """A wrong cube spoils the episode: 1/84 by luck, and as much by touching one cube after another."""
-    records = run("BunchOfColors3-v0", policy, range(1, 9))
+    records = run("BunchOfColors3-v0", policy, range(1, 4))
     assert n_successes(records) <= 1
     assert all(record.first_choice is not None for record in records)
     assert {record.target for record in records} == {None}
@@ -219,14 +232,33 @@ def test_neither_luck_nor_search_finds_several_cubes(policy: str) -> None:
 
 
 def test_the_gripper_can_remember_the_colour_and_a_frozen_one_cannot() -> None:
-    free = run("RememberColor3-v0", "body_memory", range(1, 9))
-    assert n_successes(free) == 8
+    free = run("RememberColor3-v0", "body_memory", range(1, 7))
+    assert n_successes(free) == 6
     kwargs = {"freeze_until_choice": True}
     env = make_env(EnvSettings(task="RememberColor3-v0", privileged=True, kwargs=kwargs))
-    frozen = run("RememberColor3-v0", "body_memory", range(1, 9), env=env)
+    frozen = run("RememberColor3-v0", "body_memory", range(1, 7), env=env)
     # Its gripper says nothing any more: the same candidate every time, whatever was shown.
     assert len({record.first_choice for record in frozen}) == 1
     assert len({record.target for record in frozen}) == 3
+
+
+def test_staying_at_the_place_of_the_cue_wins_where_that_keeps_the_answer() -> None:
+    """In a shell game the arm waits over the ball; cubes are shown in the middle, and lie elsewhere."""
+    assert n_successes(run("ShellGameTouch-v0", "cue_touch", (1, 2, 3))) == 3
+    assert n_successes(run("RememberColor3-v0", "cue_touch", (1, 2, 3))) == 0
+    early = {"phase_gate_success": False, "cue_steps": 30}
+    env = make_env(EnvSettings(task="RememberColor3-v0", privileged=True, kwargs=early))
+    assert n_successes(run("RememberColor3-v0", "cue_touch", (1, 2), env=env)) == 2
+
+
+def test_under_the_strict_protocol_neither_a_tour_nor_a_body_knows_more_than_chance() -> None:
+    """The first choice is final, and the arm is held until then: both choose as if nothing had been shown."""
+    for policy in ("tour", "body_memory", "cue_touch"):
+        env = make_env(EnvSettings(task="ShellGameTouch-v0", privileged=True, kwargs=dict(STRICT)))
+        records = run("ShellGameTouch-v0", policy, range(1, 10), env=env)
+        # 9 of 9 by luck, at 1/3 each: once in 19,683 times. The paper's rule lets each of them win 9.
+        assert 0 < n_successes(records) < 9
+        assert all(bool(r.success_once) == bool(r.first_choice_success) for r in records)
 
 
 @pytest.mark.parametrize("task", ["InterceptMedium-v0", "BunchOfColors3-v0"])

@@ -19,6 +19,7 @@ VERBS = (
     "eval",
     "report",
     "compare",
+    "audit",
     "record",
     "replay",
     "dataset",

@@ -5,15 +5,20 @@
   from step to step: what it does at a step follows from that step's observation alone. So any policy
   that reads the last frame could do the same, and a task that it wins does not need a memory as long as
   arm and gripper may move before the choice (`freeze_until_choice` forbids it).
+- `cue_touch`: goes to the place where the cue is shown as soon as the episode begins, and stays there. It
+  wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
+  answer: over the ball of a shell game.
 """
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
-from vla_eval.core import ActionChunk, ObservationWindow
+from vla_eval.core import ActionChunk, ObservationWindow, PrivilegedState
 from vla_eval.errors import SpecMismatchError
-from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
+from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M, Vector
+from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.choices import CandidateExpert
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
@@ -62,3 +67,43 @@ def make_body_memory(context: PolicyContext) -> BodyMemoryPolicy:
             f"{context.env.task} has no such choice. Leave this task out for this policy."
         )
     return BodyMemoryPolicy(context, cast(CandidateExpert, expert))
+
+
+CUE_PLACE_M = (0.0, 0.0, 0.02)
+"""Where cubes and other items are shown: the middle of the table, world frame (docs/tasks.md)."""
+BALL = "ball"
+
+
+class CueTouchPolicy(ScriptedPolicy):
+    """Goes to the place of the cue and stays there; see the module's text."""
+
+    privileged = True
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Go on to the place of the cue, or rest there."""
+        state = self.privileged_state(window)
+        hidden_ball = state.bodies.get(BALL)
+        expert, place_m = (CUBES, np.array(CUE_PLACE_M)) if hidden_ball is None else (MUGS, mug_over(state))
+        there = replace(state, candidate_positions_m=place_m[None])
+        return ActionChunk(actions=expert.plan(there, 0, self._n_actions))
+
+
+def mug_over(state: PrivilegedState) -> Vector:
+    """Return (3,): where the centre of the mug over the ball is, or will be, in the world frame."""
+    ball_m = state.bodies[BALL].position_m
+    nearest = np.linalg.norm((state.candidate_positions_m - ball_m)[:, :2], axis=1).argmin()
+    return np.array([*ball_m[:2], state.candidate_positions_m[nearest, 2]])
+
+
+def make_cue_touch(context: PolicyContext) -> CueTouchPolicy:
+    """Make the `cue_touch` control.
+
+    Raises:
+        SpecMismatchError: the task has no candidates, so no place where one is shown.
+    """
+    if context.n_candidates == 0:
+        raise SpecMismatchError(
+            f"policy '{context.name}' goes to where the cue is shown; {context.env.task} shows none at a "
+            "place of its own. Leave this task out for this policy."
+        )
+    return CueTouchPolicy(context)

@@ -1,0 +1,100 @@
+"""`mikasa-vla audit`: which tasks can be won without remembering?"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from vla_eval.cli.arguments import workers_argument
+from vla_eval.decoding import decode
+from vla_eval.recipes import EvalConfig, apply_overrides
+
+EXIT_EPISODE_ERRORS = 3
+DESCRIPTION = """Play every task with the controls that need no memory, and with the oracle, and say by which
+road each can be won: without acting, by touching one candidate after another, by staying at the cue,
+by storing the cue in the gripper. Nothing is rendered.
+
+Protocols: 'paper' is the task as it is; under 'strict' arm and gripper are held until the choice and the
+first choice is final. The same command again goes on where it stopped."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "audit",
+        help="find the tasks that can be won without memory",
+        description=DESCRIPTION,
+        epilog="docs/audit.md explains controls, tests and verdicts.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--task",
+        nargs="+",
+        action="extend",
+        dest="tasks",
+        metavar="T",
+        help="task ids (all of the catalogue)",
+    )
+    parser.add_argument("--episodes", type=int, default=30, metavar="N", help="per task and control (30)")
+    parser.add_argument("--protocol", choices=("paper", "strict", "both"), default="both", help="(both)")
+    parser.add_argument(
+        "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="A.B=C",
+        help="change another field of the evaluations, for example simulator=fake",
+    )
+    parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play, then print the audit to standard output; everything else goes to standard error.
+
+    Raises:
+        VlaEvalError: a mistyped task, a run folder of other settings, or a fault of every episode.
+    """
+    # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
+    from vla_eval.audit import read_audit, run_audit
+    from vla_eval.cli.progress import Progress, stop_on_signals
+    from vla_eval.results.audit_table import render_audit
+
+    configs = _configs(args)
+    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    with stop_on_signals() as stop:
+        summaries = []
+        for config in configs:
+            progress = Progress(stop, out=str(args.out / config.name))
+            try:
+                summaries += run_audit([config], args.out, command=command, observer=progress)
+            finally:
+                progress.close()
+            if summaries[-1].was_stopped:
+                print(f"Stopped. To go on: {command}", file=sys.stderr)
+                return stop.exit_code
+    print(render_audit(read_audit(configs, args.out), args.format))
+    return EXIT_EPISODE_ERRORS if any(summary.n_errors for summary in summaries) else 0
+
+
+def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
+    from vla_eval.audit import PROTOCOLS, audit_configs
+    from vla_eval.tasks.catalog import TASKS
+
+    settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below
+    apply_overrides(settings, args.overrides, cls=EvalConfig)
+    # Read strictly, with names of nothing: for the types of what was set.
+    checked = decode(EvalConfig, {"name": "x", "tasks": ["x"], "policies": ["x"], **settings}, where="--set")
+    protocols = tuple(PROTOCOLS) if args.protocol == "both" else (args.protocol,)
+    return audit_configs(
+        args.tasks or tuple(TASKS),
+        protocols,
+        episodes=args.episodes,
+        workers=args.workers,
+        settings={name: getattr(checked, name) for name in settings},
+    )
