@@ -6,9 +6,11 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
+import torchvision
 from safetensors.torch import load_file
 
 from vla_eval.cli.main import main
@@ -262,6 +264,33 @@ class TestRuns:
         )
         finetune(config)
         assert run_an_episode(make_lerobot(context(), checkpoint=str(run))) == 3
+
+    def test_a_small_diffusion_policy_goes_the_whole_way(self, recorded: Path, tmp_path: Path) -> None:
+        """It reads two frames, so the window of the adapter is tried, too."""
+        run = tmp_path / "run"
+        network = {
+            "down_dims": [16, 32],
+            "n_groups": 4,
+            "diffusion_step_embed_dim": 16,
+            "num_train_timesteps": 4,
+        }
+        policy = {"horizon": 8, "n_action_steps": 4, "num_inference_steps": 2, **network}
+        config = FinetuneConfig(
+            policy="diffusion",
+            dataset=str(recorded),
+            out=str(run),
+            finetune={**SHORT, "steps": 2, "policy": policy},
+            device="cpu",
+            allow_unreplayed=True,
+        )
+        with patch.object(torchvision.models, "resnet18", small_resnet):
+            finetune(config)
+            assert run_an_episode(make_lerobot(context(), checkpoint=str(run))) == 3
+
+
+def small_resnet(**_: Any) -> torch.nn.Module:
+    """Stand for ResNet-18 in Diffusion Policy, which leaves out the last two layers of it."""
+    return torch.nn.Sequential(torch.nn.Conv2d(3, 8, 32, 32), torch.nn.Identity(), torch.nn.Identity())
 
 
 class TestPaddedActions:
