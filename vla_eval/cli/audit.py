@@ -63,12 +63,13 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit import read_audit, run_audit
     from vla_eval.cli.progress import Progress, stop_on_signals
+    from vla_eval.evaluate import EvaluationSummary
     from vla_eval.results.audit_table import render_audit
 
     configs = _configs(args)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     with stop_on_signals() as stop:
-        summaries = []
+        summaries: list[EvaluationSummary] = []
         for config in configs:
             progress = Progress(stop, out=str(args.out / config.name))
             try:
