@@ -51,6 +51,7 @@ CHEAP = (
     "cli.report",
     "cli.compare",
     "cli.finetune",
+    "cli.checkpoint",
     "training.recipe",
     "cli.doctor",
     "cli.bench",

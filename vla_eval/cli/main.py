@@ -24,6 +24,7 @@ VERBS = (
     "replay",
     "dataset",
     "finetune",
+    "checkpoint",
     "train-expert",
     "list",
     "show",

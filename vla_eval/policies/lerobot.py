@@ -8,7 +8,8 @@ Three kinds of policies, told apart by their configuration:
 
 - `observation_delta_indices` is None or [0]: it reads the last frame (ACT, π0, π0.5, π0-FAST, SmolVLA).
 - with other indices, such as [-1, 0]: it gets these frames, (B, T, …); before the first frame of an
-  episode there is the first frame again, as in training (Diffusion Policy).
+  episode there is the first frame again, as in training (Diffusion Policy). One whose configuration says
+  `masks_history = True` is told which frames these are, by `FIELD_is_pad` (Octo).
 - with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
   gets `memory` (a recurrent policy of one's own).
@@ -84,7 +85,7 @@ class LeRobotPolicy:
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
         self._remembers = callable(getattr(loaded.policy, "remember", None))
-        self._deltas = _history(loaded.config)
+        self._deltas = history(loaded.config)
         self._noise_shape = noise_shape(loaded.config)
         draws_nothing = loaded.config.type in DETERMINISTIC or getattr(loaded.policy, "draws_nothing", False)
         can_batch = draws_nothing or self._noise_shape is not None
@@ -161,7 +162,12 @@ class LeRobotPolicy:
         if self._deltas == (0,):
             return slot.frames[-1]
         last = len(slot.frames) - 1
-        return _in_time([slot.frames[max(0, last + delta)] for delta in self._deltas])
+        frames = _in_time([slot.frames[max(0, last + delta)] for delta in self._deltas])
+        if not getattr(self._loaded.config, "masks_history", False):
+            return frames
+        # As lerobot's datasets say it: what lies before the episode's beginning is padding.
+        is_pad = torch.tensor([last + delta < 0 for delta in self._deltas])
+        return {**frames, **{f"{key}_is_pad": is_pad for key in frames}}
 
     def _chunks(self, actions: Tensor, n_slots: int) -> list[ActionChunk]:
         rows = actions.detach().to("cpu", torch.float32).numpy()
@@ -253,7 +259,13 @@ def chunk_size(config: Any) -> int:
 
 
 def noise_shape(config: Any) -> tuple[int, int] | None:
-    """Return the shape of one episode's noise for policies that take it from outside; None for others."""
+    """Return the shape of one episode's noise for policies that take it from outside; None for others.
+
+    A policy of one's own says it by `noise_shape` of its configuration.
+    """
+    own = getattr(config, "noise_shape", None)
+    if own is not None:
+        return (int(own[0]), int(own[1]))
     if config.type in ("pi0", "pi05", "smolvla"):
         return (int(config.chunk_size), int(config.max_action_dim))
     if config.type == "diffusion" and config.noise_scheduler_type == "DDIM":  # DDPM draws at every step
@@ -261,7 +273,8 @@ def noise_shape(config: Any) -> tuple[int, int] | None:
     return None
 
 
-def _history(config: Any) -> tuple[int, ...]:
+def history(config: Any) -> tuple[int, ...]:
+    """Return which frames it reads, 0 being the newest."""
     # A policy that keeps its own history may read other frames in training than when it acts.
     deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices)
     return tuple(int(delta) for delta in deltas) if deltas else (0,)

@@ -23,7 +23,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from torch import Tensor
 
-import vla_eval.policies.memory.configuration_memory  # noqa: F401  importing it registers
+import vla_eval.policies.memory.configuration_memory  # importing it registers
+import vla_eval.policies.octo.configuration_octo  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
@@ -37,6 +38,7 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
+from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 from vla_eval.policies.weights import check_same, put_weights
 
 NEEDED_STATISTICS = {
@@ -286,6 +288,8 @@ def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> Non
     """
     missing = []
     for step in (*preprocessor.steps, *postprocessor.steps):
+        if isinstance(step, EncoderStep | DecoderStep):
+            missing += step.missing_statistics()
         if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
             continue
         for key, feature in step.features.items():

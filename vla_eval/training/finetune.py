@@ -21,6 +21,8 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
 )
 from vla_eval.policies.lerobot import choose_device
+from vla_eval.policies.lerobot_loading import config_class
+from vla_eval.policies.steps.trainable import check_lora
 from vla_eval.provenance import collect_environment
 from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
 from vla_eval.results.durable import FolderLock
@@ -140,6 +142,8 @@ def _train(
     weights = resume_from / MODEL_FOLDER if resume_from is not None else base
 
     def describe(model: Any) -> None:
+        if recipe.lora is not None and recipe.lora.target_modules is not None:
+            check_lora(model, recipe.lora.target_modules, recipe.lora.full_modules)
         for line in describe_model(model).lines():
             listeners.say(line)
 
@@ -222,7 +226,12 @@ def _loop_config(
         wandb=WandBConfig(enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none"),
         peft=None
         if lora is None
-        else PeftConfig(r=lora.rank, lora_alpha=lora.alpha or lora.rank, target_modules=lora.target_modules),
+        else PeftConfig(
+            r=lora.rank,
+            lora_alpha=lora.alpha or lora.rank,
+            target_modules=lora.target_modules,
+            full_training_modules=list(lora.full_modules) or None,
+        ),
     )
     if resume:  # lerobot then expects them from the file that it does not read here
         config.optimizer = policy.get_optimizer_preset()
@@ -288,7 +297,8 @@ def _tokenizer_from(folder: str | None, kind: str) -> Any:
         return
     import importlib
 
-    processing: Any = importlib.import_module(f"lerobot.policies.{kind}.processor_{kind}")
+    name = config_class(kind, where="finetune.type").__module__.replace("configuration_", "processor_")
+    processing: Any = importlib.import_module(name)
     if not Path(folder).is_dir() or not hasattr(processing, TOKENIZER_STEP):
         raise RecipeError(
             f"finetune.tokenizer: expected the folder of a tokenizer and a policy that uses one, found "

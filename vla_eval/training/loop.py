@@ -32,6 +32,7 @@ from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import (
     MODEL_FOLDER,
+    POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     TOKENIZER_FOLDER,
     TrainingFacts,
@@ -39,6 +40,7 @@ from vla_eval.policies.checkpoint import (
     write_facts,
 )
 from vla_eval.policies.lerobot_loading import TOKENIZER_STEP, LoadOptions, fill_policy
+from vla_eval.policies.steps.processor_steps import DECODER_STEP, ENCODER_STEP
 
 PARTIAL_PREFIX = ".partial-"
 REPLACED = (
@@ -129,6 +131,8 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         if tokenizer is not None:
             overrides = {**kwargs["preprocessor_overrides"], TOKENIZER_STEP: {"tokenizer_name": tokenizer}}
             kwargs["preprocessor_overrides"] = overrides
+        if pretrained_path:
+            _override_our_steps(Path(pretrained_path), policy_cfg, kwargs)
         return originals["make_pre_post_processors"](policy_cfg, pretrained_path=pretrained_path, **kwargs)
 
     def make_optimizer_and_scheduler(cfg: Any, policy: Any) -> Any:
@@ -198,6 +202,25 @@ def _tokenizer_of(folder: Path, named: str | None) -> str | None:
     found = named or (str(own) if own.is_dir() else None)
     steps = read_json(folder / PREPROCESSOR_FILE).get("steps", [])
     return found if any(step.get("registry_name") == TOKENIZER_STEP for step in steps) else None
+
+
+def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> None:
+    """Give our own normaliser what lerobot addresses to its own by name.
+
+    That is the dataset's statistics; with them, the settings of this training and not those of its base.
+    """
+    for overrides_name, file, lerobots, ours in (
+        ("preprocessor_overrides", PREPROCESSOR_FILE, "normalizer_processor", ENCODER_STEP),
+        ("postprocessor_overrides", POSTPROCESSOR_FILE, "unnormalizer_processor", DECODER_STEP),
+    ):
+        names = [step.get("registry_name") for step in read_json(folder / file).get("steps", [])]
+        overrides = dict(kwargs.get(overrides_name) or {})
+        if ours not in names or lerobots not in overrides:
+            continue
+        given = overrides.pop(lerobots)
+        if "stats" in given:
+            overrides[ours] = {**getattr(config, "encoder_settings", {}), "stats": given["stats"]}
+        kwargs[overrides_name] = overrides
 
 
 def _save_tokenizer(preprocessor: Any, folder: Path) -> None:

@@ -136,5 +136,6 @@ def _set_features(config: Any, recipe: FinetuneRecipe, dataset: TrainingDataset)
                 f"the dataset's would be called {', '.join(inputs)}. Give them the base's names with "
                 f"finetune.rename_cameras, for example {{{absent[0]}: {next(iter(config.image_features))}}}."
             )
-    config.input_features = {**inputs, STATE_KEY: features[STATE_KEY]}
+    state = {STATE_KEY: features[STATE_KEY]} if getattr(config, "reads_state", True) else {}
+    config.input_features = {**inputs, **state}
     config.output_features = {ACTION_KEY: features[ACTION_KEY]}

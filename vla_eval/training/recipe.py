@@ -19,11 +19,22 @@ class LoraRecipe:
         alpha: scaling is alpha / rank; None: alpha = rank (peft would take 8, whatever the rank).
         target_modules: regular expression of the modules that get one; None: lerobot's choice, which for
             π0 and π0.5 is the action expert's attention and the projections, not the language model.
+            `all-linear` is refused: it would take heads and embeddings, too.
+        full_modules: last names of modules that are trained in full beside the adapters.
     """
 
     rank: int = 16
     alpha: int | None = None
     target_modules: str | None = None
+    full_modules: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what names no modules."""
+        if self.target_modules == "all-linear":
+            raise RecipeError(
+                "finetune.lora.target_modules is 'all-linear', which takes heads and embeddings of a policy, "
+                "too. Write a regular expression of the modules' names."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,62 @@
+"""`mikasa-vla checkpoint`: check that a checkpoint is complete, or convert an original one."""
+
+import argparse
+import contextlib
+import sys
+from pathlib import Path
+from typing import Any
+
+DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
+statistics, and let it act once. It says nothing of how good the policy is.
+convert-octo: make a LeRobot checkpoint of an original Octo checkpoint. Nothing is downloaded."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "checkpoint",
+        help="check a checkpoint, or convert an original one",
+        description=DESCRIPTION,
+        epilog="docs/octo.md explains converting.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    verify = actions.add_parser("verify", help="load it strictly and let it act once", allow_abbrev=False)
+    verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")
+    verify.add_argument("--device", default="cpu", metavar="D", help="auto, cpu, cuda (cpu)")
+    convert = actions.add_parser("convert-octo", help="make a LeRobot checkpoint of it", allow_abbrev=False)
+    convert.add_argument("path", metavar="PATH", help="folder of the original checkpoint")
+    convert.add_argument("--size", choices=("small", "base"), required=True, help="which Octo it is")
+    convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
+    convert.add_argument("--dataset-name", metavar="NAME", help="whose statistics, where there are several")
+    for sub in (verify, convert):
+        sub.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it; the result goes to standard output."""
+    with contextlib.redirect_stdout(sys.stderr):  # some policies print while they are made
+        lines = _verify(args) if args.action == "verify" else _convert(args)
+    print("\n".join(lines))
+    return 0
+
+
+def _verify(args: argparse.Namespace) -> list[str]:
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from vla_eval.policies.lerobot import choose_device
+    from vla_eval.policies.lerobot_loading import LoadOptions
+    from vla_eval.policies.verify import verify_checkpoint
+
+    options = LoadOptions(device=choose_device(args.device), tokenizer=args.tokenizer)
+    return verify_checkpoint(Path(args.path), options).lines()
+
+
+def _convert(args: argparse.Namespace) -> list[str]:
+    from vla_eval.policies.octo.convert import SIZES, convert
+
+    size = SIZES["small"] if args.size == "small" else SIZES["base"]
+    out = convert(
+        Path(args.path), Path(args.out), fields=size, dataset=args.dataset_name, tokenizer=args.tokenizer
+    )
+    return [str(out)]

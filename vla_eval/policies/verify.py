@@ -1,0 +1,124 @@
+"""Check a LeRobot checkpoint by using it: weights, statistics, and one chunk of finite actions.
+
+Knows nothing of tasks: whether the actions are any good is what an evaluation tells.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import torch
+from torch import Tensor
+
+from vla_eval.errors import CheckpointError, InvalidActionError
+from vla_eval.policies.checkpoint import checkpoint_sha256, weights_file
+from vla_eval.policies.lerobot import chunk_size, history, noise_shape
+from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint, read_weights
+
+INSTRUCTION = "pick the cube"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verified:
+    """What was found.
+
+    Attributes:
+        folder: with the weights.
+        kind: lerobot's name of the policy's type.
+        n_tensors: in the file, each taken over with its shape and type.
+        n_parameters: of the model; shared ones once.
+        n_trained: of these, what the configuration trains.
+        statistics: `field.statistic` of what normalises.
+        chunk: shape of the actions of one forward pass.
+        sha256: digest of the checkpoint, as an evaluation notes it.
+    """
+
+    folder: Path
+    kind: str
+    n_tensors: int
+    n_parameters: int
+    n_trained: int
+    statistics: tuple[str, ...]
+    chunk: tuple[int, ...]
+    sha256: str
+
+    def lines(self) -> list[str]:
+        """Return lines for a person."""
+        return [
+            f"checkpoint   {self.folder} ({self.sha256[:12]})",
+            f"type         {self.kind}",
+            f"weights      {self.n_tensors} tensors, none missing, none left over, all finite",
+            f"parameters   {self.n_parameters:,}, of which {self.n_trained:,} are trained",
+            f"statistics   {', '.join(self.statistics) or 'none needed'}",
+            f"forward pass {' × '.join(map(str, self.chunk))} actions, all finite",
+        ]
+
+
+def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
+    """Load a checkpoint strictly and let it act once on random pictures.
+
+    Raises:
+        CheckpointError: weights, processors or statistics are not complete.
+        InvalidActionError: the actions have another shape than declared, or are not finite.
+    """
+    loaded = load_checkpoint(path, options)
+    actions = _act(loaded)
+    expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
+    if tuple(actions.shape) != expected or not torch.isfinite(actions).all():
+        raise InvalidActionError(
+            f"{loaded.folder}: expected finite actions of shape {expected}, found {tuple(actions.shape)}, "
+            f"finite: {bool(torch.isfinite(actions).all())}."
+        )
+    file = weights_file(loaded.folder)
+    assert file is not None  # it was just loaded
+    parameters = list(loaded.policy.parameters())
+    return Verified(
+        folder=loaded.folder,
+        kind=loaded.config.type,
+        n_tensors=len(read_weights(file)),
+        n_parameters=sum(x.numel() for x in parameters),
+        n_trained=sum(x.numel() for x in parameters if x.requires_grad),
+        statistics=_used_statistics(loaded),
+        chunk=expected,
+        sha256=checkpoint_sha256(loaded.folder),
+    )
+
+
+@torch.no_grad()
+def _act(loaded: LoadedPolicy) -> Tensor:
+    config, draws = loaded.config, torch.Generator().manual_seed(0)
+    deltas = history(config)
+    extra: dict[str, Any] = {}
+    shape = noise_shape(config)
+    if shape is not None:
+        extra["noise"] = torch.randn(1, *shape, generator=draws).to(config.device)
+    if callable(getattr(loaded.policy, "remember", None)):
+        extra["memory"] = loaded.policy.remember(loaded.preprocessor(_batch(config, (0,), draws)), None)
+        deltas = ()
+    elif deltas == (0,):
+        deltas = ()
+    loaded.policy.reset()
+    batch = loaded.preprocessor(_batch(config, deltas, draws))
+    actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))
+    return actions
+
+
+def _batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -> dict[str, Any]:
+    """Return random fields of one episode, (1, …), or with frames in time (1, T, …)."""
+    batch: dict[str, Any] = {"task": [INSTRUCTION]}
+    times = (len(deltas),) if deltas else ()
+    for key, feature in config.input_features.items():
+        if not key.startswith("observation."):
+            raise CheckpointError(f"the field '{key}' is no observation; nothing can be made up for it.")
+        batch[key] = torch.rand(1, *times, *feature.shape, generator=draws)
+        if times:
+            batch[f"{key}_is_pad"] = torch.zeros(1, *times, dtype=torch.bool)
+    return batch
+
+
+def _used_statistics(loaded: LoadedPolicy) -> tuple[str, ...]:
+    found: dict[str, None] = {}
+    for step in (*loaded.preprocessor.steps, *loaded.postprocessor.steps):
+        for key, values in (getattr(step, "stats", None) or {}).items():
+            found.update(dict.fromkeys(f"{key}.{name}" for name in values))
+    return tuple(found)
