@@ -1,0 +1,1 @@
+"""OpenVLA and OpenVLA-OFT on transformers' own DINOv2, SigLIP and Llama; see `docs/openvla.md`."""
