@@ -39,14 +39,14 @@ class FusedVision(nn.Module):
         self.n_prefix_tokens = 1 + sizes.dino_registers
         self.dino = _dino(sizes)
         self.siglip = _siglip(sizes)
-        means = torch.tensor([IMAGENET_MEAN, SIGLIP_MEAN]).reshape(2, 1, 3, 1, 1)
-        stds = torch.tensor([IMAGENET_STD, SIGLIP_STD]).reshape(2, 1, 3, 1, 1)
+        means = torch.tensor([IMAGENET_MEAN, SIGLIP_MEAN], dtype=torch.float32).reshape(2, 1, 3, 1, 1)
+        stds = torch.tensor([IMAGENET_STD, SIGLIP_STD], dtype=torch.float32).reshape(2, 1, 3, 1, 1)
         self.register_buffer("mean", means, persistent=False)
         self.register_buffer("std", stds, persistent=False)
 
     def normalised(self, pictures: Tensor) -> Tensor:
         """Return (2, N, 3, H, W): what DINOv2 sees and what SigLIP sees of (N, 3, H, W) in [0, 1]."""
-        return (pictures.float() - self.mean.float()) / self.std.float()
+        return (pictures.float() - self.mean) / self.std
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return (B, C · P, D), the patches of a sample's pictures one after the other.
@@ -54,7 +54,7 @@ class FusedVision(nn.Module):
         Args:
             pictures: (B, C, 3, H, W) in [0, 1].
         """
-        for_dino, for_siglip = self.normalised(pictures.flatten(0, 1)).to(self.dino.dtype)
+        for_dino, for_siglip = self.normalised(pictures.flatten(0, 1)).to(self.dino.dtype).unbind()
         seen = self.dino(for_dino).last_hidden_state[:, self.n_prefix_tokens :]
         features = torch.cat([seen, self.siglip(for_siglip).last_hidden_state], dim=-1)
         return features.reshape(len(pictures), -1, features.shape[-1])
