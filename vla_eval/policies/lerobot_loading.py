@@ -6,6 +6,7 @@ Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is se
 """
 
 import os
+from collections.abc import Sequence
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -24,7 +25,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 import vla_eval.policies.memory.configuration_memory  # importing it registers
-import vla_eval.policies.octo.configuration_octo  # noqa: F401  as above
+import vla_eval.policies.octo.configuration_octo
+import vla_eval.policies.openvla.configuration_openvla  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
@@ -170,8 +172,14 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
     return fill_policy(make_empty_policy(config, **kwargs), folder, options).to(config.device)
 
 
-def fill_policy(policy: Any, folder: Path, options: LoadOptions) -> Any:
+def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: Sequence[str] = ()) -> Any:
     """Put the weights of a checkpoint into a policy, or an adapter on top of them; return the policy.
+
+    Args:
+        policy: with whatever weights.
+        folder: of the checkpoint.
+        options: how to load.
+        may_be_new: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
 
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
@@ -179,7 +187,13 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions) -> Any:
     if (folder / ADAPTER_CONFIG_FILE).is_file():
         return _fill_adapter(policy, folder, options)
     weights = read_weights(folder / WEIGHTS_FILE)
-    put_weights(policy, weights, where=str(folder / WEIGHTS_FILE), cast=options.dtype is not None)
+    put_weights(
+        policy,
+        weights,
+        where=str(folder / WEIGHTS_FILE),
+        cast=options.dtype is not None,
+        may_be_new=may_be_new,
+    )
     return policy
 
 
@@ -208,7 +222,10 @@ def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
             f"not there. Name its folder with `base_checkpoint` in the recipe's args."
         )
     weights = read_weights(folder / ADAPTER_WEIGHTS_FILE)
-    filled = fill_policy(policy, find_checkpoint(base), options)
+    # What the adapter was trained with in full comes with it: the base need not have it.
+    names = read_json(folder / ADAPTER_CONFIG_FILE).get("modules_to_save") or ()
+    beside = [start for start in getattr(policy, "new_in_finetuning", ()) if start.split(".")[-2] in names]
+    filled = fill_policy(policy, find_checkpoint(base), options, may_be_new=beside)
     wrapped = PeftModel.from_pretrained(filled, str(folder), is_trainable=True)
     # peft, too, leaves out what does not fit.
     check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))

@@ -1,6 +1,6 @@
 """Put weights into a model, exactly: same keys, shapes, types and, afterwards, values. Knows only torch."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any  # lerobot's policies are untyped
 
 import torch
@@ -11,7 +11,14 @@ from vla_eval.errors import CheckpointError
 MAX_SHOWN = 8
 
 
-def put_weights(policy: Any, weights: Mapping[str, Tensor], *, where: str, cast: bool = False) -> None:
+def put_weights(
+    policy: Any,
+    weights: Mapping[str, Tensor],
+    *,
+    where: str,
+    cast: bool = False,
+    may_be_new: Sequence[str] = (),
+) -> None:
     """Load the tensors into the policy, or raise and say which do not fit.
 
     Args:
@@ -19,13 +26,16 @@ def put_weights(policy: Any, weights: Mapping[str, Tensor], *, where: str, cast:
         weights: its tensors by name; a tensor that the model has under several names may be there once.
         where: the file, for messages.
         cast: whether floating point types may differ, because the user chose another precision.
+        may_be_new: beginnings of names; all tensors of one of them may be missing together and then stay
+            as the constructor made them: a head that fine-tuning begins anew.
 
     Raises:
         CheckpointError: keys are missing or unexpected, or shapes or types differ.
     """
     wanted: dict[str, Tensor] = dict(policy.state_dict())
     found = _renamed(policy, wanted, weights)
-    missing = [key for key in _missing(wanted, found) if key not in found]
+    new = tuple(start for start in may_be_new if not any(key.startswith(start) for key in found))
+    missing = [key for key in _missing(wanted, found) if key not in found and not key.startswith(new)]
     problems = {
         "missing": missing,
         "unexpected": [key for key in found if key not in wanted],

@@ -31,7 +31,7 @@ from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut, check_held_out
 from vla_eval.training.loop import LoopHooks, append_metrics, run_loop
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, LoraRecipe
 from vla_eval.training.run_folder import METRICS_FILE, TRAIN_FOLDER, open_folder, read_metrics
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 
@@ -142,8 +142,10 @@ def _train(
     weights = resume_from / MODEL_FOLDER if resume_from is not None else base
 
     def describe(model: Any) -> None:
-        if recipe.lora is not None and recipe.lora.target_modules is not None:
-            check_lora(model, recipe.lora.target_modules, recipe.lora.full_modules)
+        if recipe.lora is not None:
+            target, full_modules = _lora_targets(recipe.lora, policy)
+            if target is not None:
+                check_lora(model, target, full_modules)
         for line in describe_model(model).lines():
             listeners.say(line)
 
@@ -166,6 +168,7 @@ def _train(
         run_seed=config.run_seed,
         weights=weights,
         cast=base is not None,
+        begins_from_base=base is not None and resume_from is None,
         decode_ahead=recipe.decode_ahead,
         tokenizer=recipe.tokenizer,
         on_model=describe,
@@ -175,6 +178,15 @@ def _train(
     loop_config = _loop_config(recipe, dataset, policy, config.run_seed, out, resume=resume_from is not None)
     with _tokenizer_from(recipe.tokenizer, recipe.type):
         run_loop(loop_config, hooks, resume_from=resume_from)
+
+
+def _lora_targets(lora: LoraRecipe, policy: Any) -> tuple[str | None, tuple[str, ...]]:
+    """Return what LoRA is put on and what is trained whole: the recipe's, else the policy's own choice."""
+    own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
+    return (
+        lora.target_modules or own.get("target_modules"),
+        tuple(lora.full_modules or own.get("modules_to_save") or ()),
+    )
 
 
 def _held_out(

@@ -64,6 +64,7 @@ class LoopHooks:
         run_seed: of all noise.
         weights: folder of the weights to start from; None: from scratch.
         cast: whether the weights' precision may differ from the model's.
+        begins_from_base: whether they are a base's, which need not have what fine-tuning begins anew.
         decode_ahead, tokenizer: see `FinetuneRecipe`.
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
@@ -76,6 +77,7 @@ class LoopHooks:
     run_seed: int
     weights: Path | None
     cast: bool
+    begins_from_base: bool
     decode_ahead: bool
     tokenizer: str | None
     on_model: Callable[[Any], None]
@@ -124,7 +126,8 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         if hooks.weights is None:
             return policy
         options = LoadOptions(device=cfg.device, dtype=getattr(cfg, "dtype", None) if hooks.cast else None)
-        return fill_policy(policy, hooks.weights, options).to(cfg.device)
+        may_be_new = getattr(policy, "new_in_finetuning", ()) if hooks.begins_from_base else ()
+        return fill_policy(policy, hooks.weights, options, may_be_new=may_be_new).to(cfg.device)
 
     def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
         tokenizer = _tokenizer_of(Path(pretrained_path), hooks.tokenizer) if pretrained_path else None

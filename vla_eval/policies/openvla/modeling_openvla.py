@@ -1,0 +1,139 @@
+"""OpenVLA and OpenVLA-OFT as a LeRobot policy: loss of a chunk, chunks of several episodes at once."""
+
+import contextlib
+from collections import deque
+from collections.abc import Iterator
+from typing import Any  # lerobot and transformers are untyped
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from vla_eval.data.features import ACTION_KEY, STATE_KEY
+from vla_eval.errors import SpecMismatchError, TrainingError
+from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
+from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
+from vla_eval.policies.openvla.lora import FULL_MODULES
+from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
+from vla_eval.policies.openvla.prompt import finished
+from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
+
+PADDING_KEY = "action_is_pad"
+TOKENS_KEY, TOKENS_MASK_KEY = "observation.language.tokens", "observation.language.attention_mask"
+
+
+class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+    """See `MikasaOpenVLAConfig`."""
+
+    config_class = MikasaOpenVLAConfig
+    name = TYPE
+    draws_nothing = True
+    new_in_finetuning = tuple(f"network.{name}." for name in FULL_MODULES)
+    """Weights that a base checkpoint need not have: a plain OpenVLA has no continuous head."""
+
+    def __init__(self, config: MikasaOpenVLAConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: MikasaOpenVLAConfig = config
+        with _default_dtype(getattr(torch, config.dtype)):
+            self.network = OpenVLANetwork(config.network_sizes(), config.network_options())
+        for name in FULL_MODULES:
+            if hasattr(self.network, name):
+                getattr(self.network, name).float()
+        if config.gradient_checkpointing:
+            for part in (self.network.vision.dino, self.network.vision.siglip, self.network.llm):
+                part.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """Return the parameters that are trained."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        """Forget what lerobot's own loop has not executed yet."""
+        self._queue: deque[Tensor] = deque()
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a batch of training samples, and its parts."""
+        actions = batch[ACTION_KEY].float()
+        counts = self._counts(batch, actions)
+        inputs = self._inputs(batch, changed=self.training)
+        if self.config.head != "l1":
+            loss = token_loss(self.network, inputs, actions, counts)
+            return loss, {"cross_entropy": loss.item()}
+        errors = (self.network.actions(inputs) - actions).abs().mean(dim=-1)
+        loss = (errors * counts).sum() / counts.sum().clamp(min=1)
+        return loss, {"l1": loss.item(), "l1_first_action": errors[:, 0].mean().item()}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return normalised actions (B, chunk, action), the first of them for the frame that was given."""
+        self.eval()
+        inputs = self._inputs(batch, changed=False)
+        if self.config.head == "l1":
+            return self.network.actions(inputs)
+        told = generated_actions if self.config.head == "tokens" else parallel_actions
+        return told(self.network, inputs)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return (B, action) for lerobot's own loop: the first `n_action_steps` of each chunk in turn."""
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch)
+            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._queue.popleft()
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """Tell lerobot what LoRA trains."""
+        return self.config.lora_defaults()
+
+    def _inputs(self, batch: dict[str, Tensor], *, changed: bool) -> Inputs:
+        proprio = batch[STATE_KEY] if self.config.use_proprio else None
+        return Inputs(self._pictures(batch, changed=changed), self._prompts(batch), proprio)
+
+    def _pictures(self, batch: dict[str, Tensor], *, changed: bool) -> Tensor:
+        """Return (B, cameras, 3, edge, edge) in [0, 1], resized and either changed at random or cropped."""
+        edge = self.network.sizes.image_px
+        pictures = []
+        for name in self.config.picture_fields:
+            if name not in batch:
+                raise SpecMismatchError(f"'{TYPE}': the batch has no picture '{name}'.")
+            levels = resize_lanczos3((batch[name].float() * MAX_LEVEL).round(), Size(edge, edge))
+            if self.config.image_augmentation and changed:
+                levels = augment(levels[:, None], AUGMENTATION)[:, 0].round()
+            elif self.config.image_augmentation:
+                levels = centre_crop(levels, AUGMENTATION.centre_area)
+            pictures.append(levels / MAX_LEVEL)
+        return torch.stack(pictures, dim=1)
+
+    def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
+        ids, mask = batch[TOKENS_KEY], batch[TOKENS_MASK_KEY]
+        if ids.shape[1] > self.config.prompt_max_tokens:
+            raise SpecMismatchError(
+                f"'{TYPE}': a prompt has {ids.shape[1]} tokens, expected at most "
+                f"{self.config.prompt_max_tokens} (prompt_max_tokens)."
+            )
+        return finished(ids, mask, self.network.sizes)
+
+    def _counts(self, batch: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Return (B, chunk) float: 0 for actions beyond an episode's end."""
+        is_pad = batch.get(PADDING_KEY)
+        if is_pad is None:
+            return torch.ones(actions.shape[:2], device=actions.device)
+        if not self.config.do_mask_loss_for_padding and bool(is_pad.any()):
+            raise TrainingError(
+                f"'{TYPE}': a chunk goes beyond its episode's end. Train with a sampler that leaves out the "
+                f"last drop_n_last_frames ({self.config.drop_n_last_frames}) frames, as `mikasa-vla "
+                "finetune` does, or set do_mask_loss_for_padding."
+            )
+        return (~is_pad).float()
+
+
+@contextlib.contextmanager
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
