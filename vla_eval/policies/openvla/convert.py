@@ -1,0 +1,215 @@
+"""Make a LeRobot checkpoint of a published OpenVLA, or of what the OFT scripts have saved.
+
+No code of the checkpoint is run. Weights are safetensors; the heads of OFT lie beside them as pickled
+tensors (`action_head--50000_checkpoint.pt`), which are read only if that is allowed by name, and then by
+torch's reader that builds nothing but tensors.
+"""
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any  # JSON and lerobot
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from safetensors.torch import load_file
+from torch import Tensor
+
+from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.errors import CheckpointError, did_you_mean
+from vla_eval.policies.checkpoint import CONFIG_FILE, TOKENIZER_FOLDER, read_json
+from vla_eval.policies.openvla.configuration_openvla import MikasaOpenVLAConfig
+from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
+from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
+from vla_eval.policies.openvla.prompt import prompt_text
+from vla_eval.policies.openvla.sizes import NetworkSizes
+from vla_eval.policies.openvla.weight_names import to_ours
+from vla_eval.policies.weights import put_weights
+
+STATISTICS_FILE = "dataset_statistics.json"
+TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
+BACKBONES = {"vision_backbone_id": "dinosiglip-vit-so-224px", "llm_backbone_id": "llama2-7b-pure"}
+KNOWN_INSTRUCTION = "pick"
+KNOWN_IDS = (1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304, 5839, 29973, 13, 3744, 29901)
+"""What the published tokenizer makes of the prompt of `KNOWN_INSTRUCTION`; from the golden files."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertOptions:
+    """What the files do not say of themselves.
+
+    Attributes:
+        head, chunk_size: see `MikasaOpenVLAConfig`.
+        unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
+        pictures: fields of the pictures, in the order of the training.
+        picture_px: edge of the pictures as a camera gives them.
+        proprio: numbers of the proprioception; 0: the model has none.
+        allow_pickled: read heads that are pickled tensors.
+        sizes: sizes that differ from the published ones.
+        dtype: of the result.
+    """
+
+    head: str = "tokens"
+    chunk_size: int = 1
+    unnorm_key: str | None = None
+    pictures: tuple[str, ...] = tuple(CAMERA_KEYS.values())
+    picture_px: int = 128
+    proprio: int = 0
+    allow_pickled: bool = False
+    sizes: dict[str, int] = field(default_factory=dict)
+    dtype: str = "bfloat16"
+
+
+def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
+    """Write the LeRobot checkpoint `out`; return it.
+
+    Args:
+        source: folder with `config.json`, safetensors and tokenizer of an OpenVLA.
+        out: a folder that is not there yet.
+        options: see there.
+
+    Raises:
+        CheckpointError: something is missing, of another form, or not what the options say.
+    """
+    if out.exists():
+        raise CheckpointError(f"{out} exists already. Name another folder.")
+    described = read_json(source / CONFIG_FILE)
+    if not options.sizes:
+        _check_backbones(source, described)
+    config = _config(options)
+    policy = MikasaOpenVLAPolicy(config)
+    weights = read_original(source, options, config.network_sizes())
+    where = str(source)
+    put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)
+    statistics = read_statistics(source, described, config, options.unnorm_key)
+    partial = out.with_name(f".partial-{out.name}")
+    shutil.rmtree(partial, ignore_errors=True)
+    tokenizer = _copy_tokenizer(source, partial / TOKENIZER_FOLDER)
+    config.tokenizer_name = str(tokenizer)
+    processors = make_mikasa_openvla_pre_post_processors(config, statistics)
+    if not options.sizes:
+        _check_tokenizer(processors[0])
+    config.tokenizer_name = str(out / TOKENIZER_FOLDER)
+    policy.save_pretrained(partial)
+    for processor in processors:
+        processor.save_pretrained(partial)
+    partial.rename(out)
+    return out
+
+
+def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) -> dict[str, Tensor]:
+    """Return the weights of a published checkpoint under our names.
+
+    Raises:
+        CheckpointError: files are missing, or pickled ones are not allowed.
+    """
+    files = sorted(source.glob("*.safetensors"))
+    if not files:
+        raise CheckpointError(f"{source}: expected safetensors, found none. Fetch the whole checkpoint.")
+    original: dict[str, Tensor] = {}
+    for file in files:
+        original.update(load_file(file))
+    for name, is_wanted in (
+        ("action_head", options.head == "l1"),
+        ("proprio_projector", options.proprio > 0),
+    ):
+        if is_wanted and not any(key.startswith(f"{name}.") for key in original):
+            original.update(_pickled(source, name, allowed=options.allow_pickled))
+    return to_ours(original, sizes)
+
+
+def read_statistics(
+    source: Path, described: Mapping[str, Any], config: MikasaOpenVLAConfig, unnorm_key: str | None
+) -> dict[str, dict[str, Any]] | None:
+    """Return field -> statistics of the training data; None if there are several and none is chosen.
+
+    Raises:
+        CheckpointError: they are missing, not of that name, or normalised otherwise than ours.
+    """
+    file = source / STATISTICS_FILE
+    known = read_json(file) if file.is_file() else dict(described.get("norm_stats") or {})
+    if unnorm_key is None and len(known) == 1:
+        (unnorm_key,) = known
+    if unnorm_key is None:
+        return None  # a base for fine-tuning, whose statistics are those of the new data
+    if unnorm_key not in known:
+        raise CheckpointError(
+            f"{source}: there are no statistics '{unnorm_key}'.{did_you_mean(unnorm_key, known)} There are: "
+            f"{', '.join(known) or 'none'}."
+        )
+    chosen = known[unnorm_key]
+    wanted = {ACTION_KEY: "action", **({STATE_KEY: "proprio"} if config.use_proprio else {})}
+    for ours, theirs in wanted.items():
+        mask = (chosen.get(theirs) or {}).get("mask")
+        expected = config.normalizations()[ours].mask
+        if mask is not None and tuple(mask) != expected:
+            raise CheckpointError(f"{source}: mask of {theirs}: expected {expected}, found {tuple(mask)}.")
+    return {ours: chosen[theirs] for ours, theirs in wanted.items() if theirs in chosen}
+
+
+def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
+    shape = (3, options.picture_px, options.picture_px)
+    config = MikasaOpenVLAConfig(
+        head=options.head,
+        chunk_size=options.chunk_size,
+        n_action_steps=options.chunk_size,
+        use_proprio=options.proprio > 0,
+        sizes=options.sizes,
+        dtype=options.dtype,
+        device="cpu",
+        push_to_hub=False,
+    )
+    inputs = {name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name in options.pictures}
+    if options.proprio:
+        inputs[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(options.proprio,))
+    config.input_features = inputs
+    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
+    return config
+
+
+def _pickled(source: Path, name: str, *, allowed: bool) -> dict[str, Tensor]:
+    found = sorted(source.glob(f"{name}--*_checkpoint.pt"), key=_step)
+    if not found:
+        raise CheckpointError(
+            f"{source}: there is no {name} (expected {name}--STEP_checkpoint.pt). A plain OpenVLA has none: "
+            "convert it with head `tokens`, and fine-tune from that."
+        )
+    if not allowed:
+        raise CheckpointError(
+            f"{found[-1]}: pickled tensors are read only with allow_pickled. Use it for files you trust."
+        )
+    tensors = torch.load(found[-1], map_location="cpu", weights_only=True)
+    return {f"{name}.{key.removeprefix('module.')}": value for key, value in tensors.items()}
+
+
+def _step(file: Path) -> int:
+    number = re.search(r"--(\d+)_", file.name)
+    return int(number[1]) if number else -1
+
+
+def _copy_tokenizer(source: Path, folder: Path) -> Path:
+    files = [file for pattern in TOKENIZER_FILES for file in sorted(source.glob(pattern)) if file.is_file()]
+    if not files:
+        raise CheckpointError(f"{source}: expected the tokenizer's files, found none. Fetch them, too.")
+    folder.mkdir(parents=True)
+    for file in files:
+        shutil.copy2(file, folder / file.name)
+    return folder
+
+
+def _check_backbones(source: Path, described: Mapping[str, Any]) -> None:
+    for name, expected in BACKBONES.items():
+        if described.get(name, expected) != expected:
+            raise CheckpointError(f"{source}: {name}: expected {expected}, found {described[name]}.")
+
+
+def _check_tokenizer(preprocessor: Any) -> None:
+    tokenizer = next(step.input_tokenizer for step in preprocessor.steps if hasattr(step, "input_tokenizer"))
+    found = tuple(tokenizer(prompt_text(KNOWN_INSTRUCTION)).input_ids)
+    if found[: len(KNOWN_IDS)] != KNOWN_IDS:
+        raise CheckpointError(
+            f"the tokenizer makes {found} of a prompt that the model was trained to read as {KNOWN_IDS}. "
+            "Another version of transformers may read its files otherwise."
+        )
