@@ -28,6 +28,7 @@ POLICIES = {
     "body_memory": "vla_eval.policies.shortcuts:make_body_memory",
     "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
+    "openvla": "vla_eval.policies.openvla.paper_compat:make_openvla",
     "ppo_expert": "vla_eval.policies.ppo_expert:make_ppo_expert",
 }
 
