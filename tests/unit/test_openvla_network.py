@@ -11,6 +11,7 @@ from torch.nn import functional
 from tests.unit import openvla_golden as golden
 from tests.unit.openvla_golden import TOLERANCE
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
+from vla_eval.policies.openvla.sizes import NetworkOptions, NetworkSizes
 from vla_eval.policies.openvla.weight_names import to_original, to_ours, unused
 
 CASES = [
@@ -194,3 +195,25 @@ class TestWeightNames:
             "attn_pool",
         }
         assert all("blocks.2." in name for name in left_out if "blocks" in name)
+
+
+@pytest.mark.slow
+def test_the_published_size_has_the_published_parameters_but_for_what_is_never_used() -> None:
+    with torch.device("meta"):
+        network = OpenVLANetwork(NetworkSizes(), NetworkOptions())
+    found = [
+        sum(parameter.numel() for parameter in part.parameters())
+        for part in (network.vision.dino, network.vision.siglip, network.projector, network.llm)
+    ]
+    # Blocks: four square matrices, two of the MLP, biases, two norms, in DINOv2 two scales.
+    dino = 4 * (1024**2 + 1024) + (1024 + 1) * 4096 + (4096 + 1) * 1024 + 6 * 1024
+    siglip = 4 * (1152**2 + 1152) + (1152 + 1) * 4304 + (4304 + 1) * 1152 + 4 * 1152
+    llama = 4 * 4096**2 + 3 * 4096 * 11008 + 2 * 4096
+    patch = 3 * 14 * 14 + 1
+    assert found == [
+        # class token, 4 registers, 257 positions (the class token's row is zero)
+        23 * dino + patch * 1024 + (1 + 4 + 257) * 1024,
+        26 * siglip + patch * 1152 + 256 * 1152,
+        (2176 + 1) * 8704 + (8704 + 1) * 4096 + (4096 + 1) * 4096,
+        32 * llama + 2 * 32064 * 4096 + 4096,
+    ]

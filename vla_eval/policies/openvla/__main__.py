@@ -33,6 +33,7 @@ def _options(args: argparse.Namespace) -> ConvertOptions:
         unnorm_key=args.unnorm_key,
         proprio=args.proprio,
         allow_pickled=args.allow_pickled,
+        gripper=args.gripper,
         **({"pictures": tuple(args.pictures)} if args.pictures else {}),
     )
 
@@ -46,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, if there are several")
     convert.add_argument("--proprio", type=int, default=0, metavar="N", help="numbers of proprioception")
     convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="fields of the pictures, in order")
+    convert.add_argument("--gripper", default="maniskill", metavar="NAME", help="its encoding (maniskill)")
     convert.add_argument("--allow-pickled", action="store_true", help="read heads that are pickled tensors")
     merge = actions.add_parser("merge", help="merge a LoRA adapter into its base")
     merge.add_argument("--base-checkpoint", metavar="DIR", help="where the base lies, if it was moved")

@@ -47,6 +47,7 @@ class ConvertOptions:
         picture_px: edge of the pictures as a camera gives them.
         proprio: numbers of the proprioception; 0: the model has none.
         allow_pickled: read heads that are pickled tensors.
+        gripper: how the training data encode it; the published OpenVLA's is `unit_open`.
         sizes: sizes that differ from the published ones.
         dtype: of the result.
     """
@@ -58,6 +59,7 @@ class ConvertOptions:
     picture_px: int = 128
     proprio: int = 0
     allow_pickled: bool = False
+    gripper: str = "maniskill"
     sizes: dict[str, int] = field(default_factory=dict)
     dtype: str = "bfloat16"
 
@@ -156,6 +158,7 @@ def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
         chunk_size=options.chunk_size,
         n_action_steps=options.chunk_size,
         use_proprio=options.proprio > 0,
+        gripper=options.gripper,
         sizes=options.sizes,
         dtype=options.dtype,
         device="cpu",
