@@ -14,6 +14,7 @@ from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla
 from vla_eval.policies.openvla.network import Inputs
 from vla_eval.policies.openvla.prompt import byte_tokenizer
+from vla_eval.policies.verify import verify_checkpoint
 
 SIZES = {
     "image_px": 56,
@@ -78,6 +79,9 @@ def test_a_converted_checkpoint_says_what_the_original_says(published: Path, tmp
     actions = loaded.postprocessor(normalized)[0]
     expected = values["infer.img2.prompt2.proprio.actions"].float()
     torch.testing.assert_close(actions, expected, atol=golden.TOLERANCE, rtol=0)
+    verified = verify_checkpoint(out, LoadOptions(device="cpu"))
+    assert verified.chunk == (1, 8, 7)
+    assert {"action.q01", "action.q99", "observation.state.q01"} <= set(verified.statistics)
 
 
 @pytest.mark.parametrize(

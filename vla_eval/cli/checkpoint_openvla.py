@@ -1,0 +1,50 @@
+"""`mikasa-vla checkpoint convert-openvla` and `merge`: what `checkpoint` does for OpenVLA."""
+
+import argparse
+from pathlib import Path
+from typing import Any, get_args
+
+from vla_eval.policies.openvla.sizes import Head
+
+CONVERT, MERGE = "convert-openvla", "merge"
+
+
+def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+    """Declare the arguments."""
+    convert = actions.add_parser(CONVERT, help="make a LeRobot checkpoint of it", allow_abbrev=False)
+    convert.add_argument("path", metavar="PATH", help="folder of the published checkpoint")
+    convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
+    convert.add_argument("--head", choices=get_args(Head), default="tokens", help="tokens: a plain OpenVLA")
+    convert.add_argument("--chunk", type=int, default=1, metavar="K", help="actions of a chunk (1)")
+    convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
+    convert.add_argument("--gripper", default="maniskill", metavar="NAME", help="its encoding (maniskill)")
+    convert.add_argument("--proprio", type=int, default=0, metavar="N", help="numbers of proprioception (0)")
+    convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="fields of the pictures, in order")
+    convert.add_argument("--allow-pickled", action="store_true", help="read heads that are pickled tensors")
+    merge = actions.add_parser(MERGE, help="put a LoRA adapter into its base", allow_abbrev=False)
+    merge.add_argument("path", metavar="PATH", help="the adapter's checkpoint, or a run of ours")
+    merge.add_argument("--out", metavar="DIR", required=True, help="folder to write")
+    merge.add_argument("--base-checkpoint", metavar="DIR", help="where the base lies, if it was moved")
+
+
+def run(args: argparse.Namespace) -> list[str]:
+    """Do it; return lines for standard output."""
+    path, out = Path(args.path), Path(args.out)
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    if args.action == MERGE:
+        from vla_eval.policies.openvla.merging import merge_adapter
+
+        return [str(merge_adapter(path, out, base_checkpoint=args.base_checkpoint))]
+    from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla
+
+    named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
+    options = ConvertOptions(
+        head=args.head,
+        chunk_size=args.chunk,
+        unnorm_key=args.unnorm_key,
+        gripper=args.gripper,
+        proprio=args.proprio,
+        allow_pickled=args.allow_pickled,
+        **named,
+    )
+    return [str(convert_openvla(path, out, options))]
