@@ -152,6 +152,8 @@ class TaskStatus:
         n_wrong_choices: how many different wrong candidates have been touched in the response phase.
         chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
             environment; None where it has to be measured.
+        candidate_places: the place at which each candidate lies when the response phase begins, in candidate
+            order: 0 is the rightmost as the robot sees it (-y). Empty where places are not known.
     """
 
     phase: Phase
@@ -163,6 +165,7 @@ class TaskStatus:
     n_wrong_choices: int
     right_first_choices: tuple[int, ...] = ()
     chance_success: float | None = None
+    candidate_places: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

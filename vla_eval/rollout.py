@@ -7,9 +7,10 @@ environment executes it and renders only if somebody will look at the picture.
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_eval.core import (
     ActionChunk,
@@ -22,11 +23,14 @@ from vla_eval.core import (
     Stage,
     StepObserver,
     StepResult,
+    TaskStatus,
 )
 from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
 from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, PolicySpec, check_compatible
+
+TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre point, m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +65,8 @@ class _Episode:
     n_inferences: int = 0
     n_frames: int = 0
     n_clipped_steps: int = 0
+    tcp_start_m: NDArray[np.float64] | None = None
+    tcp_reach_m: float | None = None
     done: bool = False
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
 
@@ -127,6 +133,7 @@ def _begin(
             executor=ChunkExecutor(settings.chunking),
             result=result,
             window=[result.observation],
+            tcp_start_m=_tcp_m(result),
         )
         _digest_state(episode, result)
         for observer in observers:
@@ -149,7 +156,10 @@ def _infer(
     windows = [
         ObservationWindow(
             slot=episode.start.slot,
-            frames=tuple(episode.window if policy.spec.reads == "every" else episode.window[-1:]),
+            frames=tuple(
+                _as_declared(observation, policy.spec)
+                for observation in (episode.window if policy.spec.reads == "every" else episode.window[-1:])
+            ),
         )
         for episode in due
     ]
@@ -165,6 +175,18 @@ def _infer(
         episode.window.clear()
         for observer in observers:
             observer.on_inference(episode.start, episode.n_steps, chunk)
+
+
+def _as_declared(observation: Observation, spec: PolicySpec) -> Observation:
+    """Return what the policy has declared that it reads: observers may have asked for more.
+
+    A missing picture stays missing: `check_compatible` has found each camera in the environment.
+    """
+    return replace(
+        observation,
+        images={name: image for name, image in observation.images.items() if name in spec.cameras},
+        privileged=observation.privileged if spec.privileged else None,
+    )
 
 
 def _step(
@@ -215,6 +237,7 @@ def _account(
     """Take down what one control step brought."""
     episode.n_steps += 1
     _check_result(episode, result)
+    _account_reach(episode, result)
     episode.result = result
     episode.window.append(result.observation)
     episode.episode_return += result.reward
@@ -230,6 +253,19 @@ def _account(
         or result.status.fail
         or (stops and since_success >= settings.steps_after_success)
     )
+
+
+def _account_reach(episode: _Episode, result: StepResult) -> None:
+    """Keep how far the tool centre point ever was from where it began; None if its pose is no state."""
+    position_m = _tcp_m(result)
+    if position_m is not None and episode.tcp_start_m is not None:
+        distance_m = float(np.linalg.norm(position_m - episode.tcp_start_m))
+        episode.tcp_reach_m = max(episode.tcp_reach_m or 0.0, distance_m)
+
+
+def _tcp_m(result: StepResult) -> NDArray[np.float64] | None:
+    pose = result.observation.state.get(TCP_POSE)
+    return None if pose is None else pose[:3].astype(np.float64)
 
 
 def _check_result(episode: _Episode, result: StepResult) -> None:
@@ -298,4 +334,11 @@ def _record(episode: _Episode, spec: PolicySpec, settings: RolloutSettings) -> E
         n_frames=episode.n_frames,
         n_clipped_steps=episode.n_clipped_steps,
         trajectory_sha256=episode.digest.hexdigest(),
+        target_place=_place(status, status.target),
+        first_choice_place=_place(status, status.first_choice),
+        tcp_reach_m=episode.tcp_reach_m,
     )
+
+
+def _place(status: TaskStatus, candidate: int | None) -> int | None:
+    return status.candidate_places[candidate] if status.candidate_places and candidate is not None else None

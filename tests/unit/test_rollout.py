@@ -27,6 +27,7 @@ from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
+from vla_eval.tasks.layout import places_from_right
 
 TASK = "RememberColor3-v0"
 HORIZON = 60
@@ -348,3 +349,37 @@ def test_records_are_plain_values() -> None:
 
     assert EpisodeRecord.from_json(record.to_json(), where="here") == record
     assert all(type(value).__module__ == "builtins" for value in dataclasses.asdict(record).values())
+
+
+class TestWhatIsRecordedOfTheChoice:
+    def test_places_are_counted_from_the_robots_right(self) -> None:
+        # Seen from the robot, which looks along +x, -y is on the right; the third thing lies farthest there.
+        positions_m = np.array([[0.0, 0.1], [0.0, 0.0], [0.0, -0.1]])
+        assert places_from_right(positions_m) == (2, 1, 0)
+
+    def test_the_first_choice_of_a_policy_that_remembers_lies_where_the_target_does(self) -> None:
+        policy = Reacher(privileged=True)
+        env = env_for(policy)
+        (result,) = env.reset({0: 1}, render=False).values()
+        places = result.status.candidate_places
+        assert result.status.target is not None
+        record = run(policy, env=env)
+        assert record.target_place == record.first_choice_place == places[result.status.target]
+
+    def test_the_reach_is_the_distance_from_the_start_and_not_the_way(self) -> None:
+        # Along x there and back again: 10 steps of 0.039 m each way; it was never farther than 0.39 m.
+        class ThereAndBack(Pusher):
+            def chunk(self, window: ObservationWindow) -> ActionChunk:
+                action = np.zeros((1, 7), dtype=np.float32)
+                action[0, 0] = {True: 1.0, False: -1.0}[window.last.step < 10] * (window.last.step < 20)
+                return ActionChunk(actions=action)
+
+        assert run(ThereAndBack()).tcp_reach_m == pytest.approx(0.39, abs=1e-6)
+
+
+def test_a_policy_is_given_only_what_it_declares_whatever_observers_ask_for() -> None:
+    policy = Pusher(cameras=("base_camera",))
+    env = FakeEnv(EnvSettings(task=TASK, simulator="fake", cameras=ALL_CAMERAS, privileged=True))
+    run(policy, env=env)
+    assert {tuple(frame.images) for window in policy.windows for frame in window.frames} == {("base_camera",)}
+    assert all(frame.privileged is None for window in policy.windows for frame in window.frames)

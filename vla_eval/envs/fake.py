@@ -27,6 +27,7 @@ from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
 M_PER_STEP = 0.039  # what ManiSkill's pd_ee_delta_pose really moves per step at action 1
@@ -220,6 +221,7 @@ class FakeEnv:
             target=_only(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=self._chance(),
+            candidate_places=places_from_right(episode.candidates_m[:, :2]),
             n_candidates=self._n_items,
             first_choice=episode.touched[0] if episode.touched else None,
             n_wrong_choices=sum(choice not in episode.targets for choice in episode.touched),

@@ -308,6 +308,7 @@ def _status(env: Any, info: Any, row: int) -> TaskStatus:
         n_wrong_choices=int(info["n_wrong_choices"][row]) if is_choice else 0,
         right_first_choices=env.right_first_choices(row) if is_choice else (),
         chance_success=env.chance_success() if is_choice else None,
+        candidate_places=env.candidate_places(row) if is_choice else (),
     )
 
 

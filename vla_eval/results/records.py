@@ -58,6 +58,10 @@ class EpisodeRecord:
             right, how many there were, which one was touched first and whether that was right, and how
             many different wrong ones were touched; None for a task without candidates.
             first_choice_success is False if no candidate was touched; target is None where several are.
+        target_place, first_choice_place: where the right candidate and the first one touched lay, counted
+            from the robot's right; None as above, and where an environment does not tell.
+        tcp_reach_m: how far the tool centre point ever was from where it began, straight; None in records of
+            earlier versions.
         chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
             episode; None where it has to be measured.
         episode_return: sum of rewards.
@@ -88,6 +92,9 @@ class EpisodeRecord:
     n_frames: int | None = None
     n_clipped_steps: int | None = None
     trajectory_sha256: str | None = None
+    target_place: int | None = None
+    first_choice_place: int | None = None
+    tcp_reach_m: float | None = None
     error: EpisodeError | None = None
 
     @property

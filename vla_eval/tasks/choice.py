@@ -11,6 +11,7 @@ import torch
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
 
 NO_CHOICE = -1
@@ -70,6 +71,10 @@ class ChoiceEnv(MemoryTableEnv):
         revealed = self.response_begun()[:, None, None]
         positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
         return positions
+
+    def candidate_places(self, env: int) -> tuple[int, ...]:
+        """Return where each candidate of one environment will lie in the response phase."""
+        return places_from_right(self._slots[env, :, :2].cpu().numpy())
 
     def touch_points_m(self) -> torch.Tensor:
         """Return (B, N, 3): the points that the tool centre point must come near, world frame."""

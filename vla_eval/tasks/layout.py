@@ -15,6 +15,8 @@ MIXED_MIN_DISTANCE_M = 0.061  # a cross is 6 cm wide
 # The official arc is squeezed in y by so much per place, for these numbers of items only.
 SQUEEZE_M = {5: 0.025, 9: 0.025}
 
+ARC_CENTRE_X_M = -0.25  # the places of the official arc lie around (-0.25, 0)
+
 Plane = NDArray[np.float64]
 """Positions in the table's plane, (…, 2), m."""
 
@@ -35,10 +37,24 @@ def slot_centres_m(n_items: int) -> Plane:
     angles = [math.pi * rank / n_items for rank in ranks]
     return np.array(
         [
-            (0.3 * math.cos(angle) - 0.25, 0.3 * math.sin(angle) - squeeze_m * rank)
+            (0.3 * math.cos(angle) + ARC_CENTRE_X_M, 0.3 * math.sin(angle) - squeeze_m * rank)
             for rank, angle in zip(ranks, angles, strict=True)
         ]
     )
+
+
+def places_from_right(positions_m: Plane) -> tuple[int, ...]:
+    """Return the place of each thing: 0 is the rightmost as the robot sees it.
+
+    Counted by the angle about the centre of the arc: the outermost places of an arc of nine differ by 1 cm
+    in y, which is the jitter, but by more than 20 degrees.
+
+    Args:
+        positions_m: (N, 2) xy, world frame.
+    """
+    angles = np.arctan2(positions_m[:, 1], positions_m[:, 0] - ARC_CENTRE_X_M)
+    order = np.argsort(angles, kind="stable")
+    return tuple(int(place) for place in np.argsort(order, kind="stable"))
 
 
 def jittered(centres_m: Plane, rng: np.random.Generator) -> Plane:
