@@ -16,8 +16,8 @@ help:  ## list these verbs
 setup:  ## make .venv and, where there is none, a Vulkan driver
 	@bash scripts/setup.sh
 
-demo: setup  ## evaluate scripted policies on one task and print the table
-	$(BIN)/mikasa-vla eval configs/demo.yaml
+demo: setup  ## evaluate scripted policies on two tasks, print the table, write the report page
+	$(BIN)/mikasa-vla eval configs/demo.yaml --html runs/demo-report
 
 test: setup  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)

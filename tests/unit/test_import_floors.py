@@ -60,6 +60,7 @@ CHEAP = (
     "cli.dataset",
     "cli.train_expert",
     "training.ppo_settings",
+    "page.build",
 )
 CHEAP_PACKAGES = (vla_eval.results, vla_eval.testing)
 

@@ -82,6 +82,9 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=("markdown", "csv", "json", "latex"), default="markdown")
     parser.add_argument("--baseline", metavar="NAME", help="policy that the others are compared with")
     parser.add_argument("--paper", action="store_true", help="print the paper's figures beside ours")
+    parser.add_argument(
+        "--html", type=Path, metavar="DIR", help="also write a page: DIR/index.html; its path comes last"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -120,8 +123,9 @@ def run(args: argparse.Namespace) -> int:
             f"retries them. Causes: {out}/episodes.jsonl, {out}/logs/.",
             file=sys.stderr,
         )
-        return EXIT_EPISODE_ERRORS
-    return 0
+    if args.html is not None:
+        _write_page(out, args)
+    return EXIT_EPISODE_ERRORS if summary.n_errors else 0
 
 
 def _print_table(out: Path, args: argparse.Namespace) -> None:
@@ -133,6 +137,15 @@ def _print_table(out: Path, args: argparse.Namespace) -> None:
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
+
+
+def _write_page(out: Path, args: argparse.Namespace) -> None:
+    from vla_eval.page.build import write_page
+    from vla_eval.results.store import read_run
+
+    page = write_page([read_run(out)], args.html, baseline=args.baseline)
+    sys.stdout.flush()  # the table first, wherever the two go
+    print(f"Report page: {page}", file=sys.stderr)
 
 
 def _check_baseline(baseline: str | None, config: EvalConfig) -> None:

@@ -1,4 +1,4 @@
-"""`mikasa-vla report`: print the success table of one or more run folders."""
+"""`mikasa-vla report`: print the success table of one or more run folders, or write it as a page."""
 
 import argparse
 import sys
@@ -10,7 +10,9 @@ FORMATS = ("markdown", "csv", "json", "latex")
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
 
 Each RUN is a folder that `mikasa-vla eval` made; a run may still be going on. Several runs go into one
-table: rows with the same task, policy, n_action_steps and settings are put together."""
+table: rows with the same task, policy, n_action_steps and settings are put together.
+
+With --html, a page with plots, choices, errors and recordings is written instead, and its path printed."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -31,12 +33,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
     parser.add_argument(
+        "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
+    )
+    parser.add_argument(
         "--paper", action="store_true", help="print the paper's figures for the same tasks beside one's own"
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the runs and print their table.
+    """Read the runs, and print their table or write their page.
 
     Raises:
         VlaEvalError: a RUN is no run folder, holds nothing yet, or has no such baseline.
@@ -45,7 +50,13 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.results.report import build_table, render
     from vla_eval.results.store import read_run
 
-    table = build_table([read_run(path) for path in args.runs], baseline=args.baseline)
+    runs = [read_run(path) for path in args.runs]
+    if args.html is not None:
+        from vla_eval.page.build import write_page
+
+        print(write_page(runs, args.html, baseline=args.baseline))
+        return 0
+    table = build_table(runs, baseline=args.baseline)
     print(render(table, args.format, paper=args.paper))
     if args.format == "csv":  # has no place for them
         for note in table.notes:

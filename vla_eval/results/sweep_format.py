@@ -17,16 +17,20 @@ TITLES = (
 
 def render_sweep(sweep: Sweep, fmt: SweepFormat) -> str:
     """Return the comparison as text, without the notes for CSV."""
-    cells = [_cells(row, sweep) for row in sweep.rows]
-    # A column in which nothing stands says nothing: the variant, where there is one only.
-    kept = [i for i, _ in enumerate(TITLES) if any(row[i] != "" for row in cells)]
-    titles = [TITLES[i] for i in kept]
-    rows = [[row[i] for i in kept] for row in cells]
+    titles, rows = sweep_cells(sweep)
     if fmt == "csv":
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([titles, *rows])
         return text.getvalue().rstrip("\n")
     return f"{_markdown(titles, rows)}\n\n" + "\n".join(f"- {note}" for note in sweep_notes(sweep))
+
+
+def sweep_cells(sweep: Sweep) -> tuple[list[str], list[list[str]]]:
+    """Return the titles of the columns, and each row's cells."""
+    cells = [_cells(row, sweep) for row in sweep.rows]
+    # A column in which nothing stands says nothing: the variant, where there is one only.
+    kept = [i for i, _ in enumerate(TITLES) if any(row[i] != "" for row in cells)]
+    return [TITLES[i] for i in kept], [[row[i] for i in kept] for row in cells]
 
 
 def sweep_notes(sweep: Sweep) -> list[str]:

@@ -51,6 +51,12 @@ def render(table: Table, fmt: Format, *, paper: bool = False) -> str:
     return writers[fmt](table, figures)
 
 
+def table_cells(table: Table) -> tuple[list[Column], list[list[str]]]:
+    """Return the columns that are to be read, and each row's cells."""
+    columns = _columns(table)
+    return columns, [[column.cell(row) for column in columns] for row in table.rows]
+
+
 def _paper_figures(table: Table) -> list[PaperFigure]:
     tasks = dict.fromkeys(row.task for row in table.rows)
     return [figure for task in tasks for figure in PAPER_TABLE if figure.task == task]

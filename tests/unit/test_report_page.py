@@ -1,0 +1,243 @@
+"""The report page: equal to the JSON report, nothing made up, nothing that could become markup or load."""
+
+import json
+import re
+import shutil
+import subprocess
+from functools import lru_cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from vla_eval.cli.main import main
+from vla_eval.errors import ReportError
+from vla_eval.page.build import build_page, write_page
+from vla_eval.page.charts import Bar, Point, Series, curves, forest
+from vla_eval.page.markup import element
+from vla_eval.results.recording_files import video_file
+from vla_eval.results.records import EpisodeError, EpisodeRecord
+from vla_eval.results.report import build_table, render
+from vla_eval.results.store import RunDescription, RunFolder, Session, StoredRun, read_run
+from vla_eval.results.table_formats import table_cells
+
+COLOR, INTERCEPT = "RememberColor3-v0", "InterceptMedium-v0"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM_FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+
+
+def episode(policy: str, seed: int, won: bool, *, task: str = COLOR, k: int = 1) -> EpisodeRecord:
+    target = seed % 3
+    choice = {"target": target, "n_candidates": 3, "first_choice": target if won else (target + 1) % 3}
+    return EpisodeRecord(
+        task=task,
+        policy=policy,
+        n_action_steps=k,
+        run=0,
+        seed=seed,
+        outcome="success" if won else "failure",
+        success_once=won,
+        success_at_end=won,
+        success_step=20 + seed if won else None,
+        n_steps=60,
+        first_choice_success=won if task == COLOR else None,
+        n_inferences=60 // k,
+        trajectory_sha256=f"{task}{policy}{k}{seed}",
+        **(choice if task == COLOR else {}),
+    )
+
+
+def error(policy: str, seed: int, message: str = "gone") -> EpisodeRecord:
+    failed = EpisodeError(kind="WorkerCrashed", stage="step", message=message)
+    return EpisodeRecord(
+        task=COLOR, policy=policy, n_action_steps=1, run=0, seed=seed, outcome="error", error=failed
+    )
+
+
+def stored(*records: EpisodeRecord, path: Path = Path("runs/a"), name: str = "demo") -> StoredRun:
+    description = RunDescription(
+        name=name,
+        config={"tasks": [COLOR], "episodes": 4},
+        recipes={"policies/p": "f00d"},
+        environment={"python": "3.12.1"},
+        options={},
+        command="mikasa-vla eval demo",
+    )
+    session = Session(started_at="2030-01-01T00:00:00+00:00", command="mikasa-vla eval demo", options={})
+    return StoredRun(path=path, description=description, records=records, sessions=(session,))
+
+
+def full_run() -> StoredRun:
+    return stored(
+        *(episode(policy, seed, seed < n, k=k) for policy, n in (("p", 4), ("random", 1)) for k in (1, 4)
+          for seed in range(6)),
+        *(episode("p", seed, seed % 2 == 0, task=INTERCEPT) for seed in range(4)),
+        error("p", 6),
+    )  # fmt: skip
+
+
+@lru_cache
+def full_page() -> str:
+    """Build it once: the statistics take a while."""
+    return build_page([full_run()])
+
+
+class Page(HTMLParser):
+    """Reads back the rows of the first table, the sections, and what the page would load."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.data: list[dict[str, object]] = []
+        self.sections: dict[str, str] = {}
+        self.loads: list[str] = []
+        self._section = self._cell = None
+        self._tables = 0
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        self._tables += tag == "table"
+        if tag == "section":
+            self._section = named["id"]
+            self.sections[self._section] = ""
+        if tag == "tr" and self._tables == 1:
+            self.rows.append([])
+            if named.get("data-row"):
+                self.data.append(json.loads(named["data-row"] or ""))
+        if tag in ("td", "th"):
+            self._cell = tag
+            if self._tables == 1:
+                self.rows[-1].append("")
+        self.loads += [value for name, value in attrs if name in ("src", "href", "poster") and value]
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("td", "th"):
+            self._cell = None
+
+    def handle_data(self, data: str) -> None:
+        if self._section:
+            self.sections[self._section] += data
+        if self._cell and self._tables == 1:
+            self.rows[-1][-1] += data
+
+
+def test_the_table_of_the_page_is_the_json_report() -> None:
+    run = full_run()
+    page, table = Page(full_page()), build_table([run])
+    assert page.data == json.loads(render(table, "json"))["rows"]
+    columns, cells = table_cells(table)
+    assert page.rows == [[column.title for column in columns], *cells]
+
+
+def test_the_json_report_is_in_the_page_for_programs() -> None:
+    run = full_run()
+    text = re.search(r'<script type="application/json" id="report">(.*?)</script>', full_page(), re.S)
+    assert text is not None
+    assert json.loads(text[1]) == json.loads(render(build_table([run]), "json"))
+
+
+def test_the_same_runs_give_the_same_page() -> None:
+    assert full_page() == build_page([full_run()])
+
+
+def test_every_section_is_there_and_speaks() -> None:
+    sections = Page(full_page()).sections
+    assert list(sections) == [
+        *("table", "success", "chunks", "paired", "steps", "choices", "latency", "errors", "episodes"),
+        "reproduce",
+    ]
+    assert "WorkerCrashed" in sections["errors"]
+    assert "mikasa-vla eval demo" in sections["reproduce"] and "f00d" in sections["reproduce"]
+    assert "3.12.1" in sections["reproduce"]
+
+
+def test_what_is_missing_is_said_in_words() -> None:
+    record = episode("p", 1, True, task=INTERCEPT)
+    sections = Page(build_page([stored(record)])).sections
+    assert "Only one n_action_steps" in sections["chunks"]
+    assert "There is no baseline" in sections["paired"]
+    assert "No task of this table has candidates" in sections["choices"]
+    assert "no timing was kept" in sections["latency"]
+    assert "No episode ended in an error" in sections["errors"]
+    assert "No videos were recorded" in sections["episodes"]
+
+
+def test_text_of_a_run_never_becomes_markup() -> None:
+    evil = "</script><script>alert(1)</script><img src=http://evil>"
+    page = build_page([stored(episode(evil, 1, True), error("p", 2, evil), name=evil)])
+    assert "<script>alert" not in page
+    assert Page(page).loads.count("http://evil") == 0
+
+
+def test_nothing_is_loaded_from_anywhere(tmp_path: Path) -> None:
+    run = stored(*full_run().records, path=tmp_path)
+    video = video_file(tmp_path, run.records[0])
+    video.parent.mkdir()
+    video.write_bytes(b"not a video, but bytes")
+    page = build_page([run])
+    assert "default-src &#x27;none&#x27;" in page
+    links = [link for link in Page(page).loads if not link.startswith("#")]
+    assert {link.split(",")[0] for link in links} == {"data:", "data:video/mp4;base64"}
+
+
+def test_a_rate_lies_where_it_belongs_and_no_result_is_said_in_words() -> None:
+    bars = [
+        Bar(label="a", color=0, value=0.5, low=0.25, high=0.75, chance=None, ceiling=None),
+        Bar(label="b", color=1, value=None, low=None, high=None, chance=None, ceiling=None),
+    ]
+    drawn = forest(bars, title="t", description="d")
+    whisker = re.search(r'<line x1="([\d.]+)" x2="([\d.]+)" [^>]*class="whisker', drawn)
+    marker = re.search(r'<circle cx="([\d.]+)"', drawn)
+    assert whisker and marker
+    assert float(marker[1]) - float(whisker[1]) == pytest.approx(100, abs=0.02)  # a quarter of 400 px
+    assert float(whisker[2]) - float(marker[1]) == pytest.approx(100, abs=0.02)
+    assert "no result" in drawn
+
+
+def test_a_higher_rate_is_drawn_higher() -> None:
+    points = (Point(1, 0.0), Point(8, 1.0))
+    drawn = curves(
+        [Series(name="p", color=0, points=points)], title="t", description="d", x_title="K", x_ticks=[1, 8]
+    )
+    corners = re.search(r'points="([\d.]+),([\d.]+) ([\d.]+),([\d.]+)"', drawn)
+    assert corners is not None
+    x1, y1, x2, y2 = map(float, corners.groups())
+    assert x1 < x2 and y1 - y2 == pytest.approx(180)  # the height of the plot
+
+
+def test_elements_escape_text_and_attributes() -> None:
+    assert element("p", "a<b", title='"&') == '<p title="&quot;&amp;">a&lt;b</p>'
+
+
+def test_the_verb_prints_the_path_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunFolder.open(tmp_path / "run", stored().description) as folder:
+        for record in full_run().records:
+            folder.append(record)
+    assert main(["report", str(tmp_path / "run"), "--html", str(tmp_path / "page")]) == 0
+    page = tmp_path / "page" / "index.html"
+    assert capsys.readouterr().out == f"{page}\n"
+    assert page.read_text(encoding="utf-8") == build_page([read_run(tmp_path / "run")])
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ReportError, match=r"file/page/index\.html: cannot be written"):
+        write_page([full_run()], tmp_path / "file" / "page")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_a_browser_shows_the_page_without_complaint(tmp_path: Path) -> None:
+    run = full_run()
+    page = write_page([run], tmp_path / "page")
+    command = [str(CHROMIUM), *CHROMIUM_FLAGS, f"--user-data-dir={tmp_path / 'profile'}"]
+    command += ["--enable-logging=stderr", "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "CONSOLE" not in done.stderr  # where chromium logs what a page does wrong
+    read = Page(done.stdout)  # the browser's own reading of the page
+    _, cells = table_cells(build_table([run]))
+    assert read.rows[1:] == cells
+    assert len(re.findall(r'<svg[^>]*role="img"', done.stdout)) >= 4

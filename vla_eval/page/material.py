@@ -1,0 +1,96 @@
+"""Gather, once, what the sections of the report page speak of. Computes nothing that is not in results."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from vla_eval.results.comparison import compare_with_baseline, count_pairs
+from vla_eval.results.estimates import PairCounts
+from vla_eval.results.grouping import Grouping, RowGroup, RowKey, group_runs
+from vla_eval.results.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.results.report import build_table
+from vla_eval.results.store import StoredRun
+from vla_eval.results.table import Row, Table
+from vla_eval.results.timings import read_timings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Material:
+    """What a page is made of.
+
+    Attributes:
+        runs: each run folder once.
+        table: as `mikasa-vla report` prints it.
+        grouping: the episodes of each of its rows.
+        pairs: the counts behind each comparison with the baseline.
+        timings: run folder -> episode -> seconds.
+        colors: policy -> number of its colour and marker, the same in every plot.
+    """
+
+    runs: tuple[StoredRun, ...]
+    table: Table
+    grouping: Grouping
+    pairs: Mapping[RowKey, PairCounts]
+    timings: Mapping[str, Mapping[EpisodeKey, EpisodeTiming]]
+    colors: Mapping[str, int]
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks in the order of the table."""
+        return list(dict.fromkeys(row.task for row in self.table.rows))
+
+    def rows_of(self, task: str) -> list[Row]:
+        """Return the rows of a task."""
+        return [row for row in self.table.rows if row.task == task]
+
+    def group_of(self, row: Row) -> RowGroup:
+        """Return the episodes of a row."""
+        return self.grouping.groups[key_of(row)]
+
+    def name_of(self, row: Row, *, with_task: bool = False) -> str:
+        """Return what a row is called within its task: policy, K, and its variant if there are several."""
+        parts = [row.task] if with_task else []
+        parts += [row.policy, f"K={row.n_action_steps}"]
+        return " · ".join([*parts, row.variant] if row.variant else parts)
+
+
+def key_of(row: Row) -> RowKey:
+    """Return the key of a row."""
+    return RowKey(row.task, row.policy, row.n_action_steps, row.variant)
+
+
+def gather(runs: Sequence[StoredRun], *, baseline: str | None) -> Material:
+    """Read and compute all that the page shows.
+
+    Args:
+        runs: what the run folders hold; a folder given twice counts once.
+        baseline: as for `build_table`.
+
+    Raises:
+        ReportError: there is no episode yet.
+        UnknownNameError: there is no such baseline.
+    """
+    runs = tuple({run.path.resolve(): run for run in runs}.values())
+    table = build_table(runs, baseline=baseline)
+    grouping = group_runs(runs)
+    compared = compare_with_baseline(grouping.groups, table.baseline) if table.baseline else {}
+    groups = grouping.groups
+    policies = dict.fromkeys(row.policy for row in table.rows)
+    return Material(
+        runs=runs,
+        table=table,
+        grouping=grouping,
+        pairs={key: count_pairs(groups[key], groups[found.baseline]) for key, found in compared.items()},
+        timings={str(run.path): read_timings(run.path) for run in runs},
+        colors={policy: number for number, policy in enumerate(policies)},
+    )
+
+
+def errors_of(material: Material) -> list[EpisodeRecord]:
+    """Return all episodes that ended in an error and are in the table."""
+    return [
+        record
+        for group in material.grouping.groups.values()
+        for run in group.runs
+        for record in run.records.values()
+        if record.outcome == "error"
+    ]
