@@ -1,8 +1,8 @@
 """The inside of a worker process: keep an environment and a policy at hand, run one batch at a time.
 
 It is told what to run over a pipe, says in shared memory what it is busy with, and writes no file but
-its log. After an error it is replaced by a new process: a native library or a GPU context may be left
-in a state that no rebuilding within the process mends.
+its log and, if asked, recordings of its episodes. After an error it is replaced by a new process: a
+native library or a GPU context may be left in a state that no rebuilding within the process mends.
 """
 
 import ctypes
@@ -32,6 +32,7 @@ from vla_eval.registry import policy_factory
 from vla_eval.results.records import EpisodeError, EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.specs import EnvSpec, check_compatible
+from vla_eval.viz.recorder import Recorder
 
 STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
 MAX_DETAILS = 20_000  # characters of a traceback; the log has it all
@@ -146,8 +147,11 @@ class Runner(Protocol):
 class EpisodeRunner:
     """Runs episodes, keeping environment and policy between those of one group."""
 
-    def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
+    def __init__(
+        self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None], recorder: Recorder | None = None
+    ) -> None:
         """Start with nothing made."""
+        self._recorder = recorder
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
@@ -191,9 +195,14 @@ class EpisodeRunner:
             )
             for job in batch.jobs
         ]
-        records = rollout(env, policy, starts, group.rollout, heartbeat=self._heartbeat)
+        tapes = self._recorder.tapes(batch.jobs) if self._recorder else None
+        observers = [tapes] if tapes else []
+        records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are told apart by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
+        if self._recorder and tapes:
+            self._heartbeat("step")  # a time limit of its own
+            self._recorder.write(batch.jobs, tapes, named, env.spec.control_hz)
         return Finished(records=named, timings=self._heartbeat.timings(batch.jobs))
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
@@ -206,12 +215,23 @@ class EpisodeRunner:
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
-            env = self._make_env(
-                dataclasses.replace(group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged)
-            )
+            env = self._make_env(self._settings_for(group, policy, facts))
             self._policy, self._loaded = policy, group.key
             return env, policy
         return self._env, self._policy
+
+    def _settings_for(self, group: Group, policy: Policy, facts: EnvFacts) -> EnvSettings:
+        """Return what the policy needs; and what is recorded, of which the loop gives the policy nothing."""
+        if self._recorder is None:
+            return dataclasses.replace(
+                group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged
+            )
+        return dataclasses.replace(
+            group.env,
+            cameras=tuple(camera.name for camera in facts.spec.cameras),
+            privileged=True,
+            human_camera_stride=self._recorder.config.frame_stride,
+        )
 
     def _describe_env(self, job: EpisodeJob) -> EnvFacts:
         """Return what the policy has to know of an environment whose cameras it then decides on."""
@@ -271,10 +291,16 @@ def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
     )
 
 
-def worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+def worker_main(
+    connection: Connection,
+    shared: SharedStage,
+    log: Path,
+    parent_pid: int,
+    recorder: Recorder | None = None,
+) -> None:
     """Run episodes for the parent until it closes the pipe; the entry point of the worker process."""
     detach(log, parent_pid)
-    runner = EpisodeRunner(Heartbeat(shared), connection.send)
+    runner = EpisodeRunner(Heartbeat(shared), connection.send, recorder)
     serve(connection, runner)
 
 

@@ -81,6 +81,10 @@ class RecordingError(VlaEvalError):
     """Demonstrations could not be recorded: an expert that fails, a worker that dies, states that differ."""
 
 
+class ViewingError(VlaEvalError):
+    """A video or a rerun recording could not be written, found or opened."""
+
+
 class TrainingError(VlaEvalError):
     """A fine-tuning cannot be started, continued, or has gone wrong."""
 

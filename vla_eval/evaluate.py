@@ -5,6 +5,7 @@ one is run; a mistake that every episode would repeat ends the run. Stopped at a
 means, the same call goes on where it stopped.
 """
 
+import functools
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ from vla_eval.provenance import collect_environment
 from vla_eval.recipes import EvalConfig
 from vla_eval.results.records import EpisodeError, EpisodeRecord
 from vla_eval.results.store import RunDescription, RunFolder
+from vla_eval.viz.recorder import Recorder
 from vla_eval.workers import Answered, WorkerPool
 
 RUNS_FOLDER = Path("runs")
@@ -160,7 +162,13 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
     logs.mkdir(exist_ok=True)
     config = bookkeeper.config
     new_pool = WorkerPool[EpisodeBatch, Finished]
-    with new_pool(worker_main, size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
+    main = worker_main
+    if config.recording.is_on:
+        recorder = Recorder(
+            config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
+        )
+        main = functools.partial(worker_main, recorder=recorder)
+    with new_pool(main, size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
         for event in pool.run(queue):
             if isinstance(event, Answered):
                 bookkeeper.take(event)

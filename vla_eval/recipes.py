@@ -17,6 +17,7 @@ from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.training.recipe import FinetuneRecipe
+from vla_eval.viz.settings import RecordingConfig
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
 PACKAGE_ROOT = Path(__file__).parent
@@ -140,6 +141,7 @@ class EvalConfig:
     workers: int | Literal["auto"] = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: int = 10
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
@@ -163,7 +165,7 @@ class EvalConfig:
             self.chunking.spec(n_action_steps)  # checks the ranges
 
 
-OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors")
+OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "recording")
 """Fields of `EvalConfig` that move no result: they may differ when a run is continued."""
 
 

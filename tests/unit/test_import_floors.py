@@ -61,6 +61,8 @@ CHEAP = (
     "cli.train_expert",
     "training.ppo_settings",
     "page.build",
+    "cli.view",
+    "viz.recorder",
 )
 CHEAP_PACKAGES = (vla_eval.results, vla_eval.testing)
 

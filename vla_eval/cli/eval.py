@@ -63,6 +63,12 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
+    for kind, what in (("video", "an mp4"), ("rrd", "a recording for the rerun viewer")):
+        parser.add_argument(
+            f"--record-{kind}",
+            metavar="WHICH",
+            help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
+        )
     parser.add_argument(
         "--set",
         action="append",
@@ -155,6 +161,16 @@ def _check_baseline(baseline: str | None, config: EvalConfig) -> None:
         raise unknown_name("policy", baseline, policies, where="--baseline")
 
 
+def _which(text: str, *, flag: str) -> str | int:
+    """Read which episodes to record."""
+    if text.isascii() and text.isdigit():
+        return int(text)
+    known = ("none", "all", "failures", "successes")
+    if text not in known:
+        raise unknown_name("choice of episodes", text, (*known, "N (a number)"), where=flag)
+    return text
+
+
 def _config(args: argparse.Namespace) -> EvalConfig:
     """Return the configuration: the file, flags on top of it, `--set` on top of those."""
 
@@ -163,6 +179,10 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             value = getattr(args, name)
             if value is not None:
                 data[name] = value
+        for kind in ("video", "rrd"):
+            which = getattr(args, f"record_{kind}")
+            if which is not None:
+                data.setdefault("recording", {})[kind] = _which(which, flag=f"--record-{kind}")
         apply_overrides(data, args.overrides, cls=EvalConfig)
 
     if args.config is not None:

@@ -20,6 +20,7 @@ VERBS = (
     "report",
     "compare",
     "audit",
+    "view",
     "record",
     "replay",
     "dataset",

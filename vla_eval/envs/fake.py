@@ -21,7 +21,7 @@ from vla_eval.core import (
     StepResult,
     TaskStatus,
 )
-from vla_eval.envs.settings import EnvSettings
+from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -241,14 +241,20 @@ class FakeEnv:
         self.n_renders += render
         return Observation(
             step=episode.step,
-            images={name: self._picture(episode, name) for name in self._settings.cameras} if render else {},
+            images={name: self._picture(episode, name) for name in self._shown(episode)} if render else {},
             state={name: np.array(values, dtype=np.float32) for name, values in state.items()},
             privileged=self._privileged(episode) if self._settings.privileged else None,
         )
 
+    def _shown(self, episode: _Episode) -> tuple[str, ...]:
+        stride = self._settings.human_camera_stride
+        if stride is None or (episode.step % stride and episode.step != self.spec.horizon_steps):
+            return self._settings.cameras
+        return (*self._settings.cameras, HUMAN_CAMERA)
+
     def _picture(self, episode: _Episode, camera: str) -> ImageArray:
         """Return a picture that shows the cue in its first rows, and otherwise depends on the state alone."""
-        view = [known.name for known in CAMERAS].index(camera)
+        view = [*(known.name for known in CAMERAS), HUMAN_CAMERA].index(camera)
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )

@@ -23,7 +23,7 @@ from vla_eval.core import (
     StepResult,
     TaskStatus,
 )
-from vla_eval.envs.settings import EnvSettings
+from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -150,6 +150,13 @@ class ManiSkillEnv:
             env.close()
         self._envs = []
 
+    def _shows_human(self, info: Any, slots: list[int]) -> bool:
+        stride = self._settings.human_camera_stride
+        if stride is None:
+            return False
+        steps = [int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots]
+        return any(step % stride == 0 or step == self.spec.horizon_steps for step in steps)
+
     def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
         """Return (environment index, its slots that are meant), in order."""
         grouped: dict[int, list[int]] = {}
@@ -162,7 +169,11 @@ class ManiSkillEnv:
     ) -> dict[int, StepResult]:
         env = self._envs[index]
         executed = None if reward is None else env.executed_action
-        images = _take_pictures(env, self._settings.cameras) if render.intersection(slots) else {}
+        images = {}
+        if render.intersection(slots):
+            images = _take_pictures(env, self._settings.cameras)
+            if self._shows_human(info, slots):
+                images[HUMAN_CAMERA] = _take_human_picture(env)
         state = {
             "tcp_pose": env.agent.tcp.pose.raw_pose,
             "qpos": env.agent.robot.get_qpos(),
@@ -186,6 +197,16 @@ class ManiSkillEnv:
                 executed_action=None if executed is None else _array(executed[row]),
             )
         return results
+
+
+def _take_human_picture(env: Any) -> ImageArray:
+    """Return (B, H, W, 3) uint8 of the camera for people; what policies see is not touched."""
+    env.scene.update_render(update_sensors=False, update_human_render_cameras=True)
+    (camera,) = env.scene.human_render_cameras.values()
+    camera.capture()
+    textures = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+    image: ImageArray = textures["rgb"].cpu().numpy()
+    return image
 
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 SimBackend = Literal["cpu", "gpu"]
+HUMAN_CAMERA = "human_camera"
+"""Name of the picture for people; no policy can ask for it."""
+
 Simulator = Literal["maniskill", "fake"]
 
 
@@ -37,6 +40,8 @@ class EnvSettings:
         render: how pictures are made.
         cameras: the cameras that may be asked for pictures; empty: no renderer is started.
         privileged: whether observations carry the true state of the world.
+        human_camera_stride: every so many control steps, and at the reset, pictures include `human_camera`,
+            a view for people; None: never.
         n_slots: how many episodes run side by side.
     """
 
@@ -47,4 +52,5 @@ class EnvSettings:
     render: RenderSettings = field(default_factory=RenderSettings)
     cameras: tuple[str, ...] = ()
     privileged: bool = False
+    human_camera_stride: int | None = None
     n_slots: int = 1

@@ -1,0 +1,142 @@
+"""Compose the frames of a video: the cameras side by side, and what is known of the step below them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from vla_eval.core import ImageArray, Phase
+from vla_eval.envs.settings import HUMAN_CAMERA
+from vla_eval.results.records import EpisodeRecord
+from vla_eval.viz.tape import EpisodeTape, TapedStep
+
+VIEW_PX = 512  # the large view; the others are half of it, one below the other
+PANEL_PX = 112
+LINE_PX = 24
+MARGIN_PX = 10
+STRIP_PX = 12
+PAPER, INK, FAINT = (21, 23, 27), (232, 234, 238), (163, 169, 181)
+# Okabe and Ito, as on the report page.
+PHASE_COLORS: dict[Phase, tuple[int, int, int]] = {
+    "cue": (230, 159, 0),
+    "delay": (110, 116, 128),
+    "response": (86, 180, 233),
+}
+SUCCESS_COLOR, FAILURE_COLOR = (47, 196, 154), (255, 138, 61)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caption:
+    """What is written below the pictures of one step."""
+
+    instruction: str
+    episode: str
+    step: str
+    outcome: str
+    outcome_color: tuple[int, int, int]
+
+
+def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> ImageArray:
+    """Return one frame of an episode, (H, W, 3) uint8 with even sides.
+
+    Args:
+        tape: the whole episode.
+        taped: the step to show; it must have pictures.
+        record: what came of the episode.
+    """
+    images = taped.result.observation.images
+    small = [name for name in images if name != HUMAN_CAMERA]
+    width = VIEW_PX + VIEW_PX // 2
+    canvas = Image.new("RGB", (width, VIEW_PX + PANEL_PX), PAPER)
+    large = HUMAN_CAMERA if HUMAN_CAMERA in images else small[0]
+    canvas.paste(_scaled(images[large], VIEW_PX), (0, 0))
+    draw = ImageDraw.Draw(canvas)
+    for row, name in enumerate(small[:2]):
+        top = row * VIEW_PX // 2
+        canvas.paste(_scaled(images[name], VIEW_PX // 2), (VIEW_PX, top))
+        draw.text((VIEW_PX + 6, top + 4), name, font=_font(13), fill=INK, stroke_width=2, stroke_fill=PAPER)
+    _write(draw, _caption(tape, taped, record), width)
+    _draw_strip(draw, tape, taped, record, width)
+    return np.asarray(canvas, dtype=np.uint8)
+
+
+def _scaled(image: ImageArray, size_px: int) -> Image.Image:
+    # Pixels of the policy's cameras stay visible as such: it sees no more than these.
+    enlarges = image.shape[0] < size_px
+    picture = Image.fromarray(image)
+    how = Image.Resampling.NEAREST if enlarges else Image.Resampling.LANCZOS
+    return picture.resize((size_px, size_px), how)
+
+
+def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Caption:
+    status, start = taped.result.status, tape.start
+    n_inferences = sum(chunk.step <= taped.step for chunk in tape.chunks)
+    is_new = any(chunk.step == taped.step for chunk in tape.chunks)
+    parts = [f"step {taped.step}/{start.horizon_steps}", status.phase, f"inference {n_inferences}"]
+    parts += ["new chunk"] if is_new else []
+    if status.n_candidates:
+        target = "several" if status.target is None else str(status.target)
+        chosen = "none yet" if status.first_choice is None else str(status.first_choice)
+        parts += [f"target {target}", f"chosen {chosen}"]
+    outcome, color = "", INK
+    if record.success_step is not None and taped.step >= record.success_step:
+        outcome, color = f"SUCCESS at step {record.success_step}", SUCCESS_COLOR
+    elif taped.step == tape.steps[-1].step and record.outcome == "failure":
+        outcome, color = "FAILURE", FAILURE_COLOR
+    return Caption(
+        instruction=start.instruction,
+        episode=f"{record.task}  {record.policy}  K={record.n_action_steps}  "
+        f"run {record.run}  seed {record.seed}",
+        step="  |  ".join(parts),
+        outcome=outcome,
+        outcome_color=color,
+    )
+
+
+def _write(draw: ImageDraw.ImageDraw, caption: Caption, width: int) -> None:
+    top = VIEW_PX + STRIP_PX + 8
+    font, bold = _font(17), _font(18)
+    lines = ((caption.instruction, bold, INK), (caption.episode, font, FAINT), (caption.step, font, INK))
+    for index, (text, fitting, color) in enumerate(lines):
+        fitted = _fitted(draw, text, fitting, width - 2 * MARGIN_PX)
+        draw.text((MARGIN_PX, top + index * LINE_PX), fitted, font=fitting, fill=color)
+    size = draw.textlength(caption.outcome, font=bold)
+    place = (width - MARGIN_PX - size, top + LINE_PX)
+    draw.text(place, caption.outcome, font=bold, fill=caption.outcome_color)
+
+
+def _fitted(
+    draw: ImageDraw.ImageDraw, text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
+) -> str:
+    """Return the text, cut to what fits."""
+    if draw.textlength(text, font=font) <= width:
+        return text
+    while text and draw.textlength(f"{text}...", font=font) > width:
+        text = text[:-1]
+    return f"{text}..."
+
+
+def _draw_strip(
+    draw: ImageDraw.ImageDraw, tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, width: int
+) -> None:
+    """Draw the episode as a strip: phases, chunk boundaries as ticks, success, and where we are."""
+    n_steps = max(tape.start.horizon_steps, 1)
+    top, bottom = VIEW_PX + 2, VIEW_PX + 2 + STRIP_PX
+
+    def x_of(step: int) -> float:
+        return step / n_steps * (width - 1)
+
+    for one in tape.steps[:-1]:
+        color = PHASE_COLORS[one.result.status.phase]
+        draw.rectangle((x_of(one.step), top, x_of(one.step + 1), bottom), fill=color)
+    for chunk in tape.chunks:
+        draw.line((x_of(chunk.step), top + STRIP_PX // 2, x_of(chunk.step), bottom), fill=PAPER)
+    if record.success_step is not None:
+        x = x_of(record.success_step)
+        draw.line((x, top, x, bottom), fill=SUCCESS_COLOR, width=4)
+    x = x_of(taped.step)
+    draw.line((x, top - 2, x, bottom + 2), fill=INK, width=3)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)  # it comes with Pillow: no font of the machine is needed

@@ -1,0 +1,63 @@
+"""Find the rerun recordings of a run that a person wants to see, or say why there are none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.errors import ViewingError, unknown_name
+from vla_eval.results.recording_files import rrd_file
+from vla_eval.results.records import EpisodeRecord
+from vla_eval.results.store import StoredRun
+
+MOST_OPENED = 5  # recordings that the viewer is given at once, unless it is told which
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """Which episodes; None is any."""
+
+    task: str | None = None
+    policy: str | None = None
+    n_action_steps: int | None = None
+    seed: int | None = None
+
+
+def pick(run: StoredRun, wish: Wish) -> list[Path]:
+    """Return the recordings of the wished episodes, in the order of the records.
+
+    Raises:
+        UnknownNameError: no episode has such a task, policy or K.
+        ViewingError: none of the wished episodes was recorded.
+    """
+    for name in ("task", "policy", "n_action_steps"):
+        wanted = getattr(wish, name)
+        known = {str(getattr(record, name)) for record in run.records}
+        if wanted is not None and str(wanted) not in known:
+            raise unknown_name(name, str(wanted), known, where=str(run.path))
+    wished = [record for record in run.records if _fits(record, wish)]
+    found = [rrd_file(run.path, record) for record in wished if rrd_file(run.path, record).is_file()]
+    if not found:
+        raise ViewingError(_why_none(run, wished, wish))
+    return found
+
+
+def _fits(record: EpisodeRecord, wish: Wish) -> bool:
+    pairs = (
+        (wish.task, record.task),
+        (wish.policy, record.policy),
+        (wish.n_action_steps, record.n_action_steps),
+        (wish.seed, record.seed),
+    )
+    return all(wanted is None or wanted == found for wanted, found in pairs)
+
+
+def _why_none(run: StoredRun, wished: Sequence[EpisodeRecord], wish: Wish) -> str:
+    recorded = sorted({record.seed for record in run.records if rrd_file(run.path, record).is_file()})
+    if recorded:
+        shown = ", ".join(map(str, recorded[:10])) + (", …" if len(recorded) > 10 else "")
+        what = "no such episode" if not wished else "of the episodes asked for none was recorded"
+        return f"{run.path}: {what}. Seeds with a recording: {shown}."
+    return (
+        f"{run.path}: holds no rerun recordings. What has a result is not run again: evaluate into another "
+        f"folder, with --record-rrd all|failures|successes|N --out DIR."
+    )

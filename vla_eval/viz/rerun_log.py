@@ -1,0 +1,197 @@
+"""Write a taped episode as an `.rrd` for the rerun viewer, with a blueprint that lays it out.
+
+    cameras/NAME          pictures, at the steps where they were rendered
+    world/tcp, tcp_path   the tool centre point now, and all of its way
+    world/candidates, bodies/NAME   where things are; `robot_base`
+    actions/DIM/executed, asked, predicted_I   I: chunks that overlap lie in different series
+    gripper/width, reward, phase/cue|delay|response (0 or 1), choice/first
+    events, instruction   in words
+
+Timelines: `step` (control steps) and `time` (seconds). The arm itself is not drawn: only its hand moves.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from vla_eval.core import FloatArray, Phase
+from vla_eval.errors import ViewingError
+from vla_eval.results.recording_files import recording_stem
+from vla_eval.results.records import EpisodeRecord
+from vla_eval.viz.rerun_layout import layout
+from vla_eval.viz.tape import EpisodeTape, TapedStep
+
+APPLICATION = "mikasa-vla"
+ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
+TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
+ROBOT_BASE_M = (-0.615, 0.0, 0.0)  # where ManiSkill's table scene puts the Panda
+JPEG_QUALITY = 90
+COLORS = {"right": (0, 158, 115), "other": (163, 169, 181), "tcp": (0, 114, 178), "body": (230, 159, 0)}
+
+
+def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_hz: float) -> None:
+    """Write one episode.
+
+    Args:
+        tape: the episode.
+        record: what came of it.
+        path: the file; it is there whole or not at all.
+        control_hz: control steps per second, for the timeline `time`.
+
+    Raises:
+        ViewingError: the file cannot be written.
+    """
+    unfinished = path.with_suffix(".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()  # rerun itself does not say so where it cannot write
+        n_series = n_overlapping(tape)
+        with rr.RecordingStream(APPLICATION, recording_id=recording_stem(record)) as stream:
+            cameras = sorted({name for one in tape.steps for name in one.result.observation.images})
+            stream.save(str(unfinished), default_blueprint=layout(cameras, ACTION_DIMS))
+            _log_facts(stream, tape, record)
+            for taped in tape.steps:
+                stream.set_time("step", sequence=taped.step)
+                stream.set_time("time", duration=taped.step / control_hz)
+                _log_step(stream, taped)
+            _log_chunks(stream, tape, control_hz, n_series)
+            _log_events(stream, tape, record, control_hz)
+            stream.flush()
+            stream.disconnect()
+        unfinished.replace(path)
+    except (OSError, RuntimeError, ValueError) as exc:
+        raise ViewingError(
+            f"{path}: the rerun recording of {record.policy} on {record.task}, seed {record.seed}, could not "
+            f"be written ({exc}). Free some space, or record less; the same command runs it again."
+        ) from exc
+
+
+def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
+    """Log what holds for the whole episode."""
+    status = tape.steps[-1].result.status
+    target = "several, or none" if status.target is None else str(status.target)
+    chosen = "none" if status.first_choice is None else str(status.first_choice)
+    lines = [
+        f"# {tape.start.instruction}",
+        f"{record.task}, {record.policy}, K={record.n_action_steps}, run {record.run}, seed {record.seed}",
+        f"**{record.outcome}**"
+        + (f" at step {record.success_step}" if record.success_step is not None else ""),
+    ]
+    lines += [f"target: {target}; chosen first: {chosen}"] if status.n_candidates else []
+    text = rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+    stream.log("instruction", text, static=True)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log("world/robot_base", rr.Points3D([ROBOT_BASE_M], radii=0.05, labels=["robot"]), static=True)
+    way = [pose[:3] for one in tape.steps if (pose := one.result.observation.state.get(TCP_POSE)) is not None]
+    if way:
+        strip = rr.LineStrips3D([np.stack(way)], colors=[COLORS["tcp"]], radii=0.002)
+        stream.log("world/tcp_path", strip, static=True)
+
+
+def _log_step(stream: rr.RecordingStream, taped: TapedStep) -> None:
+    result = taped.result
+    for name, image in result.observation.images.items():
+        stream.log(f"cameras/{name}", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
+    state = result.observation.state
+    if TCP_POSE in state:
+        point = rr.Points3D([state[TCP_POSE][:3]], colors=[COLORS["tcp"]], radii=0.012)
+        stream.log("world/tcp", point)
+    if JOINTS in state:
+        stream.log("gripper/width", rr.Scalars(float(state[JOINTS][-N_FINGERS:].sum())))
+    _log_world(stream, taped)
+    for phase in PHASES:
+        stream.log(f"phase/{phase}", rr.Scalars(float(result.status.phase == phase)))
+    if taped.action is not None:
+        stream.log("reward", rr.Scalars(result.reward))
+        _log_action(stream, "asked", taped.action)
+        if result.executed_action is not None:
+            _log_action(stream, "executed", result.executed_action)
+
+
+def _log_world(stream: rr.RecordingStream, taped: TapedStep) -> None:
+    world = taped.result.observation.privileged
+    if world is None:
+        return
+    if len(world.candidate_positions_m):
+        indices = range(len(world.candidate_positions_m))
+        right = [index in world.right_candidates for index in indices]
+        points = rr.Points3D(
+            world.candidate_positions_m,
+            colors=[COLORS["right" if is_right else "other"] for is_right in right],
+            labels=[f"{index}: right" if right[index] else str(index) for index in indices],
+            radii=0.02,
+        )
+        stream.log("world/candidates", points)
+    for name, body in world.bodies.items():
+        point = rr.Points3D([body.position_m], colors=[COLORS["body"]], labels=[name], radii=0.02)
+        stream.log(f"world/bodies/{name}", point)
+
+
+def _log_action(stream: rr.RecordingStream, kind: str, action: FloatArray) -> None:
+    for name, value in zip(ACTION_DIMS, action, strict=True):
+        stream.log(f"actions/{name}/{kind}", rr.Scalars(float(value)))
+
+
+def n_overlapping(tape: EpisodeTape) -> int:
+    """Return how many series are needed so that no two chunks of one series overlap."""
+    starts = [one.step for one in tape.chunks]
+    gaps = [later - earlier for earlier, later in pairwise(starts)]
+    longest = max((len(one.chunk.actions) for one in tape.chunks), default=1)
+    return -(-longest // max(min(gaps, default=longest), 1))
+
+
+def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, control_hz: float, n_series: int) -> None:
+    """Log each chunk at the steps that it was meant for: the executed part, and what was never executed."""
+    for index in range(n_series):
+        own = tape.chunks[index::n_series]
+        if not own:
+            continue
+        steps = np.concatenate([np.arange(len(one.chunk.actions)) + one.step for one in own])
+        values = np.concatenate([one.chunk.actions for one in own])
+        for dim, name in enumerate(ACTION_DIMS):
+            _send(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], control_hz)
+
+
+def _send(
+    stream: rr.RecordingStream,
+    entity: str,
+    steps: NDArray[np.int64],
+    values: NDArray[np.float32],
+    control_hz: float,
+) -> None:
+    stream.send_columns(
+        entity,
+        indexes=[rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / control_hz)],
+        columns=rr.Scalars.columns(scalars=values.astype(np.float64)),
+    )
+
+
+def _log_events(
+    stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord, control_hz: float
+) -> None:
+    for step, text in sorted(events(tape, record)):
+        stream.set_time("step", sequence=step)
+        stream.set_time("time", duration=step / control_hz)
+        stream.log("events", rr.TextLog(text))
+        if text.startswith("first choice"):
+            stream.log("choice/first", rr.Scalars(1.0))
+
+
+def events(tape: EpisodeTape, record: EpisodeRecord) -> Iterable[tuple[int, str]]:
+    """Yield (step, what happened): phases that begin, inferences, the first choice, success."""
+    yield from ((one.step, f"inference, {len(one.chunk.actions)} actions") for one in tape.chunks)
+    before: Sequence[TapedStep | None] = [None, *tape.steps[:-1]]
+    for earlier, one in zip(before, tape.steps, strict=True):
+        status, last = one.result.status, earlier.result.status if earlier else None
+        if last is None or last.phase != status.phase:
+            yield one.step, f"phase {status.phase}"
+        if status.first_choice is not None and (last is None or last.first_choice is None):
+            is_right = status.first_choice in status.right_first_choices
+            yield one.step, f"first choice: {status.first_choice}, {'right' if is_right else 'wrong'}"
+    if record.success_step is not None:
+        yield record.success_step, "success"

@@ -1,0 +1,60 @@
+"""Which episodes are recorded, and how often pictures are taken. Knows nothing of files or viewers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vla_eval.errors import RecipeError
+
+Outcomes = Literal["none", "all", "failures", "successes"]
+Which = Outcomes | int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingConfig:
+    """What to record of an evaluation; moves no result.
+
+    Attributes:
+        video: which episodes get an mp4: by outcome, or the first N seeds of run 0 of each task, policy and
+            n_action_steps.
+        rrd: which episodes get a recording for the rerun viewer, likewise.
+        frame_stride: control steps from one picture to the next.
+    """
+
+    video: Which = "none"
+    rrd: Which = "none"
+    frame_stride: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.frame_stride < 1:
+            raise RecipeError(f"recording.frame_stride is {self.frame_stride}, expected a number ≥ 1.")
+        for name in ("video", "rrd"):
+            which = getattr(self, name)
+            if isinstance(which, int) and which < 1:
+                raise RecipeError(
+                    f"recording.{name} is {which}, expected 'none', 'all', 'failures', 'successes' or a "
+                    f"number of episodes ≥ 1."
+                )
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anything is recorded."""
+        return self.video != "none" or self.rrd != "none"
+
+
+def may_be_wanted(which: Which, *, run: int, index: int) -> bool:
+    """Return whether an episode may have to be recorded, before it is known what comes of it.
+
+    Args:
+        which: what is recorded.
+        run: the episode's run.
+        index: which of the seeds of a run it has, from 0.
+    """
+    return run == 0 and index < which if isinstance(which, int) else which != "none"
+
+
+def is_wanted(which: Which, *, run: int, index: int, is_success: bool) -> bool:
+    """Return whether an episode is to be kept, when it is over."""
+    if which in ("failures", "successes"):
+        return is_success == (which == "successes")
+    return may_be_wanted(which, run=run, index=index)
