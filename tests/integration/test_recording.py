@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RecipeError, VlaEvalError
 from vla_eval.evaluate import evaluate
+from vla_eval.plan import fingerprint
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.recipes import EvalConfig
 from vla_eval.results.recording_files import rrd_file, thumbnail_file, video_file
@@ -177,6 +177,14 @@ def test_a_number_of_episodes_below_one_is_refused() -> None:
         RecordingConfig(video=0)
 
 
+def test_recording_gives_a_run_no_other_fingerprint() -> None:
+    data = {"name": "films", "tasks": [TASK], "policies": ["oracle"]}
+    plain, filmed = (
+        decode(EvalConfig, data | more, where="test") for more in ({}, {"recording": {"video": "all"}})
+    )
+    assert fingerprint(plain) == fingerprint(filmed)
+
+
 def test_a_mistyped_choice_is_answered(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "demo", "--record-video", "failure"]) == 1
     assert "Did you mean 'failures'?" in capsys.readouterr().err
@@ -186,20 +194,15 @@ def test_a_run_records_what_it_was_asked_to_and_nothing_else(tmp_path: Path) -> 
     data = {"name": "films", "tasks": [TASK], "policies": ["cue_blind"], "episodes": 3}
     data |= {"env": SHORT | {"horizon_steps": 30}, "simulator": "fake", "workers": 1}
     recording = {"video": "failures", "rrd": 1, "frame_stride": 30}
-    plain = evaluate(decode(EvalConfig, data, where="test"), out=tmp_path / "plain")
-    filmed = evaluate(
-        decode(EvalConfig, data | {"recording": recording}, where="test"), out=tmp_path / "filmed"
-    )
-    assert plain.n_errors == filmed.n_errors == 0
-    runs = [read_run(tmp_path / name) for name in ("plain", "filmed")]
-    assert set(runs[0].records) == set(runs[1].records)
+    config = decode(EvalConfig, data | {"recording": recording}, where="test")
+    assert evaluate(config, out=tmp_path / "filmed").n_errors == 0
     folder = tmp_path / "filmed"
-    failures = {record.key for record in runs[1].records if record.outcome == "failure"}
+    run = read_run(folder)
+    failures = {record.key for record in run.records if record.outcome == "failure"}
     assert 0 < len(failures) < 3  # else the test below would show nothing
-    for record in runs[1].records:
+    for record in run.records:
         assert video_file(folder, record).exists() == (record.key in failures)
         assert thumbnail_file(folder, record).exists() == (record.key in failures)
         assert rrd_file(folder, record).exists() == (record.seed == 1)
-    assert not (tmp_path / "plain" / "videos").exists()
-    config = json.loads((folder / "run.json").read_text())
-    assert "recording" not in config["config"] and config["options"]["recording"] == recording
+    assert "recording" not in run.description.config
+    assert run.description.options["recording"] == recording
