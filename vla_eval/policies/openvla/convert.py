@@ -153,7 +153,8 @@ def read_statistics(
 
 def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
     shape = (3, options.picture_px, options.picture_px)
-    config = MikasaOpenVLAConfig(
+    make: Any = MikasaOpenVLAConfig  # lerobot, whose fields it has, is untyped
+    config: MikasaOpenVLAConfig = make(
         head=options.head,
         chunk_size=options.chunk_size,
         n_action_steps=options.chunk_size,

@@ -78,7 +78,7 @@ class Projector(nn.Module):
 
 def _dino(sizes: NetworkSizes) -> Any:
     config: Any = Dinov2WithRegistersConfig
-    model = Dinov2WithRegistersModel(
+    model: Any = Dinov2WithRegistersModel(
         config(
             hidden_size=sizes.dino_width,
             num_hidden_layers=sizes.dino_depth - 1,

@@ -14,7 +14,7 @@ from vla_eval.policies.openvla.sizes import NetworkSizes
 DINO, SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 OUR_DINO, OUR_SIGLIP = "vision.dino.", "vision.siglip."
 # Ends of names that differ, (original, ours); the rest of a name is the same.
-DINO_NAMES = (
+DINO_NAMES: tuple[tuple[str, str], ...] = (
     ("cls_token", "embeddings.cls_token"),
     ("reg_token", "embeddings.register_tokens"),
     ("patch_embed.proj.", "embeddings.patch_embeddings.projection."),
@@ -23,7 +23,7 @@ DINO_NAMES = (
     (".ls1.scale_factor", ".layer_scale1.lambda1"),
     (".ls2.scale_factor", ".layer_scale2.lambda1"),
 )
-SIGLIP_NAMES = (
+SIGLIP_NAMES: tuple[tuple[str, str], ...] = (
     ("patch_embed.proj.", "embeddings.patch_embedding."),
     ("blocks.", "encoder.layers."),
     (".attn.proj.", ".self_attn.out_proj."),
