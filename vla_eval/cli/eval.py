@@ -34,6 +34,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     _add_run_arguments(parser)
+    _add_recording_arguments(parser)
     _add_table_arguments(parser)
 
 
@@ -63,12 +64,6 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
-    for kind, what in (("video", "an mp4"), ("rrd", "a recording for the rerun viewer")):
-        parser.add_argument(
-            f"--record-{kind}",
-            metavar="WHICH",
-            help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
-        )
     parser.add_argument(
         "--set",
         action="append",
@@ -82,6 +77,15 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="go on although package versions or the machine have changed; the table will say so",
     )
+
+
+def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    for kind, what in (("video", "an mp4"), ("rrd", "a recording for the rerun viewer")):
+        parser.add_argument(
+            f"--record-{kind}",
+            metavar="WHICH",
+            help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
+        )
 
 
 def _add_table_arguments(parser: argparse.ArgumentParser) -> None:

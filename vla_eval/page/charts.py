@@ -91,11 +91,8 @@ def forest(bars: Sequence[Bar], *, title: str, description: str) -> Markup:
         if bar.value is None:
             parts.append(_label("no result", x_of(0) + 6, y + 4, anchor="start"))
             continue
-        parts.append(
-            _whisker(bar.color, x1=x_of(bar.low), x2=x_of(bar.high), y1=y, y2=y)
-            if bar.low is not None and bar.high is not None
-            else ""
-        )
+        if bar.low is not None and bar.high is not None:
+            parts.append(_whisker(bar.color, x1=x_of(bar.low), x2=x_of(bar.high), y1=y, y2=y))
         parts.append(_marker(bar.color, x_of(bar.value), y))
     return _svg(parts, width=width, height=height, title=title, description=description)
 
@@ -112,8 +109,7 @@ def curves(
         x_title: what x is, with its unit.
         x_ticks: in increasing order; the first and the last are the ends of the axis.
     """
-    left, top, width, height = 40.0, 10.0, 320.0, 180.0
-    first, last = x_ticks[0], x_ticks[-1]
+    left, top, width, height, first, last = 40.0, 10.0, 320.0, 180.0, x_ticks[0], x_ticks[-1]
 
     def x_of(value: float) -> float:
         return left + 10 + (value - first) / ((last - first) or 1) * (width - 20)
@@ -135,8 +131,8 @@ def curves(
             continue
         for point in placed:
             if point.low is not None and point.high is not None:
-                ends = {"y1": y_of(point.low), "y2": y_of(point.high)}
-                parts.append(_whisker(one.color, x1=point.x, x2=point.x, **ends))
+                low, high = y_of(point.low), y_of(point.high)
+                parts.append(_whisker(one.color, x1=point.x, x2=point.x, y1=low, y2=high))
             parts.append(_marker(one.color, point.x, point.y))
     return _svg(
         parts, width=left + width + 10, height=top + height + 44, title=title, description=description

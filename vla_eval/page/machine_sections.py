@@ -21,6 +21,26 @@ MAX_MESSAGE = 400  # characters of an error's message
 
 def latency_section(material: Material) -> Markup:
     """Show how long inferences took."""
+    rows, n_unknown = _latency_rows(material)
+    unknown = f"For {n_unknown} rows no timing was kept (timings.jsonl)." if n_unknown else ""
+    if not rows:
+        return section("latency", "Inference latency", paragraph(unknown or "No episode has a result yet."))
+    times = ("ms per inference, median", "slowest episode", "s per episode, median")
+    return section(
+        "latency",
+        "Inference latency",
+        paragraph(
+            "Wall-clock time on the machine named below, workers sharing its cores; per inference, an "
+            "episode's mean. No result depends on it.",
+            muted=True,
+        ),
+        table(("policy", "run", "episodes", *times), rows, numeric=[False, False, *[True] * 4]),
+        paragraph(unknown, muted=True) if unknown else joined(()),
+    )
+
+
+def _latency_rows(material: Material) -> tuple[list[list[str]], int]:
+    """Return a row for each run, task, policy and K, and for how many of these nothing is known."""
     rows, n_unknown = [], 0
     for run in material.runs:
         results = [record for record in run.records if record.outcome != "error"]
@@ -31,38 +51,17 @@ def latency_section(material: Material) -> Markup:
                 n_unknown += 1
                 continue
             task, policy, size = group
+            seconds = (latency.median_seconds, latency.slowest_seconds)
             rows.append(
                 [
                     f"{task} · {policy} · K={size}",
                     str(run.path),
                     str(latency.n_episodes),
-                    f"{latency.median_seconds * 1000:.2f}",
-                    f"{latency.slowest_seconds * 1000:.2f}",
+                    *(f"{value * 1000:.2f}" for value in seconds),
                     f"{latency.episode_seconds:.2f}",
                 ]
             )
-    unknown = f"For {n_unknown} rows no timing was kept (timings.jsonl)." if n_unknown else ""
-    if not rows:
-        return section("latency", "Inference latency", paragraph(unknown or "No episode has a result yet."))
-    titles = (
-        "policy",
-        "run",
-        "episodes",
-        "ms per inference, median",
-        "slowest episode",
-        "s per episode, median",
-    )
-    return section(
-        "latency",
-        "Inference latency",
-        paragraph(
-            "Wall-clock time on the machine named below, workers sharing its cores; per inference, an "
-            "episode's mean. No result depends on it.",
-            muted=True,
-        ),
-        table(titles, rows, numeric=[False, False, *[True] * 4]),
-        paragraph(unknown, muted=True) if unknown else joined(()),
-    )
+    return rows, n_unknown
 
 
 def errors_section(material: Material) -> Markup:
