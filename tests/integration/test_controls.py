@@ -111,7 +111,8 @@ def n_successes(records: list[EpisodeRecord]) -> int:
 
 
 @pytest.mark.parametrize("n_episodes", [2, pytest.param(15, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("n_action_steps", [1, 8])
+# At K = 1 each task of the sample is played in test_conformance.py, too.
+@pytest.mark.parametrize("n_action_steps", [pytest.param(1, marks=pytest.mark.slow), 8])
 def test_oracle_is_a_ceiling_at_each_chunk_length(
     sampled_task: str, n_action_steps: int, n_episodes: int
 ) -> None:
@@ -132,8 +133,9 @@ def test_oracle_reaches_its_promised_success_on_the_evaluation_seeds(task: str) 
     assert n_successes(run(task, "oracle", range(1, 101))) >= 100 * promised(task)
 
 
-@pytest.mark.parametrize("n_action_steps", [1, 4])
-@pytest.mark.parametrize("policy", ["oracle", "cue_blind", "tour"])
+@pytest.mark.parametrize(
+    ("policy", "n_action_steps"), [("oracle", 1), ("oracle", 4), ("cue_blind", 4), ("tour", 1)]
+)
 def test_experts_hold_still_until_the_choice_can_be_made(policy: str, n_action_steps: int) -> None:
     for task in ("RememberColor3-v0", "ChainOfColors3-v0", "ShellGameTouch-v0"):
         log = ActionLog()
@@ -200,7 +202,7 @@ def test_runs_differ_for_a_blind_arm_and_seeds_alone_decide_within_a_run() -> No
 
 def test_random_actions_do_not_solve_the_tasks() -> None:
     for task in ("RememberColor3-v0", "ShellGameTouch-v0", "InterceptMedium-v0"):
-        records = run(task, "random", range(1, 4))
+        records = run(task, "random", (1, 2))
         assert n_successes(records) == 0
         assert all(record.n_clipped_steps == 0 for record in records)
 
