@@ -223,6 +223,13 @@ def test_the_verb_prints_the_path_alone(tmp_path: Path, capsys: pytest.CaptureFi
     assert page.read_text(encoding="utf-8") == build_page([read_run(tmp_path / "run")])
 
 
+def test_a_page_has_no_other_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunFolder.open(tmp_path / "run", stored().description) as folder:
+        folder.append(episode("p", 1, True))
+    assert main(["report", str(tmp_path / "run"), "--html", str(tmp_path), "--format", "csv"]) == 1
+    assert "--html writes a page" in capsys.readouterr().err
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ReportError, match=r"file/page/index\.html: cannot be written"):

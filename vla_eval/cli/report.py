@@ -52,8 +52,11 @@ def run(args: argparse.Namespace) -> int:
 
     runs = [read_run(path) for path in args.runs]
     if args.html is not None:
+        from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
 
+        if args.paper or args.format != "markdown":
+            raise ReportError("--html writes a page, which --format and --paper say nothing of. Drop them.")
         print(write_page(runs, args.html, baseline=args.baseline))
         return 0
     table = build_table(runs, baseline=args.baseline)

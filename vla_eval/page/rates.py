@@ -134,24 +134,27 @@ def paired_section(material: Material) -> Markup:
 def steps_section(material: Material) -> Markup:
     """Show how soon success comes: the share of episodes that have succeeded by each step."""
     plots, names = [], {}
-    for task in material.tasks:
-        for size in sorted({row.n_action_steps for row in material.rows_of(task)}):
-            rows = [r for r in material.rows_of(task) if r.n_action_steps == size and r.n_episodes]
-            series = [_cumulative(material, row) for row in rows]
-            horizon = max((p.x for one in series for p in one.points), default=0)
-            if not horizon:
-                continue
-            names |= {row.policy: material.colors[row.policy] for row in rows}
-            plots.append(
-                curves(
-                    series,
-                    title=f"{task}, K={size}",
-                    description="Mean steps until success: "
-                    + "; ".join(f"{material.name_of(r)}: {_steps(r)}" for r in rows),
-                    x_title="control step",
-                    x_ticks=[round(horizon * i / (N_STEP_TICKS - 1)) for i in range(N_STEP_TICKS)],
-                )
+    for task, size, variant in _settings(material):
+        rows = [
+            row
+            for row in material.rows_of(task)
+            if (row.n_action_steps, row.variant) == (size, variant) and row.n_episodes
+        ]
+        series = [_cumulative(material, row) for row in rows]
+        horizon = max((point.x for one in series for point in one.points), default=0)
+        if not horizon:
+            continue
+        names |= {row.policy: material.colors[row.policy] for row in rows}
+        means = "; ".join(f"{material.name_of(row)}: {_steps(row)}" for row in rows)
+        plots.append(
+            curves(
+                series,
+                title=f"{task}, K={size}" + (f", {variant}" if variant else ""),
+                description=f"Mean steps until success: {means}",
+                x_title="control step",
+                x_ticks=[round(horizon * i / (N_STEP_TICKS - 1)) for i in range(N_STEP_TICKS)],
             )
+        )
     if not plots:
         return section("steps", "Steps to success", paragraph("No episode has a result yet."))
     return section(
@@ -165,6 +168,12 @@ def steps_section(material: Material) -> Markup:
         legend(list(names.items()), lines=True, references=False),
         element("div", *plots, class_="plots"),
     )
+
+
+def _settings(material: Material) -> list[tuple[str, int, str | None]]:
+    """Return each task, K and variant once: by task, then by K."""
+    found = {(row.task, row.n_action_steps, row.variant) for row in material.table.rows}
+    return sorted(found, key=lambda one: (material.tasks.index(one[0]), one[1], one[2] or ""))
 
 
 def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
