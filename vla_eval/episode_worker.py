@@ -201,8 +201,9 @@ class EpisodeRunner:
         # The recipe's name, whatever the adapter calls itself: records are told apart by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         if self._recorder and tapes:
-            self._heartbeat("step")  # a time limit of its own
-            self._recorder.write(batch.jobs, tapes, named, env.spec.control_hz)
+            self._recorder.write(
+                batch.jobs, tapes, named, control_hz=env.spec.control_hz, heartbeat=self._heartbeat
+            )
         return Finished(records=named, timings=self._heartbeat.timings(batch.jobs))
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
@@ -211,6 +212,8 @@ class EpisodeRunner:
             self._loaded = self._policy = None  # first, so that two policies are never loaded at once
             facts = self._describe_env(job)
             self._heartbeat("setup")
+            if self._recorder is not None:
+                self._recorder.load()
             policy = make_policy(group, facts)
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)

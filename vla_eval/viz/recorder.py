@@ -1,16 +1,20 @@
 """Decide which episodes a worker records, and write them when they are over."""
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vla_eval.core import Stage
 from vla_eval.plan import EpisodeJob
 from vla_eval.results.recording_files import rrd_file, thumbnail_file, video_file
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.viz.settings import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.viz.tape import Tapes
+
+VIDEO_WRITER = "vla_eval.viz.video:write_video"
+RRD_WRITER = "vla_eval.viz.rerun_log:write_rrd"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +31,12 @@ class Recorder:
     folder: Path
     seed_start: int
 
+    def load(self) -> None:
+        """Import what the recordings are written with, while the worker is being set up: it takes seconds."""
+        for which, writer in ((self.config.video, VIDEO_WRITER), (self.config.rrd, RRD_WRITER)):
+            if which != "none":
+                _import(writer)
+
     def tapes(self, jobs: Sequence[EpisodeJob]) -> Tapes | None:
         """Return the observer of a batch; None if none of its episodes can be wanted."""
         slots = {
@@ -40,7 +50,13 @@ class Recorder:
         return Tapes(slots, frame_stride=self.config.frame_stride) if slots else None
 
     def write(
-        self, jobs: Sequence[EpisodeJob], tapes: Tapes, records: Sequence[EpisodeRecord], control_hz: float
+        self,
+        jobs: Sequence[EpisodeJob],
+        tapes: Tapes,
+        records: Sequence[EpisodeRecord],
+        *,
+        control_hz: float,
+        heartbeat: Callable[[Stage], None],
     ) -> None:
         """Write what is wanted of a batch that is over.
 
@@ -49,6 +65,7 @@ class Recorder:
             tapes: what was seen of it.
             records: what came of it, in the order of the jobs.
             control_hz: control steps per second.
+            heartbeat: called before each file, for a watchdog: each has the time of a step.
 
         Raises:
             ViewingError: a file could not be written.
@@ -58,22 +75,24 @@ class Recorder:
             if tape is None:
                 continue
             if self._wants(self.config.video, job, record):
-                rate_hz = control_hz / self.config.frame_stride
-                names = {
-                    "path": video_file(self.folder, record),
-                    "thumbnail": thumbnail_file(self.folder, record),
-                }
-                _writer("video", "write_video")(tape, record, **names, frame_rate_hz=rate_hz)
-            if self._wants(self.config.rrd, job, record):
-                _writer("rerun_log", "write_rrd")(
-                    tape, record, rrd_file(self.folder, record), control_hz=control_hz
+                heartbeat("step")
+                _import(VIDEO_WRITER)(
+                    tape,
+                    record,
+                    video_file(self.folder, record),
+                    thumbnail=thumbnail_file(self.folder, record),
+                    frame_rate_hz=control_hz / self.config.frame_stride,
                 )
+            if self._wants(self.config.rrd, job, record):
+                heartbeat("step")
+                _import(RRD_WRITER)(tape, record, rrd_file(self.folder, record), control_hz=control_hz)
 
     def _wants(self, which: Any, job: EpisodeJob, record: EpisodeRecord) -> bool:
         index = job.seed - self.seed_start
         return is_wanted(which, run=job.run, index=index, is_success=record.outcome == "success")
 
 
-def _writer(module: str, function: str) -> Any:  # Any: the two take different arguments
+def _import(writer: str) -> Any:  # Any: the two take different arguments
     # When it is needed: a worker that records no rrd need not wait for rerun's import.
-    return getattr(importlib.import_module(f"vla_eval.viz.{module}"), function)
+    module, _, function = writer.partition(":")
+    return getattr(importlib.import_module(module), function)
