@@ -110,7 +110,8 @@ def episodes_section(material: Material) -> Markup:
     if not recorded:
         said = "No videos were recorded. `mikasa-vla eval … --record-video failures` records some."
         return section("episodes", "Episodes", paragraph(said))
-    shown, n_bytes = [], 0
+    shown: list[Markup] = []
+    n_bytes = 0
     for one in _in_turn(recorded):
         size = one.video.stat().st_size
         if len(shown) < MAX_SHOWN_VIDEOS and n_bytes + size <= MAX_VIDEO_BYTES:

@@ -62,7 +62,8 @@ def success_section(material: Material) -> Markup:
 
 def chunk_section(material: Material) -> Markup:
     """Show success against n_action_steps, with lines of chance and ceiling."""
-    plots, names = [], {}
+    plots: list[Markup] = []
+    names: dict[str, int] = {}
     for task in material.tasks:
         rows = [row for row in material.rows_of(task) if row.success_once is not None]
         sizes = sorted({row.n_action_steps for row in rows})
@@ -133,7 +134,8 @@ def paired_section(material: Material) -> Markup:
 
 def steps_section(material: Material) -> Markup:
     """Show how soon success comes: the share of episodes that have succeeded by each step."""
-    plots, names = [], {}
+    plots: list[Markup] = []
+    names: dict[str, int] = {}
     for task, size, variant in _settings(material):
         rows = [
             row
