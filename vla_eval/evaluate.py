@@ -29,7 +29,7 @@ from vla_eval.recipes import EvalConfig
 from vla_eval.results.records import EpisodeError, EpisodeRecord
 from vla_eval.results.store import RunDescription, RunFolder
 from vla_eval.viz.recorder import Recorder
-from vla_eval.workers import Answered, WorkerPool
+from vla_eval.workers import Answered, WorkerMain, WorkerPool
 
 RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
@@ -162,7 +162,7 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
     logs.mkdir(exist_ok=True)
     config = bookkeeper.config
     new_pool = WorkerPool[EpisodeBatch, Finished]
-    main = worker_main
+    main: WorkerMain = worker_main
     if config.recording.is_on:
         recorder = Recorder(
             config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
