@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import av
 from PIL import Image
@@ -12,8 +13,8 @@ from vla_eval.viz.frames import compose
 from vla_eval.viz.tape import EpisodeTape
 
 HOLD_SECONDS = 1.0  # the last frame stays, so that the outcome can be read
-CODEC = "libx264"
-OPTIONS = {"crf": "23", "preset": "veryfast", "threads": "1"}
+CODEC: Literal["libx264"] = "libx264"
+OPTIONS: dict[str, object] = {"crf": "23", "preset": "veryfast", "threads": "1"}
 JPEG_QUALITY = 85
 
 
