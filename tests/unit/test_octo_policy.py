@@ -1,0 +1,363 @@
+"""Octo as a policy: windows and padding as the original's, one episode like many, from data to a table."""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from vla_eval.cli.main import main
+from vla_eval.core import EpisodeStart, Observation, ObservationWindow
+from vla_eval.data.features import ACTION_NAMES
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import CheckpointError, MissingInstructionError
+from vla_eval.policies.checkpoint import find_checkpoint
+from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.policies.octo.configuration_octo import TRAINED, MikasaOctoConfig
+from vla_eval.policies.octo.convert import convert, octo_config
+from vla_eval.policies.octo.language import PromptEmbeddings
+from vla_eval.policies.octo.modeling_octo import TOKENS_KEY, TOKENS_MASK_KEY, MikasaOctoPolicy
+from vla_eval.policies.octo.original import unpack
+from vla_eval.policies.steps.trainable import trainable
+from vla_eval.recipes import PolicyRecipe, load_recipe
+from vla_eval.results.store import read_run
+
+TASK = "RememberColor3-v0"
+N_BYTES = 260  # 256, three special tokens, and one to spare
+GOLDEN = Path(__file__).parents[1] / "golden" / "octo"
+BASE, WRIST = "observation.images.base", "observation.images.wrist"
+TINY: dict[str, Any] = {
+    **{"image_px": {"primary": 32, "wrist": 16}, "width": 16, "layers": 1, "heads": 2, "mlp_width": 16},
+    **{"stem_channels": [32, 32, 32, 32], "stem_features": 8, "head_hidden": 16, "head_blocks": 1},
+    **{"language_tokens": 40, "tokenizer_name": "bytes"},
+    "t5": {"vocabulary": 260, "width": 8, "key": 4, "heads": 2, "layers": 1, "mlp_width": 8},
+}
+
+
+def tiny_policy(**fields: Any) -> MikasaOctoPolicy:
+    torch.manual_seed(0)
+    return MikasaOctoPolicy(octo_config({**TINY, **fields})).eval()
+
+
+def batch(policy: MikasaOctoPolicy, *, n: int = 2, n_missing: int = 0) -> dict[str, Any]:
+    config, draws = policy.config, torch.Generator().manual_seed(1)
+    n_steps = config.window + config.chunk_size - 1
+    before = (torch.arange(config.window) < n_missing).expand(n, -1)
+    return {
+        **{key: torch.rand(n, config.window, 3, 24, 24, generator=draws) for key in (BASE, WRIST)},
+        **{f"{key}_is_pad": before for key in (BASE, WRIST)},
+        "action": torch.rand(n, n_steps, 7, generator=draws),
+        "action_is_pad": (torch.arange(n_steps) < n_missing).expand(n, -1).clone(),
+        "index": torch.arange(n),
+        TOKENS_KEY: torch.arange(config.language_tokens).expand(n, -1) + 3,
+        TOKENS_MASK_KEY: torch.ones(n, config.language_tokens, dtype=torch.bool),
+    }
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, Tensor]:
+    return dict(load_file(GOLDEN / "io.safetensors"))
+
+
+class TestWindows:
+    def test_training_targets_are_the_originals_where_they_count(self, golden: dict[str, Tensor]) -> None:
+        """From a trajectory of 10 steps as lerobot gives it: ends repeated, and flags for what is beyond."""
+        policy = tiny_policy(window=4, max_window=4)
+        actions = golden["data.chunk_full.trajectory_actions"]
+        for step in range(len(actions)):
+            wanted = torch.arange(step - 3, step + 4)
+            targets = policy._targets(
+                {
+                    "action": actions[wanted.clamp(0, len(actions) - 1)][None],
+                    "action_is_pad": ((wanted < 0) | (wanted >= len(actions)))[None],
+                }
+            )
+            assert torch.equal(targets.step_mask[0], golden["data.chunk_full.timestep_pad_mask"][step])
+            counts = targets.step_mask[0][:, None, None] & targets.action_mask[0]
+            expected = golden["data.chunk_full.action_pad_mask"][step]
+            assert torch.equal(counts, targets.step_mask[0][:, None, None] & expected)
+            found = targets.actions[0][counts]
+            assert torch.equal(found, golden["data.chunk_full.actions"][step][counts])
+
+    def test_history_in_an_episode_is_that_of_the_originals_wrapper(self, golden: dict[str, Tensor]) -> None:
+        """8 rows: the reset and 7 steps, each with the frames of a window of 4, also within a chunk."""
+        policy = tiny_policy(window=4, max_window=4)
+        seen: list[dict[str, Tensor]] = []
+        policy.predict_action_chunk = lambda batch: (  # type: ignore[method-assign]
+            seen.append(batch) or torch.zeros(1, 4, 7)
+        )
+        n_actions = 3
+        policy.config.n_action_steps = n_actions
+        for step in range(7):
+            frame = torch.full((1, 3, 2, 2), float(step))
+            policy.select_action({BASE: frame, WRIST: frame})
+        for number, shown in enumerate(seen):
+            row = number * n_actions
+            assert (
+                shown[BASE][0, :, 0, 0, 0].tolist() == golden["data.history.observation_index"][row].tolist()
+            )
+            assert torch.equal(~shown[f"{BASE}_is_pad"][0], golden["data.history.timestep_pad_mask"][row])
+        assert len(seen) == math.ceil(7 / n_actions)
+
+    def test_what_lies_before_the_episode_changes_nothing_and_what_lies_in_it_does(self) -> None:
+        policy = tiny_policy()
+        given = batch(policy, n_missing=7)
+        noise = torch.randn(2, *policy.config.noise_shape)
+        chunk = policy.predict_action_chunk(given, noise=noise)
+        for step, changes in ((6, False), (7, True)):
+            other = {**given, BASE: given[BASE].clone()}
+            other[BASE][:, step] = 0.5
+            again = policy.predict_action_chunk(other, noise=noise)
+            assert torch.equal(again, chunk) is not changes
+
+
+class TestTraining:
+    @pytest.mark.parametrize(("mode", "n_patterns"), [("heads", 1), ("heads_and_positions", 2), ("all", 1)])
+    def test_each_mode_trains_just_what_it_names(self, mode: Any, n_patterns: int) -> None:
+        policy = tiny_policy(trained=mode)
+        policy.train()
+        loss, _ = policy.forward(batch(policy))
+        loss.backward()
+        moved = {name for name, x in policy.named_parameters() if x.grad is not None}
+        named = set(trainable(policy))
+        heads = {name for name in named if name.startswith("network.head.")}
+        positions = {name for name in named if "positions" in name}
+        everything = {name for name, _ in policy.network.named_parameters(prefix="network")}
+        expected = {"heads": heads, "heads_and_positions": heads | positions, "all": everything}[mode]
+        assert named == expected and moved == expected and len(TRAINED[mode]) == n_patterns
+        assert positions or mode == "heads"
+        kernels, others = policy.get_optim_params()
+        assert len(kernels["params"]) + len(others["params"]) == len(named)
+        assert others["weight_decay"] == 0.0 and all(x.ndim > 1 for x in kernels["params"])
+
+    def test_remembered_readouts_are_computed_once_and_are_the_same(self) -> None:
+        policy = tiny_policy(remember_readouts=True, augment=False)
+        policy.train()
+        given = batch(policy)
+        direct = policy._readout(given)
+        calls: list[int] = []
+        policy.network.transformer.register_forward_hook(lambda *_: calls.append(1))
+        for _ in range(2):
+            torch.testing.assert_close(policy._remembered(given), direct)
+        assert len(calls) == 1
+
+    def test_remembering_does_not_go_with_what_changes(self) -> None:
+        with pytest.raises(CheckpointError, match="remember_readouts needs"):
+            octo_config({**TINY, "remember_readouts": True})
+
+    def test_an_instruction_is_embedded_once_and_an_empty_one_is_an_error(self) -> None:
+        policy, prompts, calls = tiny_policy(), PromptEmbeddings(), []
+        policy.language.register_forward_hook(lambda *_: calls.append(1))
+        tokens, mask = torch.tensor([[3, 4, 0], [5, 0, 0], [3, 4, 0]]), torch.ones(3, 3, dtype=torch.bool)
+        first = prompts(policy.language, tokens, mask)
+        assert torch.equal(first[0], first[2]) and torch.equal(prompts(policy.language, tokens, mask), first)
+        assert len(calls) == 2
+        with pytest.raises(MissingInstructionError):
+            prompts(policy.language, tokens, torch.zeros(3, 3, dtype=torch.bool))
+
+    def test_wrong_sizes_are_errors(self) -> None:
+        for fields in (
+            {"window": 11},
+            {"image_px": {"primary": 100, "wrist": 16}},
+            {"cameras": {"primary": BASE}},
+        ):
+            with pytest.raises(CheckpointError, match="not a configuration of Octo"):
+                octo_config({**TINY, **fields})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("octo_small", "octo_base", "octo_tiny", "octo_small_positions", "octo_small_window2"),
+        *("octo_small_full", "octo_small_cached"),
+    ],
+)
+def test_each_recipe_is_a_configuration(name: str) -> None:
+    section = load_recipe("policies", name, PolicyRecipe).value.finetune
+    assert section is not None and section.type == "mikasa_octo"
+    config = MikasaOctoConfig(device="cpu", **section.policy)
+    assert (config.window, config.chunk_size) == (2 if name.endswith("window2") else 10, 4)
+
+
+# --------------------------------------------------------------------------------- the original checkpoint
+
+
+def golden_fields() -> dict[str, Any]:
+    config = json.loads((GOLDEN / "config.json").read_text())
+    head, t5, stem = config["action_head"], config["t5"], config["stem"]
+    return {
+        "image_px": {name: camera["image_size"] for name, camera in config["cameras"].items()},
+        **{"window": 4, "max_window": config["max_horizon"], "width": config["token_embedding_size"]},
+        **{"layers": config["num_layers"], "heads": config["num_attention_heads"]},
+        **{"mlp_width": config["mlp_dim"], "stem_channels": stem["features"]},
+        **{"stem_features": stem["num_features"], "head_hidden": head["hidden_dim"]},
+        **{"head_blocks": head["num_blocks"], "head_time": head["time_dim"]},
+        **{"language_tokens": config["language_tokens"], "tokenizer_name": "bytes"},
+        "t5": {
+            **{"vocabulary": N_BYTES, "width": t5["d_model"], "key": t5["d_kv"]},
+            **{"heads": t5["num_heads"], "layers": t5["num_layers"], "mlp_width": t5["d_ff"]},
+            "buckets": t5["relative_attention_num_buckets"],
+            "max_distance": t5["relative_attention_max_distance"],
+        },
+    }
+
+
+def golden_weights() -> dict[str, Tensor]:
+    """The stored parameters, the text encoder's vocabulary lengthened so that each byte has a row."""
+    weights = dict(load_file(GOLDEN / "weights.safetensors"))
+    key = "octo_transformer.task_tokenizers_language.hf_model.shared.embedding"
+    weights[key] = torch.cat([weights[key], torch.ones(N_BYTES - len(weights[key]), weights[key].shape[1])])
+    return weights
+
+
+def write_statistics(folder: Path, **datasets: float) -> None:
+    def numbers(mean: float) -> dict[str, Any]:
+        return {"action": {"mean": [mean] * 7, "std": [0.5] * 7, "max": [1.0] * 7}, "num_transitions": 3}
+
+    data = {name: numbers(mean) for name, mean in datasets.items()}
+    (folder / "dataset_statistics.json").write_text(json.dumps(data))
+
+
+def packed(value: Any) -> bytes:
+    """Write msgpack with the longest form of each type; arrays as flax's extension 1."""
+    if isinstance(value, dict):
+        inner = b"".join(packed(key) + packed(x) for key, x in value.items())
+        return b"\xdf" + struct.pack(">I", len(value)) + inner
+    if isinstance(value, list):
+        return b"\xdd" + struct.pack(">I", len(value)) + b"".join(packed(x) for x in value)
+    if isinstance(value, str):
+        return b"\xdb" + struct.pack(">I", len(value)) + value.encode()
+    if isinstance(value, bytes):
+        return b"\xc6" + struct.pack(">I", len(value)) + value
+    if isinstance(value, int):
+        return b"\xd3" + struct.pack(">q", value)
+    array = np.ascontiguousarray(value)
+    inner = packed([list(array.shape), array.dtype.name, array.tobytes()])
+    return b"\xc9" + struct.pack(">I", len(inner)) + b"\x01" + inner
+
+
+class TestOriginal:
+    def test_which_statistics_has_to_be_said_where_there_are_several(self, tmp_path: Path) -> None:
+        write_statistics(tmp_path, bridge_dataset=0.0, fractal=0.0)
+        save_file({"x": torch.zeros(1)}, tmp_path / "params.safetensors")
+        with pytest.raises(CheckpointError, match="Did you mean 'bridge_dataset'"):
+            convert(tmp_path, tmp_path / "out", fields=TINY, dataset="bridge_datset")
+
+    def test_a_tensor_that_lacks_or_has_another_shape_is_named(self, tmp_path: Path) -> None:
+        flat = golden_weights()
+        flat.pop("octo_transformer.readout_action_pos_embedding")
+        flat["octo_transformer.obs_wrist_projection.bias"] = torch.zeros(3)
+        save_file(flat, tmp_path / "params.safetensors")
+        write_statistics(tmp_path, bridge=0.0)
+        with pytest.raises(CheckpointError) as error:
+            convert(tmp_path, tmp_path / "out", fields=golden_fields(), dataset="bridge")
+        assert "1 missing: network.transformer.readout_positions" in str(error.value)
+        assert "network.transformer.projections.wrist.bias (expected (32,), found (3,))" in str(error.value)
+
+    def test_layouts_that_are_not_read_are_named_with_what_to_do(self, tmp_path: Path) -> None:
+        (tmp_path / "manifest.ocdbt").touch()
+        write_statistics(tmp_path, bridge=0.0)
+        with pytest.raises(CheckpointError, match="flatten_dict"):
+            convert(tmp_path, tmp_path / "out", fields=TINY, dataset="bridge")
+
+    @pytest.mark.parametrize("data", [b"\xc1", b"\xdf\x00\x00\x00\x02", packed({"a": 1}) + b"\x00"])
+    def test_damaged_msgpack_is_an_error(self, data: bytes) -> None:
+        with pytest.raises(CheckpointError, match="not flax's msgpack"):
+            unpack(data, where="x")
+
+
+# ----------------------------------------------------------------------------------- from data to a table
+
+
+@pytest.fixture(scope="module")
+def run(_recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny Octo after two steps, by the command line and without a network."""
+    folder = tmp_path_factory.mktemp("octo")
+    recipe = folder / "tiny_octo.yaml"
+    section = {
+        **{"type": "mikasa_octo", "policy": {**TINY, "trained": "all"}, "steps": 2, "batch_size": 2},
+        **{"save_every_steps": 2, "log_every_steps": 1, "num_workers": 0, "decode_ahead": False},
+    }
+    text = {"version": 1, "description": "tiny", "adapter": "lerobot", "finetune": section}
+    recipe.write_text(yaml.safe_dump(text))
+    arguments = ["--policy", str(recipe), "--dataset", str(_recorded), "--device", "cpu"]
+    assert main(["finetune", *arguments, "--allow-unreplayed", "--out", str(folder / "run")]) == 0
+    return folder / "run"
+
+
+def adapter(run: Path, *, n_slots: int = 1) -> LeRobotPolicy:
+    made: Any = make_env(EnvSettings(task=TASK, simulator="fake"))
+    context = PolicyContext(
+        name="octo", env=made.spec, chunking=ChunkingSpec(n_action_steps=4), n_candidates=3, n_slots=n_slots
+    )
+    return make_lerobot(context, checkpoint=str(run), device="cpu")
+
+
+def episode(slot: int) -> EpisodeStart:
+    return EpisodeStart(slot=slot, task=TASK, seed=10 + slot, run=0, instruction="touch it", horizon_steps=30)
+
+
+def frames(slot: int, first: int, stop: int) -> tuple[Observation, ...]:
+    rng = np.random.default_rng(slot)
+    pictures = rng.integers(0, 256, (stop, 2, 128, 128, 3), dtype=np.uint8)
+    return tuple(
+        Observation(step=n, images={"base_camera": pictures[n, 0], "hand_camera": pictures[n, 1]}, state={})
+        for n in range(first, stop)
+    )
+
+
+class TestInTheHarness:
+    def test_it_reads_every_frame_and_needs_no_proprioception(self, run: Path) -> None:
+        policy = adapter(run)
+        assert (policy.spec.reads, policy.spec.chunk_size, policy.spec.states) == ("every", 4, ())
+        assert policy.spec.cameras == ("base_camera", "hand_camera")
+
+    def test_several_episodes_in_one_pass_get_the_actions_they_get_alone(self, run: Path) -> None:
+        together = adapter(run, n_slots=3)
+        together.reset([episode(slot) for slot in range(3)])
+        alone = [adapter(run) for _ in range(3)]
+        for slot, policy in enumerate(alone):
+            policy.reset([EpisodeStart(**{**vars_of(episode(slot)), "slot": 0})])
+        for first, stop in ((0, 1), (1, 5), (5, 9)):
+            windows = [ObservationWindow(slot=slot, frames=frames(slot, first, stop)) for slot in range(3)]
+            chunks = together.act_batch(windows)
+            for slot, policy in enumerate(alone):
+                (single,) = policy.act_batch([ObservationWindow(slot=0, frames=frames(slot, first, stop))])
+                np.testing.assert_allclose(chunks[slot].actions, single.actions, atol=1e-5)
+        assert np.abs(chunks[0].actions - chunks[1].actions).max() > 1e-3  # noise of their own
+
+    def test_an_evaluation_with_chunks_of_four_and_context_ten_appears_in_the_table(
+        self, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = tmp_path / "evaluation"
+        fake = ["--set", "simulator=fake", "--set", "env.horizon_steps=12"]
+        arguments = ["--task", TASK, "--policy", str(run), "--n-action-steps", "4", "--episodes", "1"]
+        assert main(["eval", *arguments, "--workers", "1", *fake, "--out", str(out)]) == 0
+        (record,) = read_run(out).records
+        # 12 steps: inferences at 0, 4 and 8, given 1, 4 and 4 frames.
+        assert (record.n_inferences, record.n_frames, record.n_steps) == (3, 9, 12)
+        assert "run-000002" in capsys.readouterr().out
+
+    def test_the_checkpoint_names_its_statistics_and_has_no_proprioception(self, run: Path) -> None:
+        folder = find_checkpoint(run)
+        steps = json.loads((folder / "policy_preprocessor.json").read_text())["steps"]
+        encoder = next(step for step in steps if step.get("registry_name") == "mikasa_encoder")
+        assert encoder["config"]["fields"]["action"]["mask"] == [True] * 6 + [False]
+        state = load_file(folder / encoder["state_file"])
+        assert set(state) == {"action/mean", "action/std"}
+        assert state["action/mean"].shape == (len(ACTION_NAMES),)
+        assert "observation.state" not in json.loads((folder / "config.json").read_text())["input_features"]
+
+
+def vars_of(start: EpisodeStart) -> dict[str, Any]:
+    return {name: getattr(start, name) for name in ("task", "seed", "run", "instruction", "horizon_steps")}
