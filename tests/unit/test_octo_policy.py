@@ -25,12 +25,15 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.octo.configuration_octo import TRAINED, MikasaOctoConfig
 from vla_eval.policies.octo.convert import convert, octo_config
+from vla_eval.policies.octo.flax_names import our_name
 from vla_eval.policies.octo.language import PromptEmbeddings
 from vla_eval.policies.octo.modeling_octo import TOKENS_KEY, TOKENS_MASK_KEY, MikasaOctoPolicy
 from vla_eval.policies.octo.original import unpack
 from vla_eval.policies.steps.trainable import trainable
 from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.results.store import read_run
+from vla_eval.training.finetune import finetune
+from vla_eval.training.recipe import FinetuneConfig
 
 TASK = "RememberColor3-v0"
 N_BYTES = 260  # 256, three special tokens, and one to spare
@@ -247,6 +250,36 @@ def packed(value: Any) -> bytes:
 
 
 class TestOriginal:
+    def test_both_layouts_become_the_same_checkpoint_that_verify_accepts(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        kept = golden_weights()
+        tree: dict[str, Any] = {}
+        for key, x in kept.items():
+            parts = key.split(".")  # T5's names have more dots than its tree; the flat names are the same
+            inner = tree
+            for part in parts[:-1]:
+                inner = inner.setdefault(part, {})
+            inner[parts[-1]] = x.numpy()
+        for layout in ("one", "two"):
+            folder = tmp_path / layout
+            folder.mkdir()
+            write_statistics(folder, bridge=0.25, fractal=0.5)
+            if layout == "one":
+                save_file(kept, folder / "params.safetensors")
+            else:
+                (folder / "checkpoint").write_bytes(packed(tree))
+            convert(folder, tmp_path / f"{layout}-out", fields=golden_fields(), dataset="bridge")
+        first, second = (load_file(tmp_path / f"{x}-out" / "model.safetensors") for x in ("one", "two"))
+        assert first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
+        # safetensors keeps one of the two names of T5's embeddings.
+        named = {key.replace("language.encoder.embed_tokens", "language.shared") for key in first}
+        assert named == {our_name(key) for key in kept}
+        assert main(["checkpoint", "verify", str(tmp_path / "one-out")]) == 0
+        said = capsys.readouterr().out
+        assert "1 × 4 × 7 actions" in said and "action.mean, action.std" in said
+        assert f"{sum(x.numel() for x in kept.values()):,}" in said
+
     def test_which_statistics_has_to_be_said_where_there_are_several(self, tmp_path: Path) -> None:
         write_statistics(tmp_path, bridge_dataset=0.0, fractal=0.0)
         save_file({"x": torch.zeros(1)}, tmp_path / "params.safetensors")
@@ -357,6 +390,42 @@ class TestInTheHarness:
         assert set(state) == {"action/mean", "action/std"}
         assert state["action/mean"].shape == (len(ACTION_NAMES),)
         assert "observation.state" not in json.loads((folder / "config.json").read_text())["input_features"]
+
+
+def test_from_a_converted_base_only_the_head_changes_and_the_statistics_are_the_datasets(
+    recorded: Path, tmp_path: Path
+) -> None:
+    original, base, out = tmp_path / "original", tmp_path / "base", tmp_path / "run"
+    original.mkdir()
+    save_file(golden_weights(), original / "params.safetensors")
+    write_statistics(original, bridge=0.25)
+    convert(original, base, fields=golden_fields(), dataset="bridge")
+    short = {"steps": 1, "batch_size": 2, "save_every_steps": 1, "log_every_steps": 1, "num_workers": 0}
+    finetune(
+        FinetuneConfig(
+            policy="octo_small",
+            dataset=str(recorded),
+            out=str(out),
+            finetune={
+                **{**short, "base_checkpoint": str(base), "decode_ahead": False},
+                "policy": {"window": 3, "gripper_encoding": "unit_open", "scheduler_warmup_steps": 0},
+            },
+            device="cpu",
+            allow_unreplayed=True,
+        )
+    )
+    folder = find_checkpoint(out)
+    before, after = (load_file(path / "model.safetensors") for path in (base, folder))
+    changed = {key for key in before if not torch.equal(before[key], after[key])}
+    assert changed and all(key.startswith("network.head.") for key in changed)
+    for name in ("preprocessor", "postprocessor"):
+        steps = json.loads((folder / f"policy_{name}.json").read_text())["steps"]
+        ours = next(step for step in steps if str(step.get("registry_name")).startswith("mikasa_"))
+        assert ours["config"]["gripper"]["encoding"] == "unit_open"  # the recipe's, not the base's
+        mean = load_file(folder / ours["state_file"])["action/mean"]
+        assert not torch.equal(mean, torch.full((7,), 0.25))
+        expected = json.loads((recorded / "meta" / "stats.json").read_text())["action"]["mean"]
+        torch.testing.assert_close(mean, torch.tensor(expected))
 
 
 def vars_of(start: EpisodeStart) -> dict[str, Any]:
