@@ -124,7 +124,8 @@ class DiffusionHead(nn.Module):
         noisy = left.sqrt() * actions + (1 - left).sqrt() * draws.noise
         errors = (self(condition_BWD, noisy, draws.time) - draws.noise).square()
         counts = (targets.step_mask[..., None, None] & targets.action_mask).flatten(2).to(errors.dtype)
-        return (errors * counts).mean() / counts.mean().clamp(min=LEAST_SHARE) * self.sizes.action
+        mean: Tensor = (errors * counts).mean() / counts.mean().clamp(min=LEAST_SHARE)
+        return mean * self.sizes.action
 
     def sample(self, condition_BD: Tensor, noise: Tensor) -> Tensor:
         """Return chunks (B, chunk, action), normalised.
@@ -144,7 +145,7 @@ class DiffusionHead(nn.Module):
             if at > 0:
                 x = x + beta.sqrt() * noise[:, 1 + index]
             x = x.clamp(-self.sizes.max_action, self.sizes.max_action)
-        return x.unflatten(-1, (self.sizes.chunk, self.sizes.action))
+        return x.reshape(len(x), self.sizes.chunk, self.sizes.action)
 
 
 class Targets(NamedTuple):

@@ -45,8 +45,8 @@ class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
             key: spec if isinstance(spec, Normalization) else decode(Normalization, spec, where=key)
             for key, spec in self.fields.items()
         }
-        if not isinstance(self.gripper, Gripper):
-            self.gripper = decode(Gripper, self.gripper, where="gripper")
+        given: Any = self.gripper  # a mapping, where it comes from JSON
+        self.gripper = given if isinstance(given, Gripper) else decode(Gripper, given, where="gripper")
         check_gripper_mask(self.fields.get(ACTION), self.gripper)
         self._given = bool(self.stats)
         if self.stats:
