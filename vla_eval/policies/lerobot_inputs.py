@@ -207,7 +207,9 @@ def _state_kind(config: Any, preprocessor: Any, wanted: StateKind | None, policy
         return None
     statistics = _statistics(preprocessor).get(STATE_KEY, {})
     # Fine-tuned from a base, a configuration keeps the base's padded size; statistics are the dataset's.
-    n_dims = next((int(np.size(value)) for name, value in statistics.items() if name != "count"), None)
+    n_dims = next(
+        (int(np.asarray(value).size) for name, value in statistics.items() if name != "count"), None
+    )
     n_dims = int(feature.shape[0]) if n_dims is None else n_dims
     sizes = {kind: len(names) for kind, names in STATE_NAMES.items()}
     fitting = [kind for kind, size in sizes.items() if size == n_dims]

@@ -80,7 +80,8 @@ class OpenVLANetwork(nn.Module):
         self.sizes, self.options = sizes, options
         self.vision = FusedVision(sizes)
         self.projector = Projector(sizes)
-        self.llm: Any = LlamaForCausalLM(_llama_config(sizes))
+        make_llm: Any = LlamaForCausalLM
+        self.llm: Any = make_llm(_llama_config(sizes))
         if options.proprio:
             self.proprio_projector = ProprioProjector(proprio=options.proprio, llm_width=sizes.llm_width)
         if options.head == "l1":
