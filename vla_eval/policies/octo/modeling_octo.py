@@ -62,7 +62,8 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
 
     def get_optim_params(self) -> list[dict[str, Any]]:
         """Return what is trained; decay is for kernels alone, as in the original."""
-        kernels, others = [], []
+        kernels: list[Tensor] = []
+        others: list[Tensor] = []
         for name, parameter in self.named_parameters():
             if parameter.requires_grad:
                 is_kernel = parameter.ndim > 1 and name.endswith(".weight")

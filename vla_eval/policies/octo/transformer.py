@@ -196,7 +196,7 @@ class OctoTransformer(nn.Module):
     def _split(self, x_BND: Tensor, n_task: int, counts: Mapping[str, int]) -> Outputs:
         per_step = sum(counts.values()) + 1
         steps_BWND = x_BND[:, n_task:].reshape(len(x_BND), -1, per_step, x_BND.shape[-1])
-        parts = steps_BWND.split([*counts.values(), 1], dim=2)
+        parts = torch.split(steps_BWND, [*counts.values(), 1], dim=2)
         return Outputs(x_BND[:, :n_task], dict(zip(counts, parts[:-1], strict=True)), parts[-1].squeeze(2))
 
 
