@@ -244,21 +244,23 @@ def test_the_gripper_can_remember_the_colour_and_a_frozen_one_cannot() -> None:
     assert len({record.target for record in frozen}) == 3
 
 
-def test_staying_at_the_place_of_the_cue_wins_where_that_keeps_the_answer() -> None:
-    """In a shell game the arm waits over the ball; cubes are shown in the middle, and lie elsewhere."""
-    assert n_successes(run("ShellGameTouch-v0", "cue_touch", (1, 2, 3))) == 3
-    assert n_successes(run("RememberColor3-v0", "cue_touch", (1, 2, 3))) == 0
+def test_staying_at_the_place_of_the_cue_wins_cube_tasks_only_where_touching_the_cue_counts() -> None:
+    """Cubes are shown in the middle, and lie elsewhere when one has to be chosen."""
     early = {"phase_gate_success": False, "cue_steps": 30}
     env = make_env(EnvSettings(task="RememberColor3-v0", privileged=True, kwargs=early))
     assert n_successes(run("RememberColor3-v0", "cue_touch", (1, 2), env=env)) == 2
+    early["phase_gate_success"] = True
+    env = make_env(EnvSettings(task="RememberColor3-v0", privileged=True, kwargs=early))
+    records = run("RememberColor3-v0", "cue_touch", (1, 2), env=env)
+    assert all(record.success_step is None or record.success_step >= 35 for record in records)
 
 
 def test_under_the_strict_protocol_neither_a_tour_nor_a_body_knows_more_than_chance() -> None:
     """The first choice is final, and the arm is held until then: both choose as if nothing had been shown."""
-    for policy in ("tour", "body_memory", "cue_touch"):
+    for policy in ("tour", "body_memory"):
         env = make_env(EnvSettings(task="ShellGameTouch-v0", privileged=True, kwargs=dict(STRICT)))
         records = run("ShellGameTouch-v0", policy, range(1, 10), env=env)
-        # 9 of 9 by luck, at 1/3 each: once in 19,683 times. The paper's rule lets each of them win 9.
+        # 9 of 9 by luck, at 1/3 each: once in 19,683 times. The paper's rule lets either win 9.
         assert 0 < n_successes(records) < 9
         assert all(bool(r.success_once) == bool(r.first_choice_success) for r in records)
 

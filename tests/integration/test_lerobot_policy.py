@@ -1,5 +1,6 @@
 """LeRobot policies in our loop: nothing loads half, nothing hides frames, nothing depends on neighbours."""
 
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -39,7 +40,13 @@ from vla_eval.results.store import read_run
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec
 from vla_eval.testing import check_policy
-from vla_eval.training.tiny_models import TINY_POLICY, make_tiny_pi0, tiny_paligemma, write_tiny_tokenizer
+from vla_eval.training.tiny_models import (
+    TINY_POLICY,
+    make_tiny_pi0,
+    tiny_paligemma,
+    tiny_resnet,
+    write_tiny_tokenizer,
+)
 
 TASK = "RememberColor3-v0"
 FAKE = EnvSettings(task=TASK, simulator="fake", cameras=("base_camera", "hand_camera"))
@@ -111,8 +118,15 @@ def act_config() -> ACTConfig:
     )
 
 
+@pytest.fixture(scope="module", autouse=True, params=["small", pytest.param("real", marks=pytest.mark.slow)])
+def eyes(request: pytest.FixtureRequest) -> Iterator[None]:
+    """ACT's ResNet-18, or one convolution in its place."""
+    with tiny_resnet() if request.param == "small" else contextlib.nullcontext():
+        yield
+
+
 @pytest.fixture(scope="module")
-def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def act(eyes: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(with_features(act_config()), tmp_path_factory.mktemp("act") / "model")
 
 

@@ -83,11 +83,18 @@ def recorded(_recorded: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def small_act(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """ACT with a small network for its eyes, here and in workers: most of a training's time went there."""
-    from vla_eval import evaluate
-    from vla_eval.training.tiny_models import tiny_resnet, tiny_worker_main
+def small_act() -> Iterator[None]:
+    """ACT with a small network for its eyes: most of a training's time went there."""
+    from vla_eval.training.tiny_models import tiny_resnet
 
-    monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
     with tiny_resnet():
         yield
+
+
+@pytest.fixture
+def small_act_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same in worker processes, which have to import lerobot for it."""
+    from vla_eval import evaluate
+    from vla_eval.training.tiny_models import tiny_worker_main
+
+    monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)

@@ -85,6 +85,7 @@ def quick_evaluation(monkeypatch: pytest.MonkeyPatch) -> list[EvalConfig]:
 
 
 class TestEvaluation:
+    @pytest.mark.usefixtures("small_act_in_workers")
     def test_the_checkpoint_is_evaluated_and_the_weights_are_those_of_a_run_without(
         self, recorded: Path, tmp_path: Path
     ) -> None:

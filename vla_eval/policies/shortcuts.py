@@ -7,7 +7,7 @@
   arm and gripper may move before the choice (`freeze_until_choice` forbids it).
 - `cue_touch`: goes to the place where the cue is shown as soon as the episode begins, and stays there. It
   wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
-  answer: over the ball of a shell game.
+  answer: over the ball of a shell game, where it goes down on the mug that it finds nearest.
 """
 
 from dataclasses import replace
@@ -17,11 +17,12 @@ import numpy as np
 
 from vla_eval.core import ActionChunk, ObservationWindow, PrivilegedState
 from vla_eval.errors import SpecMismatchError
-from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M, Vector
+from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.choices import CandidateExpert
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.tasks.catalog import task_spec
 
 
 class BodyMemoryPolicy(ScriptedPolicy):
@@ -71,7 +72,6 @@ def make_body_memory(context: PolicyContext) -> BodyMemoryPolicy:
 
 CUE_PLACE_M = (0.0, 0.0, 0.02)
 """Where cubes and other items are shown: the middle of the table, world frame (docs/tasks.md)."""
-BALL = "ball"
 
 
 class CueTouchPolicy(ScriptedPolicy):
@@ -79,20 +79,28 @@ class CueTouchPolicy(ScriptedPolicy):
 
     privileged = True
 
+    def __init__(self, context: PolicyContext) -> None:
+        """Look up whether the cue is shown where the right candidate will be: if a place is to be kept."""
+        super().__init__(context)
+        self._is_a_place = task_spec(context.env.task).memory == "spatial"
+
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Go on to the place of the cue, or rest there."""
         state = self.privileged_state(window)
-        hidden_ball = state.bodies.get(BALL)
-        expert, place_m = (CUBES, np.array(CUE_PLACE_M)) if hidden_ball is None else (MUGS, mug_over(state))
-        there = replace(state, candidate_positions_m=place_m[None])
-        return ActionChunk(actions=expert.plan(there, 0, self._n_actions))
+        if not self._is_a_place:
+            there = replace(state, candidate_positions_m=np.array([CUE_PLACE_M]))
+            return ActionChunk(actions=CUBES.plan(there, 0, self._n_actions))
+        if state.phase == "delay":
+            return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
+        candidate = state.target if state.phase == "cue" else _nearest(state)
+        assert candidate is not None  # one place is shown in these tasks
+        return ActionChunk(actions=MUGS.plan(state, candidate, self._n_actions))
 
 
-def mug_over(state: PrivilegedState) -> Vector:
-    """Return (3,): where the centre of the mug over the ball is, or will be, in the world frame."""
-    ball_m = state.bodies[BALL].position_m
-    nearest = np.linalg.norm((state.candidate_positions_m - ball_m)[:, :2], axis=1).argmin()
-    return np.array([*ball_m[:2], state.candidate_positions_m[nearest, 2]])
+def _nearest(state: PrivilegedState) -> int:
+    """Return the candidate nearest to the gripper, seen from above."""
+    offsets = state.candidate_positions_m - state.tcp_position_m
+    return int(np.linalg.norm(offsets[:, :2], axis=1).argmin())
 
 
 def make_cue_touch(context: PolicyContext) -> CueTouchPolicy:
