@@ -19,6 +19,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from safetensors.torch import load_file, save_file
 
+from vla_eval import evaluate as evaluate_module
 from vla_eval.cli.main import main
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.data.features import proprioception
@@ -45,6 +46,7 @@ from vla_eval.training.tiny_models import (
     make_tiny_pi0,
     tiny_paligemma,
     tiny_resnet,
+    tiny_worker_main,
     write_tiny_tokenizer,
 )
 
@@ -119,14 +121,14 @@ def act_config() -> ACTConfig:
 
 
 @pytest.fixture(scope="module", autouse=True, params=["small", pytest.param("real", marks=pytest.mark.slow)])
-def eyes(request: pytest.FixtureRequest) -> Iterator[None]:
+def eyes(request: pytest.FixtureRequest) -> Iterator[str]:
     """ACT's ResNet-18, or one convolution in its place."""
     with tiny_resnet() if request.param == "small" else contextlib.nullcontext():
-        yield
+        yield request.param
 
 
 @pytest.fixture(scope="module")
-def act(eyes: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def act(eyes: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(with_features(act_config()), tmp_path_factory.mktemp("act") / "model")
 
 
@@ -646,8 +648,10 @@ class TestFolders:
         assert checkpoint_sha256(folder) != before
 
     def test_eval_takes_a_folder_and_notes_weights_and_dataset(
-        self, act: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, act: Path, eyes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        if eyes == "small":
+            monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
         folder = tmp_path / "mine"
         folder.mkdir()
         copied(act, folder)
