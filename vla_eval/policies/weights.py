@@ -109,7 +109,7 @@ def _differing(
 
 
 def _refuse(problems: Mapping[str, list[str]], where: str) -> None:
-    lines = [f"  {len(keys)} {what}: {_shown(keys)}" for what, keys in problems.items() if keys]
+    lines = [f"  {len(keys)} {what}: {listed(keys)}" for what, keys in problems.items() if keys]
     if lines:
         raise CheckpointError(
             f"{where}: the weights are not those of this policy:\n"
@@ -120,6 +120,7 @@ def _refuse(problems: Mapping[str, list[str]], where: str) -> None:
         )
 
 
-def _shown(keys: list[str]) -> str:
+def listed(keys: Sequence[str]) -> str:
+    """Return the first names, and how many more there are; for messages."""
     more = f" … and {len(keys) - MAX_SHOWN} more" if len(keys) > MAX_SHOWN else ""
     return ", ".join(keys[:MAX_SHOWN]) + more

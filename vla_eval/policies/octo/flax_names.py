@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.weights import listed
 
 TRUNK = "octo_transformer."
 HEAD = "heads_action.diffusion_model."
@@ -20,7 +21,6 @@ ATTENTION = BLOCK + r"MultiHeadDotProductAttention_0\."
 STEM = TRUNK + r"observation_tokenizers_(?P<camera>\w+?)\.SmallStem16_0\."
 T5 = TRUNK + r"task_tokenizers_language\.hf_model\."
 RESIDUAL = HEAD + r"reverse_network\.MLPResNetBlock_(?P<i>\d+)\."
-MAX_SHOWN = 8
 
 
 class _Rule(NamedTuple):
@@ -127,19 +127,15 @@ def from_flax(tree: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     converted, unknown = {}, []
     for key, values in tree.items():
-        found = next(
-            ((match, rule) for pattern, rule in _COMPILED if (match := pattern.fullmatch(key))), None
-        )
-        if found is None:
+        rule = _rule(key)
+        if rule is None:
             unknown.append(key)
             continue
-        match, rule = found
-        converted[match.expand(rule.name)] = rule.change(torch.as_tensor(values)).contiguous()
+        converted[rule.name] = rule.change(torch.as_tensor(values)).contiguous()
     if unknown:
-        more = f" … and {len(unknown) - MAX_SHOWN} more" if len(unknown) > MAX_SHOWN else ""
         raise CheckpointError(
             f"{len(unknown)} tensors are not of the Octo that is built here (cameras, instruction, diffusion "
-            f"head): {', '.join(unknown[:MAX_SHOWN])}{more}."
+            f"head): {listed(unknown)}."
         )
     return converted
 

@@ -10,9 +10,9 @@ from typing import Any  # peft and lerobot are untyped
 from torch import nn
 
 from vla_eval.errors import TrainingError, did_you_mean
+from vla_eval.policies.weights import listed
 
 ALL_LINEAR = "all-linear"
-MAX_SHOWN = 8
 _LORA = re.compile(r"^(?P<module>.+)\.lora_(?:A|B|embedding_A|embedding_B|magnitude_vector)\..+$")
 _SAVED = re.compile(r"^(?P<module>.+)\.modules_to_save\.[^.]+\.(?P<rest>.+)$")
 
@@ -100,7 +100,7 @@ def check_lora(model: Any, target: str, full_modules: Sequence[str] = ()) -> tup
             name for name in trainable(inner) if not _is_meant(name, linear, full_modules)
         ],
     }
-    lines = [f"  {what}: {_shown(names)}" for what, names in problems.items() if names]
+    lines = [f"  {what}: {listed(names)}" for what, names in problems.items() if names]
     if lines:
         raise TrainingError("LoRA does not train what the recipe names:\n" + "\n".join(lines))
     return expected
@@ -120,8 +120,3 @@ def _is_meant(name: str, adapted: Sequence[str], full_modules: Sequence[str]) ->
     return saved is not None and any(
         saved["module"] == module or saved["module"].endswith(f".{module}") for module in full_modules
     )
-
-
-def _shown(names: Sequence[str]) -> str:
-    more = f" … and {len(names) - MAX_SHOWN} more" if len(names) > MAX_SHOWN else ""
-    return ", ".join(names[:MAX_SHOWN]) + more
