@@ -62,8 +62,11 @@ def _verify(args: argparse.Namespace) -> list[str]:
 def _convert(args: argparse.Namespace) -> list[str]:
     from vla_eval.policies.octo.convert import SIZES, convert
 
-    size = SIZES["small"] if args.size == "small" else SIZES["base"]
     out = convert(
-        Path(args.path), Path(args.out), fields=size, dataset=args.dataset_name, tokenizer=args.tokenizer
+        Path(args.path),
+        Path(args.out),
+        fields=SIZES[args.size],
+        dataset=args.dataset_name,
+        tokenizer=args.tokenizer,
     )
     return [str(out)]

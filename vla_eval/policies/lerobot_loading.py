@@ -298,6 +298,14 @@ def _checked_steps(path: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
+def save_tokenizer(preprocessor: Any, folder: Path) -> None:
+    """Keep the tokenizer beside the weights: the name it was loaded by may mean nothing elsewhere."""
+    for step in preprocessor.steps:
+        tokenizer = getattr(step, "input_tokenizer", None)
+        if tokenizer is not None:
+            tokenizer.save_pretrained(str(folder))
+
+
 def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:
     """Raise `CheckpointError` unless all that is normalised has its statistics.
 

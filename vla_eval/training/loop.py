@@ -39,7 +39,7 @@ from vla_eval.policies.checkpoint import (
     read_json,
     write_facts,
 )
-from vla_eval.policies.lerobot_loading import TOKENIZER_STEP, LoadOptions, fill_policy
+from vla_eval.policies.lerobot_loading import TOKENIZER_STEP, LoadOptions, fill_policy, save_tokenizer
 from vla_eval.policies.steps.processor_steps import DECODER_STEP, ENCODER_STEP
 
 PARTIAL_PREFIX = ".partial-"
@@ -159,7 +159,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         partial = checkpoint_dir.with_name(f"{PARTIAL_PREFIX}{checkpoint_dir.name}")
         originals["save_checkpoint"](checkpoint_dir=partial, **kwargs)
         write_facts(partial / MODEL_FOLDER, hooks.facts)
-        _save_tokenizer(kwargs["preprocessor"], partial / MODEL_FOLDER / TOKENIZER_FOLDER)
+        save_tokenizer(kwargs["preprocessor"], partial / MODEL_FOLDER / TOKENIZER_FOLDER)
         _sync(partial)
         os.replace(partial, checkpoint_dir)
         hooks.on_checkpoint(checkpoint_dir)
@@ -224,14 +224,6 @@ def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> No
         if "stats" in given:
             overrides[ours] = {**getattr(config, "encoder_settings", {}), "stats": given["stats"]}
         kwargs[overrides_name] = overrides
-
-
-def _save_tokenizer(preprocessor: Any, folder: Path) -> None:
-    """Keep the tokenizer beside the weights: the name it was loaded by may mean nothing elsewhere."""
-    for step in preprocessor.steps:
-        tokenizer = getattr(step, "input_tokenizer", None)
-        if tokenizer is not None:
-            tokenizer.save_pretrained(str(folder))
 
 
 def _sync(folder: Path) -> None:

@@ -6,13 +6,13 @@ from typing import Any, Literal  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+from vla_eval.data.features import ACTION_KEY
 from vla_eval.policies.octo.diffusion_head import HeadSizes
 from vla_eval.policies.octo.language import T5Sizes
 from vla_eval.policies.octo.transformer import PATCH_PX, TransformerSizes
 from vla_eval.policies.steps.gripper import Gripper, GripperDecoding, GripperEncoding
 from vla_eval.policies.steps.images import Augmentation
 from vla_eval.policies.steps.normalization import Normalization, mask_all_but
-from vla_eval.policies.steps.processor_steps import ACTION
 
 TYPE = "mikasa_octo"
 BYTES_TOKENIZER = "bytes"
@@ -204,7 +204,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
     @property
     def encoder_settings(self) -> dict[str, Any]:
         """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
-        return {"fields": {ACTION: self.action_normalization}, "gripper": self.gripper}
+        return {"fields": {ACTION_KEY: self.action_normalization}, "gripper": self.gripper}
 
     def augmentation(self, camera: str) -> Augmentation:
         """Return how training pictures of a camera are changed; the first one is cropped, too."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
-from vla_eval.policies.lerobot_loading import make_empty_policy
+from vla_eval.policies.lerobot_loading import make_empty_policy, save_tokenizer
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
 from vla_eval.policies.octo.flax_names import from_flax
 from vla_eval.policies.octo.original import read_parameters, read_statistics
@@ -22,7 +22,6 @@ SIZES: dict[Size, dict[str, Any]] = {
     "base": {"width": 768, "layers": 12, "heads": 12, "mlp_width": 3072},
 }
 """Source: octo/model/components/transformer.py of the original, `vit_s` and `vit_b`."""
-TOKENIZER_STEP = "tokenizer_processor"
 
 
 def convert(
@@ -56,9 +55,7 @@ def convert(
     policy.save_pretrained(out)
     before.save_pretrained(out)
     after.save_pretrained(out)
-    for step in before.steps:
-        if hasattr(step, "input_tokenizer"):
-            step.input_tokenizer.save_pretrained(str(out / TOKENIZER_FOLDER))
+    save_tokenizer(before, out / TOKENIZER_FOLDER)
     return out
 
 

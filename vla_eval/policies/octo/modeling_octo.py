@@ -9,6 +9,7 @@ from typing import Any  # lerobot is untyped
 
 import torch
 from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY
@@ -27,7 +28,6 @@ from vla_eval.policies.steps.images import (
 )
 from vla_eval.policies.steps.trainable import set_trainable
 
-TOKENS_KEY, TOKENS_MASK_KEY = "observation.language.tokens", "observation.language.attention_mask"
 INDEX_KEY = "index"  # of a frame in the dataset
 
 
@@ -142,7 +142,9 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
             for camera, field in self.config.cameras.items()
         }
         language_BLD = self._prompts(
-            self.language, _needed(batch, TOKENS_KEY), _needed(batch, TOKENS_MASK_KEY).bool()
+            self.language,
+            _needed(batch, OBS_LANGUAGE_TOKENS),
+            _needed(batch, OBS_LANGUAGE_ATTENTION_MASK).bool(),
         )
         return Window(
             images=images,

@@ -8,7 +8,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vla_eval.data.features import STATE_KEY
+from vla_eval.data.features import ACTION_KEY, STATE_KEY
 from vla_eval.errors import RecipeError, did_you_mean, unknown_name
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, network_sizes
@@ -168,7 +168,7 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         """
         n_dims = int(self.action_feature.shape[0])
         fields = {
-            "action": Normalization(kind="q01_q99", mask=mask_all_but(n_dims, left_alone=(-1,)), clip=True)
+            ACTION_KEY: Normalization(kind="q01_q99", mask=mask_all_but(n_dims, left_alone=(-1,)), clip=True)
         }
         if self.use_proprio:
             n_state = int(self.robot_state_feature.shape[0])

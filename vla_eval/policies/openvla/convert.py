@@ -17,7 +17,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
 from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.policies.checkpoint import CONFIG_FILE, TOKENIZER_FOLDER, read_json
 from vla_eval.policies.openvla.configuration_openvla import MikasaOpenVLAConfig
@@ -169,7 +169,7 @@ def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
     if options.proprio:
         inputs[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(options.proprio,))
     config.input_features = inputs
-    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
+    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
     return config
 
 

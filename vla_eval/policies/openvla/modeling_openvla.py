@@ -7,6 +7,7 @@ from typing import Any  # lerobot and transformers are untyped
 
 import torch
 from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
@@ -19,7 +20,6 @@ from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
 
 PADDING_KEY = "action_is_pad"
-TOKENS_KEY, TOKENS_MASK_KEY = "observation.language.tokens", "observation.language.attention_mask"
 
 
 class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -107,7 +107,7 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
         return torch.stack(pictures, dim=1)
 
     def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
-        ids, mask = batch[TOKENS_KEY], batch[TOKENS_MASK_KEY]
+        ids, mask = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         if ids.shape[1] > self.config.prompt_max_tokens:
             raise SpecMismatchError(
                 f"'{TYPE}': a prompt has {ids.shape[1]} tokens, expected at most "

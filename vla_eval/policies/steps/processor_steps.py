@@ -15,12 +15,12 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
+from vla_eval.data.features import ACTION_KEY
 from vla_eval.decoding import decode
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.steps.gripper import Gripper
 from vla_eval.policies.steps.normalization import STATISTICS, Normalization, Normalizer
 
-ACTION = "action"
 ENCODER_STEP, DECODER_STEP = "mikasa_encoder", "mikasa_decoder"
 
 
@@ -47,7 +47,7 @@ class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
         }
         given: Any = self.gripper  # a mapping, where it comes from JSON
         self.gripper = given if isinstance(given, Gripper) else decode(Gripper, given, where="gripper")
-        check_gripper_mask(self.fields.get(ACTION), self.gripper)
+        check_gripper_mask(self.fields.get(ACTION_KEY), self.gripper)
         self._given = bool(self.stats)
         if self.stats:
             self._use(self.stats)
@@ -125,9 +125,9 @@ class EncoderStep(_Statistics):
         action = changed.get(TransitionKey.ACTION)
         if isinstance(action, Tensor):
             encoded = self.gripper.encode(action)
-            normalized = ACTION in self.fields
+            normalized = ACTION_KEY in self.fields
             changed[TransitionKey.ACTION] = (
-                self._normalizer(ACTION).normalize(encoded) if normalized else encoded
+                self._normalizer(ACTION_KEY).normalize(encoded) if normalized else encoded
             )
         return changed
 
@@ -143,8 +143,8 @@ class DecoderStep(_Statistics):
         action = changed.get(TransitionKey.ACTION)
         if not isinstance(action, Tensor):
             raise CheckpointError(f"expected a tensor of actions, found {type(action).__name__}.")
-        if ACTION in self.fields:
-            action = self._normalizer(ACTION).unnormalize(action)
+        if ACTION_KEY in self.fields:
+            action = self._normalizer(ACTION_KEY).unnormalize(action)
         changed[TransitionKey.ACTION] = self.gripper.decode(action.to(torch.float32))
         return changed
 
