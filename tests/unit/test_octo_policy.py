@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -27,7 +28,7 @@ from vla_eval.policies.octo.configuration_octo import TRAINED, MikasaOctoConfig
 from vla_eval.policies.octo.convert import convert, octo_config
 from vla_eval.policies.octo.flax_names import our_name
 from vla_eval.policies.octo.language import PromptEmbeddings
-from vla_eval.policies.octo.modeling_octo import TOKENS_KEY, TOKENS_MASK_KEY, MikasaOctoPolicy
+from vla_eval.policies.octo.modeling_octo import MikasaOctoPolicy
 from vla_eval.policies.octo.original import unpack
 from vla_eval.policies.steps.trainable import trainable
 from vla_eval.recipes import PolicyRecipe, load_recipe
@@ -62,8 +63,8 @@ def batch(policy: MikasaOctoPolicy, *, n: int = 2, n_missing: int = 0) -> dict[s
         "action": torch.rand(n, n_steps, 7, generator=draws),
         "action_is_pad": (torch.arange(n_steps) < n_missing).expand(n, -1).clone(),
         "index": torch.arange(n),
-        TOKENS_KEY: torch.arange(config.language_tokens).expand(n, -1) + 3,
-        TOKENS_MASK_KEY: torch.ones(n, config.language_tokens, dtype=torch.bool),
+        OBS_LANGUAGE_TOKENS: torch.arange(config.language_tokens).expand(n, -1) + 3,
+        OBS_LANGUAGE_ATTENTION_MASK: torch.ones(n, config.language_tokens, dtype=torch.bool),
     }
 
 
