@@ -80,14 +80,14 @@ class CueTouchPolicy(ScriptedPolicy):
     privileged = True
 
     def __init__(self, context: PolicyContext) -> None:
-        """Look up whether the cue is shown where the right candidate will be: if a place is to be kept."""
+        """Look up whether the cue is shown where the right candidate will be."""
         super().__init__(context)
-        self._is_a_place = task_spec(context.env.task).memory == "spatial"
+        self._marks_place = task_spec(context.env.task).cue_marks_place
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Go on to the place of the cue, or rest there."""
         state = self.privileged_state(window)
-        if not self._is_a_place:
+        if not self._marks_place:
             there = replace(state, candidate_positions_m=np.array([CUE_PLACE_M]))
             return ActionChunk(actions=CUBES.plan(there, 0, self._n_actions))
         if state.phase == "delay":

@@ -84,6 +84,7 @@ def _shell_game(mode: str, *, asks: str, success: str, oracle: str, max_reward: 
         oracle=oracle,
         oracle_sees="poses of all mugs and which one is right; moves once the mugs have appeared",
         candidates="mugs",
+        cue_marks_place=True,
         chance_success=1 / 3,
         max_reward=max_reward,
     )

@@ -29,6 +29,7 @@ class TaskSpec:
             measured (there is no choice among candidates), or depends on the arguments (families).
         max_reward: the dense reward at success, which `normalized_dense` divides by.
         idle_success: how often doing nothing succeeds, as measured; 0 for all tasks but a few.
+        cue_marks_place: the cue is shown where the right candidate will be.
         shows_one_by_one: the cue is `n_shown` items one after another, each for `cue_steps`.
         open_arguments: what has to be chosen to make a task of this row; empty except for a family.
         min_response_steps: of a family: the horizon grows with cue and delay so that at least so many
@@ -50,6 +51,7 @@ class TaskSpec:
     chance_success: float | None
     max_reward: float
     idle_success: float = 0.0
+    cue_marks_place: bool = False
     shows_one_by_one: bool = False
     open_arguments: tuple[str, ...] = ()
     min_response_steps: int | None = None
