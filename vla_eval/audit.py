@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from scipy import stats
-
 from vla_eval.errors import RecipeError
-from vla_eval.evaluate import EvaluationObserver, EvaluationSummary, evaluate
 from vla_eval.recipes import EvalConfig
+from vla_eval.results.estimates import p_above, p_more
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.store import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -143,25 +141,6 @@ def _refuse_own_fields(settings: Mapping[str, object]) -> None:
             )
 
 
-def run_audit(
-    configs: Sequence[EvalConfig], out: Path, *, command: str = "", observer: EvaluationObserver | None = None
-) -> tuple[EvaluationSummary, ...]:
-    """Play what has no result yet, one evaluation after another, until one is stopped.
-
-    Args:
-        configs: from `audit_configs`.
-        out: gets one run folder per configuration.
-        command: what the user typed, for the record.
-        observer: is told of progress.
-    """
-    summaries: list[EvaluationSummary] = []
-    for config in configs:
-        summaries.append(evaluate(config, out=out / config.name, command=command, observer=observer))
-        if summaries[-1].was_stopped:
-            break
-    return tuple(summaries)
-
-
 def read_audit(configs: Sequence[EvalConfig], out: Path) -> tuple[TaskAudit, ...]:
     """Return the audit of each task and protocol from the run folders, in the order of the configurations."""
     audits = []
@@ -229,13 +208,10 @@ def verdict(counts: Mapping[str, Counts], chance: float | None) -> tuple[str, ..
 
 def beats_chance(counts: Counts, chance: float) -> bool:
     """Whether so many successes would be too lucky for a success rate of `chance`."""
-    if counts.n_episodes == 0:
-        return False
-    test = stats.binomtest(counts.success_once, counts.n_episodes, chance, alternative="greater")
-    return bool(test.pvalue < ALPHA)
+    return p_above(counts.success_once, counts.n_episodes, chance) < ALPHA
 
 
 def beats(one: Counts, other: Counts) -> bool:
     """Whether the first succeeds more often than the second, beyond luck."""
-    table = [[c.success_once, c.n_episodes - c.success_once] for c in (one, other)]
-    return bool(stats.fisher_exact(table, alternative="greater").pvalue < ALPHA)
+    first, second = ((c.success_once, c.n_episodes) for c in (one, other))
+    return p_more(first, second) < ALPHA

@@ -1,6 +1,9 @@
-"""Kinds of arguments that several verbs take."""
+"""What several verbs share: kinds of arguments, exit codes."""
 
 import argparse
+
+EXIT_EPISODE_ERRORS = 3
+"""All episodes were played, and some ended in an error."""
 
 
 def workers_argument(text: str) -> int | str:

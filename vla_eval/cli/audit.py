@@ -6,11 +6,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, workers_argument
 from vla_eval.decoding import decode
 from vla_eval.recipes import EvalConfig, apply_overrides
 
-EXIT_EPISODE_ERRORS = 3
 DESCRIPTION = """Play every task with the controls that need no memory, and with the oracle, and say by which
 road each can be won: without acting, by touching one candidate after another, by staying at the cue,
 by storing the cue in the gripper. Nothing is rendered.
@@ -61,26 +60,28 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a mistyped task, a run folder of other settings, or a fault of every episode.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.audit import read_audit, run_audit
+    from vla_eval.audit import read_audit
+    from vla_eval.audit_table import render_audit
     from vla_eval.cli.progress import Progress, stop_on_signals
-    from vla_eval.evaluate import EvaluationSummary
-    from vla_eval.results.audit_table import render_audit
+    from vla_eval.evaluate import evaluate
 
     configs = _configs(args)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     with stop_on_signals() as stop:
-        summaries: list[EvaluationSummary] = []
+        n_errors = 0
         for config in configs:
-            progress = Progress(stop, out=str(args.out / config.name))
+            out = args.out / config.name
+            progress = Progress(stop, out=str(out))
             try:
-                summaries += run_audit([config], args.out, command=command, observer=progress)
+                summary = evaluate(config, out=out, command=command, observer=progress)
             finally:
                 progress.close()
-            if summaries[-1].was_stopped:
+            n_errors += summary.n_errors
+            if summary.was_stopped:
                 print(f"Stopped. To go on: {command}", file=sys.stderr)
                 return stop.exit_code
     print(render_audit(read_audit(configs, args.out), args.format))
-    return EXIT_EPISODE_ERRORS if any(summary.n_errors for summary in summaries) else 0
+    return EXIT_EPISODE_ERRORS if n_errors else 0
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:

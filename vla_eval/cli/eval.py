@@ -4,15 +4,17 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, workers_argument
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.recipe import policy_name
 from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
 
-EXIT_EPISODE_ERRORS = 3
+if TYPE_CHECKING:
+    from vla_eval.results.store import StoredRun
+
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
 CONFIG is a file, or the name of one in configs/ (`mikasa-vla list configs`). Without it, name at least
@@ -102,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.cli.progress import Progress, stop_on_signals
     from vla_eval.evaluate import default_run_folder, evaluate
+    from vla_eval.results.store import read_run
 
     config = _config(args)
     _check_baseline(args.baseline, config)
@@ -126,7 +129,8 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return stop.exit_code
-    _print_table(out, args)
+    found = read_run(out)
+    _print_table(found, args)
     if summary.n_errors:
         print(
             f"{summary.n_errors} episodes ended in an error and are not in the rates; the same command "
@@ -134,26 +138,24 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     if args.html is not None:
-        _write_page(out, args)
+        _write_page(found, args)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
 
 
-def _print_table(out: Path, args: argparse.Namespace) -> None:
+def _print_table(run: "StoredRun", args: argparse.Namespace) -> None:
     from vla_eval.results.report import build_table, render
-    from vla_eval.results.store import read_run
 
-    table = build_table([read_run(out)], baseline=args.baseline)
+    table = build_table([run], baseline=args.baseline)
     print(render(table, args.format, paper=args.paper))
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
 
 
-def _write_page(out: Path, args: argparse.Namespace) -> None:
+def _write_page(run: "StoredRun", args: argparse.Namespace) -> None:
     from vla_eval.page.build import write_page
-    from vla_eval.results.store import read_run
 
-    page = write_page([read_run(out)], args.html, baseline=args.baseline)
+    page = write_page([run], args.html, baseline=args.baseline)
     sys.stdout.flush()  # the table first, wherever the two go
     print(f"Report page: {page}", file=sys.stderr)
 

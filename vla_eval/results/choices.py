@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy import stats
-
+from vla_eval.results.estimates import p_above
 from vla_eval.results.grouping import RowGroup
 from vla_eval.results.records import EpisodeRecord
 
@@ -123,7 +122,7 @@ def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) 
         n_possible = sum(n for (target, _), n in wrong.items() if target != index)
         n_chosen = sum(n for (_, chosen), n in wrong.items() if chosen == index)
         if n_possible:
-            p = float(stats.binomtest(n_chosen, n_possible, by_luck, alternative="greater").pvalue)
+            p = p_above(n_chosen, n_possible, by_luck)
             found.append(
                 Habit(
                     index=index,

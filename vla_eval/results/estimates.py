@@ -130,6 +130,34 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     return PairedTest(difference=difference, n_pairs=counts.n_pairs, p_value=min(1.0, p_value))
 
 
+def p_above(n_success: int, n_episodes: int, rate: float) -> float:
+    """Return how likely so many successes, or more, are at a given success rate.
+
+    Args:
+        n_success: how many succeeded, 0 to `n_episodes`.
+        n_episodes: how many there are; without one, nothing speaks against any rate: 1.
+        rate: the success rate that is doubted, in [0, 1].
+
+    Source: one-sided exact binomial test, computed by scipy.stats.binomtest.
+    """
+    if n_episodes == 0:
+        return 1.0
+    return float(stats.binomtest(n_success, n_episodes, rate, alternative="greater").pvalue)
+
+
+def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
+    """Return how likely the first is so much ahead of the second, or more, if both are equally good.
+
+    Args:
+        first: successes and episodes.
+        second: successes and episodes, of other episodes than the first.
+
+    Source: Fisher's one-sided exact test, computed by scipy.stats.fisher_exact.
+    """
+    table = [[n_success, n_episodes - n_success] for n_success, n_episodes in (first, second)]
+    return float(stats.fisher_exact(table, alternative="greater").pvalue)
+
+
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
     """Return p values corrected for how many there are, in the same order.
 
