@@ -8,8 +8,10 @@ native library or a GPU context may be left in a state that no rebuilding within
 import ctypes
 import dataclasses
 import faulthandler
+import fcntl
 import inspect
 import logging
+import multiprocessing
 import os
 import signal
 import sys
@@ -36,7 +38,6 @@ from vla_eval.viz.recorder import Recorder
 
 STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
 MAX_DETAILS = 20_000  # characters of a traceback; the log has it all
-PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
 
 logger = logging.getLogger(__name__)
 
@@ -298,11 +299,10 @@ def worker_main(
     connection: Connection,
     shared: SharedStage,
     log: Path,
-    parent_pid: int,
     recorder: Recorder | None = None,
 ) -> None:
     """Run episodes for the parent until it closes the pipe; the entry point of the worker process."""
-    detach(log, parent_pid)
+    detach(log)
     runner = EpisodeRunner(Heartbeat(shared), connection.send, recorder)
     serve(connection, runner)
 
@@ -316,7 +316,7 @@ def serve(connection: Connection, runner: Runner) -> None:
         runner.close()  # the parent is done with us, or gone
 
 
-def detach(log: Path, parent_pid: int) -> None:
+def detach(log: Path) -> None:
     """Send all output to the log, die with the parent, and leave its signals to the parent."""
     os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -327,8 +327,21 @@ def detach(log: Path, parent_pid: int) -> None:
     faulthandler.enable(all_threads=True)
     faulthandler.register(signal.SIGUSR1, all_threads=True)  # the watchdog asks where it hangs
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    if sys.platform == "linux":
-        # A parent that is killed with -9 cannot end its workers; the kernel does it.
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent_pid:  # it died before the line above
+    _end_with_parent()
+
+
+def _end_with_parent() -> None:
+    """Have the kernel kill this process when its parent is gone: after `kill -9` nobody else can.
+
+    The parent holds the writing end of the pipe that is its sentinel, and writes no more to it. `prctl` would
+    not do: a worker that was forked from a server is the server's child.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:  # no worker: called by a test
+        return
+    descriptor = int(parent.sentinel)
+    fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | fcntl.FASYNC)
+    if not parent.is_alive():  # it died before the line above
         os._exit(1)

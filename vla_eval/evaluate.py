@@ -7,6 +7,7 @@ means, the same call goes on where it stopped.
 
 import functools
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -26,9 +27,11 @@ from vla_eval.plan import (
 )
 from vla_eval.provenance import collect_environment
 from vla_eval.recipes import EvalConfig
+from vla_eval.registry import own_modules
 from vla_eval.results.records import EpisodeError, EpisodeRecord
 from vla_eval.results.store import RunDescription, RunFolder
 from vla_eval.viz.recorder import Recorder
+from vla_eval.worker_start import simulator_modules
 from vla_eval.workers import Answered, WorkerMain, WorkerPool
 
 RUNS_FOLDER = Path("runs")
@@ -118,7 +121,7 @@ def evaluate(
         n_workers = worker_count(config, plan, n_jobs=len(queue))
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
         bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
-        was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers)
+        was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers, _modules(config, plan))
     return EvaluationSummary(
         out=path,
         n_episodes=len(plan.jobs),
@@ -156,7 +159,13 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
     )
 
 
-def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
+def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
+    """Return what takes workers long to import; other packages' code is left out: it may not bear a fork."""
+    adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
+    return (*simulator_modules(config.simulator), *own_modules(adapters))
+
+
+def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Sequence[str]) -> bool:
     """Run the queue's episodes; return whether the observer stopped it."""
     logs = bookkeeper.path / "logs"
     logs.mkdir(exist_ok=True)
@@ -168,7 +177,7 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int) -> bool:
             config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
         )
         main = functools.partial(worker_main, recorder=recorder)
-    with new_pool(main, size=n_workers, timeouts=config.timeouts, logs=logs) as pool:
+    with new_pool(main, size=n_workers, timeouts=config.timeouts, logs=logs, preload=preload) as pool:
         for event in pool.run(queue):
             if isinstance(event, Answered):
                 bookkeeper.take(event)

@@ -5,7 +5,7 @@ A name is looked up among ours, then among installed packages that declare the e
 """
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import Any
@@ -45,6 +45,16 @@ def check_adapter(adapter: str) -> None:
     root = module_name.partition(".")[0]
     if find_spec(root) is None:
         raise _no_module(adapter, module_name)
+
+
+def own_modules(adapters: Iterable[str]) -> tuple[str, ...]:
+    """Return the modules of those adapters that come with this package.
+
+    Raises:
+        UnknownNameError: there is no such adapter.
+    """
+    modules = (_target(adapter)[0] for adapter in adapters)
+    return tuple(dict.fromkeys(name for name in modules if name.startswith("vla_eval.")))
 
 
 def policy_factory(adapter: str) -> PolicyFactory:

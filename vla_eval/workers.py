@@ -8,14 +8,13 @@ or files of results, nor of what a job is: the inside of a worker is `vla_eval.e
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
@@ -31,14 +30,12 @@ from vla_eval.episode_worker import (
 )
 from vla_eval.recipes import TimeoutConfig
 from vla_eval.results.records import EpisodeError
+from vla_eval.worker_start import begin, worker_context, worker_environment
 
 TICK_SECONDS = 0.2
 FAREWELL_SECONDS = 5.0  # for closing simulators at the end; then they are killed
 DUMP_SECONDS = 0.5  # for a hanging worker to write where it hangs
 REAP_SECONDS = 5.0  # a process that sits in a driver may survive SIGKILL for a while; go on without it
-
-# One thread per worker: several workers share the cores, and sums do not depend on the number of threads.
-WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 
 logger = logging.getLogger(__name__)
 
@@ -69,8 +66,8 @@ class Answered[J: Job, A]:
     answer: A | Failed
 
 
-WorkerMain = Callable[[Connection, SharedStage, Path, int], None]
-"""Entry point of a worker process: pipe, shared memory for its stage, its log, process id of the parent."""
+WorkerMain = Callable[[Connection, SharedStage, Path], None]
+"""Entry point of a worker process: pipe, shared memory for its stage, its log."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -78,7 +75,7 @@ class _Worker[J: Job]:
     """One process and what it was given to do."""
 
     index: int
-    process: SpawnProcess
+    process: ForkServerProcess | SpawnProcess
     connection: Connection
     shared: SharedStage
     log: Path
@@ -95,9 +92,18 @@ class WorkerPool[J: Job, A]:
         size: how many processes at most.
         timeouts: how long a worker may be busy with one thing.
         logs: folder for what the workers write to standard output and error.
+        preload: modules that the workers need and that take long to import; see `worker_context`.
     """
 
-    def __init__(self, main: WorkerMain, *, size: int, timeouts: TimeoutConfig, logs: Path) -> None:
+    def __init__(
+        self,
+        main: WorkerMain,
+        *,
+        size: int,
+        timeouts: TimeoutConfig,
+        logs: Path,
+        preload: Sequence[str] = (),
+    ) -> None:
         """Start nothing yet: processes start when there is work for them."""
         self._main = main
         self._size = size
@@ -108,7 +114,7 @@ class WorkerPool[J: Job, A]:
             "inference": timeouts.inference_seconds,
         }
         self._logs = logs
-        self._context = multiprocessing.get_context("spawn")
+        self._context = worker_context(preload=preload)
         self._workers: dict[int, _Worker[J]] = {}
 
     def __enter__(self) -> Self:
@@ -162,10 +168,12 @@ class WorkerPool[J: Job, A]:
         ours, theirs = self._context.Pipe()
         shared: SharedStage = self._context.RawArray("d", 2)
         log = self._logs / f"worker-{index}.log"
-        process = self._context.Process(
-            target=self._main, args=(theirs, shared, log, os.getpid()), name=f"mikasa-vla worker {index}"
-        )
-        with _worker_environment():
+        with worker_environment() as environment:
+            process = self._context.Process(
+                target=begin,
+                args=(environment, self._main, theirs, shared, log),
+                name=f"mikasa-vla worker {index}",
+            )
             process.start()
         theirs.close()  # else its end would not be seen as an end of file
         worker = _Worker[J](index=index, process=process, connection=ours, shared=shared, log=log)
@@ -274,15 +282,3 @@ def _cause_of_death(exitcode: int | None) -> str:
     name = signal.Signals(-exitcode).name if -exitcode in set(signal.Signals) else f"signal {-exitcode}"
     hint = " (often the kernel, for want of memory: use fewer --workers)" if name == "SIGKILL" else ""
     return f"was killed by {name}{hint}"
-
-
-@contextlib.contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Set the environment variables that a new process reads when it starts, unless the user has set them."""
-    added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]

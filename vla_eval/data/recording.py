@@ -33,6 +33,7 @@ from vla_eval.errors import RecordingError
 from vla_eval.evaluate import as_exception, available_cores
 from vla_eval.provenance import collect_environment
 from vla_eval.results.run_file import RunDescription
+from vla_eval.worker_start import simulator_modules
 from vla_eval.workers import WorkerPool
 
 WORKER_MODULE = "vla_eval.data.recording_worker"
@@ -93,9 +94,9 @@ class RecordingSummary:
     was_stopped: bool
 
 
-def recording_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+def recording_main(connection: Connection, shared: SharedStage, log: Path) -> None:
     """Record for the parent until it closes the pipe; the entry point of a worker process."""
-    detach(log, parent_pid)
+    detach(log)
     # Imported by the worker alone: lerobot costs the parent 5 s, in which a mistake can long be told.
     runner = importlib.import_module(WORKER_MODULE).RecordingRunner
     serve(connection, runner(Heartbeat(shared), connection.send))
@@ -172,7 +173,13 @@ def run_plan(
     n_workers = available_cores() if recipe.workers == "auto" else recipe.workers
     with (
         RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder,
-        RecordingPool(recording_main, size=n_workers, timeouts=recipe.timeouts, logs=folder.logs()) as pool,
+        RecordingPool(
+            recording_main,
+            size=n_workers,
+            timeouts=recipe.timeouts,
+            logs=folder.logs(),
+            preload=(WORKER_MODULE, *simulator_modules(recipe.simulator)),
+        ) as pool,
     ):
         recorder = _Recorder(
             plan=plan,

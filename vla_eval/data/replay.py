@@ -33,6 +33,7 @@ from vla_eval.evaluate import as_exception, available_cores
 from vla_eval.provenance import collect_environment
 from vla_eval.recipes import TimeoutConfig
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.worker_start import simulator_modules
 from vla_eval.workers import Answered, WorkerPool
 
 WORKER_MODULE = "vla_eval.data.replay_worker"
@@ -98,9 +99,9 @@ class ReplayObserver(Protocol):
         """Called several times a second; returns whether the replay shall stop now."""
 
 
-def replay_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+def replay_main(connection: Connection, shared: SharedStage, log: Path) -> None:
     """Replay for the parent until it closes the pipe; the entry point of a worker process."""
-    detach(log, parent_pid)
+    detach(log)
     runner = importlib.import_module(WORKER_MODULE).ReplayRunner  # lerobot is imported by the worker alone
     serve(connection, runner(Heartbeat(shared), connection.send))
 
@@ -157,7 +158,8 @@ def replay(
     size = max(1, min(len(jobs), available_cores() if workers == "auto" else workers))
     replayed: list[EpisodeReplayed] = []
     pool = WorkerPool[ReplayJob, EpisodeReplayed]
-    with pool(replay_main, size=size, timeouts=TimeoutConfig(), logs=logs) as running:
+    preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
+    with pool(replay_main, size=size, timeouts=TimeoutConfig(), logs=logs, preload=preload) as running:
         for event in running.run(JobList(jobs)):
             if isinstance(event, Answered):
                 done = _episode_of(event)

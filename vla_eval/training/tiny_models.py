@@ -148,7 +148,7 @@ def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any
         return make_lerobot(context, **args)
 
 
-def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path, parent_pid: int) -> None:
+def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
     """Be a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
     with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
-        worker_main(connection, shared, log, parent_pid)
+        worker_main(connection, shared, log)

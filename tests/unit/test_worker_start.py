@@ -1,0 +1,80 @@
+"""How workers begin: what they know of the parent's environment, and what becomes of them without it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from vla_eval import worker_start
+from vla_eval.worker_start import begin, simulator_modules, worker_context, worker_environment
+
+PARENT = """
+import os, sys, time
+from vla_eval.worker_start import begin, worker_context, worker_environment
+code = "from pathlib import Path; import os, time, vla_eval.episode_worker as inside;"
+code += "inside.detach(Path(os.devnull)); there.send(os.getpid()); time.sleep(600)"
+context = worker_context()
+here, there = context.Pipe()
+with worker_environment() as environment:
+    context.Process(target=begin, args=(environment, exec, code, {"there": there})).start()
+print(here.recv(), flush=True)
+time.sleep(600)
+"""
+
+
+def ask(*names: str) -> dict[str, str | None]:
+    """Return variables of the environment that a new worker sees."""
+    context = worker_context()
+    here, there = context.Pipe()
+    code = "import os; there.send({name: os.environ.get(name) for name in names})"
+    with worker_environment() as environment:
+        process = context.Process(
+            target=begin, args=(environment, exec, code, {"there": there, "names": names})
+        )
+        process.start()
+    there.close()
+    found: dict[str, str | None] = here.recv()
+    process.join()
+    return found
+
+
+def test_a_worker_has_the_environment_of_its_own_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not the one in which an earlier pool of the same process started the server."""
+    monkeypatch.setenv("MIKASA_A_TEST", "first")
+    assert ask("MIKASA_A_TEST", "OMP_NUM_THREADS")["MIKASA_A_TEST"] == "first"
+    monkeypatch.setenv("MIKASA_A_TEST", "second")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert ask("MIKASA_A_TEST", "OMP_NUM_THREADS") == {"MIKASA_A_TEST": "second", "OMP_NUM_THREADS": "1"}
+    assert "OMP_NUM_THREADS" not in os.environ
+
+
+def test_where_there_is_an_nvidia_driver_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CUDA context does not survive it."""
+    monkeypatch.setattr(worker_start, "nvidia_driver_version", lambda: "580.65.06")
+    assert worker_context().get_start_method() == "spawn"
+    monkeypatch.setattr(worker_start, "nvidia_driver_version", lambda: None)
+    assert worker_context().get_start_method() == "forkserver"
+
+
+def test_only_what_takes_long_is_imported_before_the_fork() -> None:
+    assert simulator_modules("fake") == ()
+    assert simulator_modules("maniskill") == ("vla_eval.envs.maniskill",)
+
+
+def test_a_worker_ends_with_a_command_that_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        os.kill(worker, 0)  # it is there
+        parent.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline:
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail(f"worker {worker} outlived its parent")
