@@ -3,7 +3,7 @@
 # Where it is set, each of the many processes of the tests would compile torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-all lint bench clean
+.PHONY: help setup demo test test-all lint docs bench clean
 
 BIN := .venv/bin
 # Each takes some 2 GB and 10 s to begin.
@@ -30,9 +30,13 @@ lint: setup  ## ruff and mypy --strict
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
+docs: setup  ## build the documentation into site/; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "Documentation: site/index.html"
+
 bench: setup  ## measure the speed of this machine
 	$(BIN)/mikasa-vla bench
 	$(BIN)/mikasa-vla bench --loader
 
 clean:  ## remove .venv and caches; results in runs/ stay
-	rm -rf .venv dist build .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv dist build site .mypy_cache .ruff_cache .pytest_cache

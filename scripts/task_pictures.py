@@ -1,4 +1,4 @@
-"""Make the pictures of `docs/tasks.md`: what the two cameras see in each phase of each task.
+"""Make the pictures of `docs/tasks/*.md`: what the two cameras see in each phase of each task.
 
 Usage: .venv/bin/python scripts/task_pictures.py [DOCS_IMAGES_FOLDER]
 """

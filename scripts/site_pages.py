@@ -1,0 +1,88 @@
+"""Pages of the documentation that are made from the code when the site is built; a hook of MkDocs.
+
+They are not committed, so they cannot be out of date: the command line from its argparse parsers, the
+tasks from the catalogue, the tables of recipes from the READMEs beside them, the changelog. The pages
+`docs/reference/api/*.md` name modules; mkdocstrings fills them from docstrings. It knows nothing of how
+pages look, and imports neither torch nor a simulator.
+"""
+
+import argparse
+import contextlib
+import io
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from vla_eval.cli import show
+from vla_eval.cli.main import PROGRAM, build_parser
+from vla_eval.prompts import DEFAULT_PROMPT_SET
+from vla_eval.tasks.catalog import FAMILIES, TASKS
+
+ROOT = Path(__file__).parents[1]
+RECIPE_FOLDERS = ("configs", "policies", "datasets", "prompts")
+HELP_COLUMNS = "82"  # what the column of a page shows without scrolling
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages to those of docs/."""
+    for path, text in generated_pages().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def generated_pages() -> dict[str, str]:
+    """Return path in the site -> Markdown."""
+    return {
+        "reference/cli.md": _command_line(),
+        "reference/tasks.md": _tasks(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        **{f"reference/{folder}.md": _recipes(folder) for folder in RECIPE_FOLDERS},
+    }
+
+
+def _command_line() -> str:
+    lines = [
+        "# The command line",
+        "",
+        f"Each verb as `{PROGRAM} VERB --help` prints it. Flags are never abbreviated.",
+        "",
+    ]
+    with mock.patch.dict(os.environ, {"COLUMNS": HELP_COLUMNS}):
+        for parser in _with_actions(build_parser()):
+            depth = 2 if parser.prog.count(" ") < 2 else 3
+            lines += [f"{'#' * depth} `{parser.prog}`", "", *_printed(parser.format_help())]
+    return "\n".join(lines)
+
+
+def _with_actions(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield a parser, then those of its verbs, and of their actions."""
+    yield parser
+    for action in parser._actions:  # argparse has no public way to ask for the parsers of verbs
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from _with_actions(sub)
+
+
+def _tasks() -> str:
+    lines = ["# Every task, as `show` prints it", "", "[All tasks](../tasks.md) explains the arguments.", ""]
+    for title, specs in (("Tasks", TASKS), ("Families", FAMILIES)):
+        lines += [f"## {title}", ""]
+        for name in specs:
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                show.run(argparse.Namespace(task=name, prompt_set=DEFAULT_PROMPT_SET))
+            lines += [f"### {name}", "", *_printed(printed.getvalue())]
+    return "\n".join(lines)
+
+
+def _printed(text: str) -> list[str]:
+    return ["```text", text.rstrip(), "```", ""]
+
+
+def _recipes(folder: str) -> str:
+    text = (ROOT / folder / "README.md").read_text(encoding="utf-8")
+    return text.replace("](../docs/", "](../")
