@@ -30,6 +30,7 @@ SMALL = {
     "llm_kv_heads": 2,
     "llm_head_width": 16,
     "llm_mlp": 128,
+    "llm_own_head": 0,
     "depth_layers": 0,  # what the depth model says is one of the inputs
     "theta_bins": 4,
     "phi_bins": 6,

@@ -278,6 +278,5 @@ def test_names_of_weights_there_and_back_are_the_same() -> None:
 @pytest.mark.slow
 def test_the_published_size_has_the_published_parameters() -> None:
     with torch.device("meta"):
-        network = SpatialVLANetwork(NetworkSizes(llm_own_head=1))
-    # Of the published files: Gemma's output matrix is counted beside its input matrix.
+        network = SpatialVLANetwork(NetworkSizes())
     assert sum(parameter.numel() for parameter in network.parameters()) == 4_027_854_731

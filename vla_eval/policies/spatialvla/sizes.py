@@ -2,7 +2,7 @@
 
 Source: Qu et al. 2025 (arXiv 2501.15830) for the parts and their backbones; the sizes are those of
 PaliGemma 2 3B (SigLIP so400m/14, Gemma 2 2B) and of `Intel/zoedepth-nyu-kitti`, which together have the
-4,027,854,731 parameters of the published files, Gemma's output matrix counted beside its input matrix.
+4,027,854,731 parameters of the published files. Gemma's output matrix is one of its own there.
 """
 
 import dataclasses
@@ -35,7 +35,8 @@ class NetworkSizes:
         image_px, patch_px: edge of a picture and of a patch.
         siglip_width, siglip_depth, siglip_heads, siglip_mlp: SigLIP.
         llm_width, llm_depth, llm_heads, llm_kv_heads, llm_head_width, llm_mlp: Gemma 2.
-        llm_own_head: 1: Gemma has an output matrix of its own; 0: the one of its input, as Gemma 2 does.
+        llm_own_head: 1: Gemma has an output matrix of its own, as published; 0: that of its input, as Gemma 2
+            itself and the golden files.
         depth_px, depth_width, depth_layers, depth_heads, depth_mlp: ZoeDepth's eye (BEiT); without layers
             there is no depth model, and depth has to be given.
         depth_neck, depth_fusion, depth_features, depth_embedding, depth_bins: the rest of ZoeDepth.
@@ -57,7 +58,7 @@ class NetworkSizes:
     llm_kv_heads: int = 4
     llm_head_width: int = 256
     llm_mlp: int = 9216
-    llm_own_head: int = 0
+    llm_own_head: int = 1
     depth_px: int = 384
     depth_width: int = 1024
     depth_layers: int = 24
