@@ -13,7 +13,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla
 from vla_eval.policies.openvla.network import Inputs
-from vla_eval.policies.openvla.prompt import byte_tokenizer
+from vla_eval.policies.steps.byte_tokenizer import byte_tokenizer
 from vla_eval.policies.verify import verify_checkpoint
 
 SIZES = {

@@ -10,8 +10,9 @@ from tests.unit import openvla_golden as golden
 from vla_eval.errors import MissingInstructionError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
-from vla_eval.policies.openvla.prompt import BYTE_SIZES, byte_tokenizer, finished, prompt_text
+from vla_eval.policies.openvla.prompt import BYTE_SIZES, finished, prompt_text
 from vla_eval.policies.openvla.sizes import network_sizes
+from vla_eval.policies.steps.byte_tokenizer import byte_tokenizer
 from vla_eval.policies.steps.trainable import check_lora, trainable
 from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.training.dataset import training_dataset

@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli import checkpoint_openvla
+from vla_eval.cli import checkpoint_openvla, checkpoint_spatialvla
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
-convert-octo, convert-openvla: make a LeRobot checkpoint of an original one. merge: put a LoRA adapter into
-its base. Nothing is downloaded."""
+convert-octo, convert-openvla, convert-spatialvla: make a LeRobot checkpoint of an original one. merge: put a
+LoRA adapter into its base. Nothing is downloaded."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -20,7 +20,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "checkpoint",
         help="check a checkpoint, or convert an original one",
         description=DESCRIPTION,
-        epilog="docs/octo.md and docs/openvla.md explain converting.",
+        epilog="docs/octo.md, docs/openvla.md and docs/spatialvla.md explain converting.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -34,6 +34,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
     convert.add_argument("--dataset-name", metavar="NAME", help="whose statistics, where there are several")
     checkpoint_openvla.add_parsers(actions)
+    checkpoint_spatialvla.add_parsers(actions)
     for sub in (verify, convert):
         sub.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
 
@@ -43,6 +44,8 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.redirect_stdout(sys.stderr):  # some policies print while they are made
         if args.action in (checkpoint_openvla.CONVERT, checkpoint_openvla.MERGE):
             lines = checkpoint_openvla.run(args)
+        elif args.action == checkpoint_spatialvla.CONVERT:
+            lines = checkpoint_spatialvla.run(args)
         else:
             lines = _verify(args) if args.action == "verify" else _convert(args)
     print("\n".join(lines))

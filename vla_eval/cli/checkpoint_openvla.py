@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> list[str]:
     path, out = Path(args.path), Path(args.out)
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     if args.action == MERGE:
-        from vla_eval.policies.openvla.merging import merge_adapter
+        from vla_eval.policies.merging import merge_adapter
 
         return [str(merge_adapter(path, out, base_checkpoint=args.base_checkpoint))]
     from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla

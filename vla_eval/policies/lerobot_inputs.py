@@ -21,6 +21,7 @@ from vla_eval.specs import EnvSpec
 ACTION_KEY = "action"
 RENAME_STEP = "rename_observations_processor"
 MAX_UNIT = 1.0 + 1e-3  # statistics of pictures in [0, 1]; those of 0 … 255 are far beyond
+MAX_FOV_DIFFERENCE_RAD = 1e-4
 STATES = ("tcp_pose", "qpos", "qvel")  # what `proprioception` is computed from
 
 
@@ -131,7 +132,7 @@ def check_training(
     """
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     seen = {field: sizes[camera] for camera, field in inputs.cameras.items()}
-    problems = _range_problems(preprocessor)
+    problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env)
     if facts is None:
         shapes = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
         renamed = _rename_map(preprocessor)
@@ -163,6 +164,18 @@ def _facts_problems(
         pairs.append(("state", facts.state, inputs.state))
     return [
         f"{what}: expected {trained}, found {found}" for what, trained, found in pairs if trained != found
+    ]
+
+
+def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:
+    """Compare the field of view, for a policy that computes with it and says so by `camera_fov_rad`."""
+    trained = getattr(config, "camera_fov_rad", None)
+    if trained is None:
+        return []
+    return [
+        f"field of view of {camera.name}: expected {trained:.4f} rad, found {camera.fov_rad:.4f} rad"
+        for camera in env.cameras
+        if camera.name in inputs.cameras and abs(camera.fov_rad - trained) > MAX_FOV_DIFFERENCE_RAD
     ]
 
 

@@ -26,7 +26,8 @@ from torch import Tensor
 
 import vla_eval.policies.memory.configuration_memory  # importing it registers
 import vla_eval.policies.octo.configuration_octo
-import vla_eval.policies.openvla.configuration_openvla  # noqa: F401  as above
+import vla_eval.policies.openvla.configuration_openvla
+import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
@@ -197,6 +198,27 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
     return policy
 
 
+def begin_from(policy: Any, base: Path) -> None:
+    """Let a policy change its base's weights, which were just loaded, into what its training begins from.
+
+    Args:
+        policy: with the base's weights; most have nothing to change.
+        base: folder of the base.
+
+    Raises:
+        CheckpointError: the base is an adapter, whose own base would be changed a second time.
+    """
+    begin = getattr(policy, "begin_from_base", None)
+    if begin is None:
+        return
+    if (base / ADAPTER_CONFIG_FILE).is_file():
+        raise CheckpointError(
+            f"{base}: a policy of this type begins from whole weights, found a LoRA adapter. Merge it with "
+            "`mikasa-vla checkpoint merge`, and name the result as the base."
+        )
+    begin()
+
+
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Return the tensors of a safetensors file.
 
@@ -226,6 +248,7 @@ def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
     names = read_json(folder / ADAPTER_CONFIG_FILE).get("modules_to_save") or ()
     beside = [start for start in getattr(policy, "new_in_finetuning", ()) if start.split(".")[-2] in names]
     filled = fill_policy(policy, find_checkpoint(base), options, may_be_new=beside)
+    begin_from(filled, find_checkpoint(base))
     wrapped = PeftModel.from_pretrained(filled, str(folder), is_trainable=True)
     # peft, too, leaves out what does not fit.
     check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))

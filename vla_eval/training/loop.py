@@ -39,7 +39,13 @@ from vla_eval.policies.checkpoint import (
     read_json,
     write_facts,
 )
-from vla_eval.policies.lerobot_loading import TOKENIZER_STEP, LoadOptions, fill_policy, save_tokenizer
+from vla_eval.policies.lerobot_loading import (
+    TOKENIZER_STEP,
+    LoadOptions,
+    begin_from,
+    fill_policy,
+    save_tokenizer,
+)
 from vla_eval.policies.steps.processor_steps import DECODER_STEP, ENCODER_STEP
 
 PARTIAL_PREFIX = ".partial-"
@@ -127,7 +133,10 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
             return policy
         options = LoadOptions(device=cfg.device, dtype=getattr(cfg, "dtype", None) if hooks.cast else None)
         may_be_new = getattr(policy, "new_in_finetuning", ()) if hooks.begins_from_base else ()
-        return fill_policy(policy, hooks.weights, options, may_be_new=may_be_new).to(cfg.device)
+        filled = fill_policy(policy, hooks.weights, options, may_be_new=may_be_new)
+        if hooks.begins_from_base:
+            begin_from(filled, hooks.weights)
+        return filled.to(cfg.device)
 
     def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
         tokenizer = _tokenizer_of(Path(pretrained_path), hooks.tokenizer) if pretrained_path else None

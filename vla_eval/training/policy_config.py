@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple  # lerobot is untyped
 
 import draccus
+import numpy as np
+import torch
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import RecipeError, SpecMismatchError, did_you_mean, unknown_name
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
@@ -50,6 +53,9 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     _set_features(config, recipe, dataset)
     if hasattr(config, "window_steps"):
         _set_window(config, dataset)
+    if hasattr(config, "fit_to_actions"):
+        actions = torch.from_numpy(read_columns(dataset.root)[ACTION_KEY].astype(np.float32))
+        config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)

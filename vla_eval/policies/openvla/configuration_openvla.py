@@ -15,12 +15,10 @@ from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, 
 from vla_eval.policies.steps.gripper import Gripper
 from vla_eval.policies.steps.images import Augmentation
 from vla_eval.policies.steps.normalization import Normalization, mask_all_but
+from vla_eval.policies.steps.precision import DTYPES
 
 TYPE = "mikasa_openvla"
 HEADS: tuple[Head, ...] = ("l1", "parallel_tokens", "tokens")
-DTYPES = ("float32", "bfloat16")
-BYTE_TOKENIZER = "bytes"
-"""`tokenizer_name` of a tokenizer that is made on the spot, for tiny models: one token per byte."""
 # Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
 # prismatic/vla/datasets/datasets.py#L152-L166
 AUGMENTATION = Augmentation(
@@ -70,7 +68,8 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False, as the
             original: no chunk begins so late that it has any.
         drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.
-        tokenizer_name: folder or name of the tokenizer; `bytes`: see `BYTE_TOKENIZER`.
+        tokenizer_name: folder or name of the tokenizer; `bytes`: see
+            `steps.byte_tokenizer`.
         prompt_max_tokens: a longer prompt is an error.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps: AdamW, constant, divided by ten after `scheduler_decay_steps` (0: never).

@@ -6,7 +6,6 @@ torch's reader that builds nothing but tensors.
 """
 
 import re
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,19 @@ from typing import Any  # JSON and lerobot
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from safetensors.torch import load_file
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
-from vla_eval.errors import CheckpointError, did_you_mean
-from vla_eval.policies.checkpoint import CONFIG_FILE, TOKENIZER_FOLDER, read_json
+from vla_eval.errors import CheckpointError
+from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
+from vla_eval.policies.conversion import (
+    Statistics,
+    check_free,
+    check_mask,
+    chosen_statistics,
+    read_safetensors,
+    write_checkpoint,
+)
 from vla_eval.policies.openvla.configuration_openvla import MikasaOpenVLAConfig
 from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
@@ -29,7 +35,6 @@ from vla_eval.policies.openvla.weight_names import to_ours
 from vla_eval.policies.weights import put_weights
 
 STATISTICS_FILE = "dataset_statistics.json"
-TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 BACKBONES = {"vision_backbone_id": "dinosiglip-vit-so-224px", "llm_backbone_id": "llama2-7b-pure"}
 KNOWN_INSTRUCTION = "pick"
 KNOWN_IDS = (1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304, 5839, 29973, 13, 3744, 29901)
@@ -75,8 +80,7 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
     Raises:
         CheckpointError: something is missing, of another form, or not what the options say.
     """
-    if out.exists():
-        raise CheckpointError(f"{out} exists already. Name another folder.")
+    check_free(out)
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
         _check_backbones(source, described)
@@ -86,19 +90,18 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
     where = str(source)
     put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)
     statistics = read_statistics(source, described, config, options.unnorm_key)
-    partial = out.with_name(f".partial-{out.name}")
-    shutil.rmtree(partial, ignore_errors=True)
-    tokenizer = _copy_tokenizer(source, partial / TOKENIZER_FOLDER)
-    config.tokenizer_name = str(tokenizer)
-    processors = make_mikasa_openvla_pre_post_processors(config, statistics)
-    if not options.sizes:
-        _check_tokenizer(processors[0])
-    config.tokenizer_name = str(out / TOKENIZER_FOLDER)
-    policy.save_pretrained(partial)
-    for processor in processors:
-        processor.save_pretrained(partial)
-    partial.rename(out)
-    return out
+
+    def check_tokenizer(tokenizer: Any) -> None:
+        if not options.sizes:
+            _check_tokenizer(tokenizer)
+
+    return write_checkpoint(
+        source,
+        out,
+        policy,
+        lambda: make_mikasa_openvla_pre_post_processors(config, statistics),
+        check_tokenizer=check_tokenizer,
+    )
 
 
 def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) -> dict[str, Tensor]:
@@ -107,12 +110,7 @@ def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) ->
     Raises:
         CheckpointError: files are missing, or pickled ones are not allowed.
     """
-    files = sorted(source.glob("*.safetensors"))
-    if not files:
-        raise CheckpointError(f"{source}: expected safetensors, found none. Fetch the whole checkpoint.")
-    original: dict[str, Tensor] = {}
-    for file in files:
-        original.update(load_file(file))
+    original = read_safetensors(source)
     for name, is_wanted in (
         ("action_head", options.head == "l1"),
         ("proprio_projector", options.proprio > 0),
@@ -124,7 +122,7 @@ def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) ->
 
 def read_statistics(
     source: Path, described: Mapping[str, Any], config: MikasaOpenVLAConfig, unnorm_key: str | None
-) -> dict[str, dict[str, Any]] | None:
+) -> Statistics | None:
     """Return field -> statistics of the training data; None if there are several and none is chosen.
 
     Raises:
@@ -132,22 +130,12 @@ def read_statistics(
     """
     file = source / STATISTICS_FILE
     known = read_json(file) if file.is_file() else dict(described.get("norm_stats") or {})
-    if unnorm_key is None and len(known) == 1:
-        (unnorm_key,) = known
-    if unnorm_key is None:
-        return None  # a base for fine-tuning, whose statistics are those of the new data
-    if unnorm_key not in known:
-        raise CheckpointError(
-            f"{source}: there are no statistics '{unnorm_key}'.{did_you_mean(unnorm_key, known)} There are: "
-            f"{', '.join(known) or 'none'}."
-        )
-    chosen = known[unnorm_key]
+    chosen = chosen_statistics(source, known, unnorm_key)
+    if chosen is None:
+        return None
     wanted = {ACTION_KEY: "action", **({STATE_KEY: "proprio"} if config.use_proprio else {})}
     for ours, theirs in wanted.items():
-        mask = (chosen.get(theirs) or {}).get("mask")
-        expected = config.normalizations()[ours].mask
-        if mask is not None and tuple(mask) != expected:
-            raise CheckpointError(f"{source}: mask of {theirs}: expected {expected}, found {tuple(mask)}.")
+        check_mask(source, theirs, chosen.get(theirs) or {}, config.normalizations()[ours].mask)
     return {ours: chosen[theirs] for ours, theirs in wanted.items() if theirs in chosen}
 
 
@@ -193,24 +181,13 @@ def _step(file: Path) -> int:
     return int(number[1]) if number else -1
 
 
-def _copy_tokenizer(source: Path, folder: Path) -> Path:
-    files = [file for pattern in TOKENIZER_FILES for file in sorted(source.glob(pattern)) if file.is_file()]
-    if not files:
-        raise CheckpointError(f"{source}: expected the tokenizer's files, found none. Fetch them, too.")
-    folder.mkdir(parents=True)
-    for file in files:
-        shutil.copy2(file, folder / file.name)
-    return folder
-
-
 def _check_backbones(source: Path, described: Mapping[str, Any]) -> None:
     for name, expected in BACKBONES.items():
         if described.get(name, expected) != expected:
             raise CheckpointError(f"{source}: {name}: expected {expected}, found {described[name]}.")
 
 
-def _check_tokenizer(preprocessor: Any) -> None:
-    tokenizer = next(step.input_tokenizer for step in preprocessor.steps if hasattr(step, "input_tokenizer"))
+def _check_tokenizer(tokenizer: Any) -> None:
     found = tuple(tokenizer(prompt_text(KNOWN_INSTRUCTION)).input_ids)
     if found[: len(KNOWN_IDS)] != KNOWN_IDS:
         raise CheckpointError(

@@ -3,13 +3,16 @@
 Legend as in `network`. Decoding is greedy, as the original's.
 """
 
+from typing import Any  # transformers is untyped here
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 from transformers import DynamicCache
 
 from vla_eval.policies.openvla.action_tokens import from_tokens, to_tokens
-from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Sequence
+from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
+from vla_eval.policies.steps.greedy import Prefix, greedy_tokens
 
 
 def parallel_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
@@ -20,37 +23,15 @@ def parallel_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
 
 
 def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
-    """Return normalised actions (B, K, A), told token after token.
-
-    Prompts of several lengths go together: padding stands between a prompt and its tokens in the cache
-    and is never attended to, and positions are counted without it.
-    """
-    llm, n_tokens = network.llm, network.options.n_action_tokens
-    prefix = _prefix(network.sequence(inputs))
-    lengths, n = prefix.first_action, prefix.mask.shape[1]
-    cache = DynamicCache()
+    """Return normalised actions (B, K, A), told token after token, for prompts of several lengths."""
+    sequence = network.sequence(inputs)
+    n = int(sequence.first_action.max())
+    lengths = sequence.first_action
+    seen = torch.arange(n, device=lengths.device) < lengths[:, None]
     causal = torch.ones(n, n, dtype=torch.bool, device=lengths.device).tril()
-    answer = llm.model(
-        inputs_embeds=prefix.embeddings,
-        attention_mask=prefix.mask[:, None, None, :] & causal,
-        position_ids=torch.arange(n, device=lengths.device)[None],
-        past_key_values=cache,
-        use_cache=True,
-    )
-    last = answer.last_hidden_state.take_along_dim((lengths - 1)[:, None, None], dim=1)
-    tokens = [llm.lm_head(last).argmax(dim=-1)]
-    mask = prefix.mask
-    for step in range(n_tokens - 1):
-        mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        answer = llm.model(
-            inputs_embeds=llm.model.embed_tokens(tokens[-1]),
-            attention_mask=mask[:, None, None, :],
-            position_ids=(lengths + step)[:, None],
-            past_key_values=cache,
-            use_cache=True,
-        )
-        tokens.append(llm.lm_head(answer.last_hidden_state).argmax(dim=-1))
-    return _chunk(network, torch.cat(tokens, dim=1))
+    prefix = Prefix(sequence.embeddings[:, :n], seen[:, None, :] & causal, lengths)
+    told = greedy_tokens(_Llama(network.llm), prefix, network.options.n_action_tokens)
+    return _chunk(network, told.tokens)
 
 
 def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts: Tensor) -> Tensor:
@@ -75,13 +56,29 @@ def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts:
     return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
 
 
-def _prefix(sequence: Sequence) -> Sequence:
-    """Return the sequence cut before the action tokens, whose places become padding where rows differ."""
-    n = int(sequence.first_action.max())
-    places = torch.arange(n, device=sequence.mask.device)
-    return sequence._replace(
-        embeddings=sequence.embeddings[:, :n], mask=places < sequence.first_action[:, None]
-    )
+class _Llama:
+    """OpenVLA's Llama, for greedy decoding."""
+
+    def __init__(self, llm: Any) -> None:
+        self._llm = llm
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        embeddings: Tensor = self._llm.model.embed_tokens(tokens)
+        return embeddings
+
+    def read(self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None) -> Tensor:
+        hidden: Tensor = self._llm.model(
+            inputs_embeds=embeddings,
+            attention_mask=mask[:, None],
+            position_ids=places,
+            past_key_values=cache,
+            use_cache=cache is not None,
+        ).last_hidden_state
+        return hidden
+
+    def logits(self, hidden: Tensor) -> Tensor:
+        logits: Tensor = self._llm.lm_head(hidden)
+        return logits
 
 
 def _chunk(network: OpenVLANetwork, tokens: Tensor) -> Tensor:

@@ -1,8 +1,6 @@
 """OpenVLA and OpenVLA-OFT as a LeRobot policy: loss of a chunk, chunks of several episodes at once."""
 
-import contextlib
 from collections import deque
-from collections.abc import Iterator
 from typing import Any  # lerobot and transformers are untyped
 
 import torch
@@ -18,6 +16,7 @@ from vla_eval.policies.openvla.lora import FULL_MODULES
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
 from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
+from vla_eval.policies.steps.precision import default_dtype
 
 PADDING_KEY = "action_is_pad"
 
@@ -35,7 +34,7 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
         super().__init__(config)
         config.validate_features()
         self.config: MikasaOpenVLAConfig = config
-        with _default_dtype(getattr(torch, config.dtype)):
+        with default_dtype(getattr(torch, config.dtype)):
             self.network = OpenVLANetwork(config.network_sizes(), config.network_options())
         for name in FULL_MODULES:
             if hasattr(self.network, name):
@@ -127,13 +126,3 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
                 "finetune` does, or set do_mask_loss_for_padding."
             )
         return (~is_pad).float()
-
-
-@contextlib.contextmanager
-def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(before)

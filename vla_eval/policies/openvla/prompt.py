@@ -1,12 +1,9 @@
-"""OpenVLA's prompt: its words, the token that ends it, and a tokenizer of bytes for tiny models.
+"""OpenVLA's prompt: its words, and the token that ends it.
 
 Source of words and token: https://github.com/moojink/openvla-oft/blob/
 213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/prismatic/extern/hf/modeling_prismatic.py#L960-L985 and
 prismatic/vla/datasets/datasets.py#L44-L60.
 """
-
-from collections.abc import Sequence
-from typing import Any  # tokenizers and transformers are untyped here
 
 import torch
 from torch import Tensor
@@ -16,8 +13,6 @@ from vla_eval.policies.openvla.network import Prompts
 from vla_eval.policies.openvla.sizes import NetworkSizes
 
 TEMPLATE = "In: What action should the robot take to {instruction}?\nOut:"
-BYTE_SPECIAL = ("<pad>", "<s>", "</s>")
-N_BYTES = 256
 SPACE = "Ġ"  # how a byte-level tokenizer writes a space
 BYTE_SIZES = {
     "pad_token": 0,
@@ -63,24 +58,4 @@ def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
     ends = (places == lengths[:, None]) & is_missing[:, None]
     return Prompts(
         ids=torch.where(ends, sizes.empty_token, wider), mask=places < (lengths + is_missing)[:, None]
-    )
-
-
-def byte_tokenizer() -> Any:
-    """Return a tokenizer of one token per byte, made from nothing; for models without a published one."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
-    from transformers import PreTrainedTokenizerFast
-
-    pad, bos, eos = BYTE_SPECIAL
-    symbols: Sequence[str] = sorted(pre_tokenizers.ByteLevel.alphabet())
-    vocabulary = {symbol: index for index, symbol in enumerate([*BYTE_SPECIAL, *symbols])}
-    tokenizer: Any = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    tokenizer.post_processor = processors.TemplateProcessing(
-        single=f"{bos} $A", special_tokens=[(bos, vocabulary[bos])]
-    )
-    make_fast: Any = PreTrainedTokenizerFast
-    return make_fast(
-        tokenizer_object=tokenizer, pad_token=pad, bos_token=bos, eos_token=eos, padding_side="right"
     )

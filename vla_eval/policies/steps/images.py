@@ -20,6 +20,8 @@ from vla_eval.errors import RecipeError
 
 MAX_LEVEL = 255.0
 LANCZOS_RADIUS = 3.0
+CUBIC_A = -0.5  # of PIL's bicubic kernel; torch's own has -0.75 where it does not antialias
+PIL_PRECISION = 1 << 22  # steps of PIL's weights
 
 
 class Size(NamedTuple):
@@ -39,6 +41,25 @@ def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
     if tuple(images.shape[-2:]) == size:
         return images
     return _whole_levels(_resized(images, size))
+
+
+def resize_bicubic(images: Tensor, size: Size) -> Tensor:
+    """Return the pictures in another size, bit for bit as PIL's BICUBIC does it with whole levels.
+
+    Args:
+        images: (…, 3, H, W) whole levels in [0, 255].
+        size: the new one.
+
+    Source: Pillow 12.3.0, src/libImaging/Resample.c: first along the rows, in whole levels between, with
+    weights in multiples of 2⁻²².
+    """
+    height, width = images.shape[-2:]
+    if (height, width) == size:
+        return images
+    columns = _bicubic_weights(width, size.width_px).to(images.device)
+    rows = _bicubic_weights(height, size.height_px).to(images.device)
+    along = (images.double() @ columns.T + 0.5).floor().clamp(0, MAX_LEVEL)
+    return (rows @ along + 0.5).floor().clamp(0, MAX_LEVEL).to(images.dtype)
 
 
 def resize_and_centre_crop(images: Tensor, size: Size, area: float) -> Tensor:
@@ -72,15 +93,31 @@ def _whole_levels(images: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=32)
 def _resize_weights(n_in: int, n_out: int) -> Tensor:
-    """Return (n_out, n_in): how much each old pixel counts in each new one; rows sum to 1."""
+    """Return (n_out, n_in) of Lanczos: how much each old pixel counts in each new one; rows sum to 1."""
+    distances = _distances(n_in, n_out)
+    lobes = torch.sinc(distances) * torch.sinc(distances / LANCZOS_RADIUS)
+    weights = torch.where(distances <= LANCZOS_RADIUS, lobes, 0.0)
+    return (weights / weights.sum(dim=1, keepdim=True)).float()
+
+
+@functools.lru_cache(maxsize=32)
+def _bicubic_weights(n_in: int, n_out: int) -> Tensor:
+    """Return (n_out, n_in), float64, of the cubic kernel with a = -0.5, in multiples of 2⁻²²."""
+    x = _distances(n_in, n_out)
+    near = ((CUBIC_A + 2) * x - (CUBIC_A + 3)) * x * x + 1
+    far = (((x - 5) * x + 8) * x - 4) * CUBIC_A
+    weights = torch.where(x < 1, near, torch.where(x < 2, far, 0.0))
+    weights = weights / weights.sum(dim=1, keepdim=True)
+    return (weights * PIL_PRECISION).round() / PIL_PRECISION
+
+
+def _distances(n_in: int, n_out: int) -> Tensor:
+    """Return (n_out, n_in), float64: from each new pixel to each old one, in the kernel's unit."""
     scale = n_in / n_out
     kernel_scale = max(scale, 1.0)  # antialiasing: when shrinking, the kernel covers as many more pixels
     centres = (torch.arange(n_out, dtype=torch.float64) + 0.5) * scale
     places = torch.arange(n_in, dtype=torch.float64) + 0.5
-    distances = ((places - centres[:, None]) / kernel_scale).abs()
-    lobes = torch.sinc(distances) * torch.sinc(distances / LANCZOS_RADIUS)
-    weights = torch.where(distances <= LANCZOS_RADIUS, lobes, 0.0)
-    return (weights / weights.sum(dim=1, keepdim=True)).float()
+    return ((places - centres[:, None]) / kernel_scale).abs()
 
 
 class Boxes(NamedTuple):

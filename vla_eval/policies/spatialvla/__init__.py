@@ -1,0 +1,1 @@
+"""SpatialVLA on transformers' SigLIP, Gemma 2 and ZoeDepth; see docs/spatialvla.md."""

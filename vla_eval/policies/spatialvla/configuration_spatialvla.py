@@ -1,0 +1,286 @@
+"""lerobot's configuration of SpatialVLA; `docs/spatialvla.md` explains it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any  # lerobot is untyped
+
+import torch
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS
+from vla_eval.errors import RecipeError, did_you_mean, unknown_name
+from vla_eval.policies.spatialvla.action_grid import (
+    ActionGrid,
+    fitted_gaussians,
+    gaussian_grid,
+    uniform_grid,
+)
+from vla_eval.policies.spatialvla.lora import LORA_TARGETS, SPATIAL_EMBEDDINGS
+from vla_eval.policies.spatialvla.sizes import (
+    ATTENTIONS,
+    N_ACTION,
+    Attention,
+    NetworkSizes,
+    network_sizes,
+)
+from vla_eval.policies.steps.gripper import Gripper
+from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
+from vla_eval.policies.steps.precision import DTYPES
+
+TYPE = "mikasa_spatialvla"
+GRIDS = ("refitted", "kept", "uniform")
+
+
+@LRSchedulerConfig.register_subclass("mikasa_linear_decay")
+@dataclass
+class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
+    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step.
+
+    Attributes:
+        num_warmup_steps: how long it rises.
+    """
+
+    num_warmup_steps: int | None = 0
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """Return torch's scheduler."""
+        n_warmup = self.num_warmup_steps or 0
+
+        def factor(step: int) -> float:
+            if step < n_warmup:
+                return step / n_warmup
+            return max(0.0, (num_training_steps - step) / max(1, num_training_steps - n_warmup))
+
+        return LambdaLR(optimizer, factor)
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
+    """SpatialVLA.
+
+    Attributes:
+        chunk_size: actions of a chunk, three tokens each.
+        n_action_steps: how many lerobot's own loop executes, the first ones; ours sets its own number.
+        pictures: fields of the pictures that are read, in this order. The base camera alone, as the original
+            does; with the wrist's it is an extension of ours.
+        camera_fov_rad: vertical field of view of their cameras, from which their matrices are made. MIKASA's
+            cameras have a quarter turn; an evaluation with others is refused.
+        action_grid: where a fine-tuning has the bins: `refitted` to the dataset's actions (tokens of a base
+            are moved along), `kept` as the base has them, `uniform`.
+        grid: edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion.
+        base_grid: those of the base, if they were others; set by a fine-tuning.
+        prefix_attention: what pictures and prompt attend to, see `sizes.Attention`.
+        inference_attention: the same for inference; None: as in training.
+        train_spatial_embeddings: train the embeddings of the action tokens.
+        train_word_embeddings: train Gemma's own embeddings, and what tells the tokens.
+        sizes: sizes that differ from the published model's, see `NetworkSizes`.
+        dtype: of the network: `float32`, `bfloat16`.
+        gradient_checkpointing: recompute activations in the backward pass.
+        gripper: how the gripper is encoded.
+        do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False: chunks that
+            have any are refused.
+        drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.
+        tokenizer_name: folder or name of the tokenizer; `bytes`: see `steps.byte_tokenizer`.
+        prompt_max_tokens: a longer prompt is an error.
+        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps: AdamW, and
+            `mikasa_linear_decay`.
+    """
+
+    chunk_size: int = 4
+    n_action_steps: int = 4
+    pictures: list[str] = field(default_factory=lambda: [CAMERA_KEYS["base_camera"]])
+    camera_fov_rad: float = math.pi / 2
+    action_grid: str = "refitted"
+    grid: list[list[float]] = field(default_factory=list)
+    base_grid: list[list[float]] = field(default_factory=list)
+    prefix_attention: str = "causal"
+    inference_attention: str | None = None
+    train_spatial_embeddings: bool = False
+    train_word_embeddings: bool = False
+    sizes: dict[str, int] = field(default_factory=dict)
+    dtype: str = "bfloat16"
+    gradient_checkpointing: bool = False
+    gripper: str = "unit_open"
+    do_mask_loss_for_padding: bool = True
+    drop_n_last_frames: int = 0
+    tokenizer_name: str = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
+    prompt_max_tokens: int = 256
+
+    optimizer_lr: float = 5e-4
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 250
+
+    # Of lerobot's own normaliser, which this policy does not use: see `normalizations`.
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a dataset."""
+        super().__post_init__()
+        for name, value, known in (
+            ("action_grid", self.action_grid, GRIDS),
+            ("prefix_attention", self.prefix_attention, ATTENTIONS),
+            ("inference_attention", self.inference_attention or self.prefix_attention, ATTENTIONS),
+            ("dtype", self.dtype, DTYPES),
+        ):
+            if value not in known:
+                raise RecipeError(str(unknown_name(name, value, known, where=TYPE)))
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise RecipeError(
+                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
+            )
+        if not 0 < self.camera_fov_rad < math.pi:
+            raise RecipeError(f"camera_fov_rad is {self.camera_fov_rad}, expected radians in (0, π).")
+        if not self.pictures:
+            raise RecipeError(f"'{TYPE}': pictures is empty, expected the fields that are read, in order.")
+        self.network_sizes()
+        self.gripper_spec()
+        self.drop_n_last_frames = 0 if self.do_mask_loss_for_padding else self.chunk_size - 1
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        if not self.image_features or self.action_feature is None:
+            raise RecipeError(f"'{TYPE}' needs pictures and an action.")
+        found = tuple(self.action_feature.shape)
+        if found != (N_ACTION,):
+            raise RecipeError(
+                f"'{TYPE}' tells translation, rotation and gripper: expected actions of {N_ACTION} numbers, "
+                f"found shape {found}."
+            )
+        for name in self.pictures:
+            if name not in self.image_features:
+                raise RecipeError(
+                    f"'{TYPE}': pictures names '{name}', which the dataset does not have."
+                    f"{did_you_mean(name, self.image_features)}"
+                )
+
+    @property
+    def reads_state(self) -> bool:
+        """Whether the policy has any use for `observation.state`: it has none."""
+        return False
+
+    def network_sizes(self) -> NetworkSizes:
+        """Return the sizes of the network."""
+        return network_sizes(self.sizes)
+
+    def gripper_spec(self) -> Gripper:
+        """Return how the gripper is encoded."""
+        encoding: Any = self.gripper  # `Gripper` checks it
+        return Gripper(encoding=encoding)
+
+    def attention(self, *, training: bool) -> Attention:
+        """Return what pictures and prompt attend to."""
+        name: Any = self.prefix_attention if training else self.inference_attention or self.prefix_attention
+        chosen: Attention = name  # checked in `__post_init__`
+        return chosen
+
+    def fit_to_actions(self, actions: Tensor, statistics: Mapping[str, Any]) -> None:
+        """Set the grid for a dataset; `grid` is then what a base had, if there is one.
+
+        Args:
+            actions: (N, 7) of all frames, as the environment takes them.
+            statistics: of the dataset's actions.
+
+        Raises:
+            RecipeError: the base's grid is to be kept, and there is none.
+        """
+        base, self.base_grid = self.grid, []
+        if self.action_grid == "kept":
+            if not base:
+                raise RecipeError(
+                    f"'{TYPE}': action_grid is 'kept', but there is no base with a grid. Name a "
+                    "base_checkpoint, or choose 'refitted' or 'uniform'."
+                )
+            return
+        bins = self.network_sizes().n_bins
+        if self.action_grid == "uniform":
+            chosen = uniform_grid(bins)
+        else:
+            spec = self.normalizations()[ACTION_KEY]
+            normalizer = Normalizer(spec, statistics, where="statistics of the dataset's actions")
+            normalized = normalizer.normalize(self.gripper_spec().encode(actions.to(torch.float64)))
+            chosen = gaussian_grid(fitted_gaussians(normalized), bins)
+        self.grid, self.base_grid = [list(edges) for edges in chosen.edges], base
+
+    def current_grid(self) -> ActionGrid:
+        """Return where the bins lie.
+
+        Raises:
+            RecipeError: nobody has set it, or it has other bins than the network has tokens.
+        """
+        if not self.grid:
+            raise RecipeError(
+                f"'{TYPE}': there is no action grid. A fine-tuning sets it (action_grid), and so does "
+                "`mikasa-vla checkpoint convert-spatialvla`."
+            )
+        return self._checked(self.grid)
+
+    def former_grid(self) -> ActionGrid | None:
+        """Return where the base's bins lay; None: where they lie now."""
+        return self._checked(self.base_grid) if self.base_grid else None
+
+    def _checked(self, edges: list[list[float]]) -> ActionGrid:
+        grid = ActionGrid(edges=tuple(map(tuple, edges)))
+        if grid.n_bins != self.network_sizes().n_bins:
+            raise RecipeError(
+                f"'{TYPE}': the action grid has {grid.n_bins} bins, expected {self.network_sizes().n_bins} "
+                "(sizes)."
+            )
+        return grid
+
+    def normalizations(self) -> dict[str, Normalization]:
+        """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
+
+        Source: data.norm.* of the golden files; the original's data/utils/data_utils.py.
+        """
+        mask = mask_all_but(N_ACTION, left_alone=(-1,))
+        return {ACTION_KEY: Normalization(kind="q01_q99", mask=mask, clip=True)}
+
+    @property
+    def encoder_settings(self) -> dict[str, Any]:
+        """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
+        return {"fields": self.normalizations(), "gripper": self.gripper_spec()}
+
+    def lora_defaults(self) -> dict[str, Any]:
+        """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
+        full = [SPATIAL_EMBEDDINGS] if self.train_spatial_embeddings else None
+        return {"target_modules": LORA_TARGETS, "modules_to_save": full}
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """The frame itself."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """One chunk."""
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None
+
+    def get_optimizer_preset(self) -> Any:
+        """Return lerobot's configuration of AdamW."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> Any:
+        """Return the configuration of the schedule."""
+        return LinearDecaySchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)

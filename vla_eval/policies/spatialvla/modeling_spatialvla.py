@@ -1,0 +1,137 @@
+"""SpatialVLA as a LeRobot policy: loss of a chunk, chunks of several episodes at once."""
+
+from collections import deque
+from typing import Any  # lerobot and transformers are untyped
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from torch import Tensor
+
+from vla_eval.data.features import ACTION_KEY
+from vla_eval.errors import SpecMismatchError, TrainingError
+from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
+from vla_eval.policies.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
+from vla_eval.policies.spatialvla.generation import generated_actions, token_loss
+from vla_eval.policies.spatialvla.grid_refit import refitted
+from vla_eval.policies.spatialvla.network import Inputs, Prompts, SpatialVLANetwork
+from vla_eval.policies.spatialvla.prompt import finished
+from vla_eval.policies.steps.images import MAX_LEVEL, Size, resize_bicubic
+from vla_eval.policies.steps.precision import default_dtype
+
+PADDING_KEY = "action_is_pad"
+
+
+class MikasaSpatialVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+    """See `MikasaSpatialVLAConfig`."""
+
+    config_class = MikasaSpatialVLAConfig
+    name = TYPE
+    draws_nothing = True
+
+    def __init__(self, config: MikasaSpatialVLAConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: MikasaSpatialVLAConfig = config
+        self.grid = config.current_grid()
+        with default_dtype(getattr(torch, config.dtype)):
+            self.network = SpatialVLANetwork(config.network_sizes())
+        self.network.spatial_embed_tokens.requires_grad_(config.train_spatial_embeddings)
+        self.network.llm.embed_tokens.requires_grad_(config.train_word_embeddings)
+        if self.network.sizes.llm_own_head:
+            self.network.lm_head.requires_grad_(config.train_word_embeddings)
+        if config.gradient_checkpointing:
+            for part in (self.network.vision, self.network.llm):
+                part.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+        self.reset()
+
+    @torch.no_grad()
+    def begin_from_base(self) -> None:
+        """Move the base's action tokens to this policy's grid; to be called once, with the base's weights.
+
+        The rows that tell the tokens move as those that are read do, or a token would be told by what it
+        was before.
+        """
+        former = self.config.former_grid()
+        if former is None:
+            return
+        network = self.network
+        head = network.lm_head if network.sizes.llm_own_head else network.llm.embed_tokens
+        told = head.weight[network.sizes.first_action_token :]
+        for table in (network.spatial_embed_tokens.weight, told):
+            table.copy_(refitted(table, former, self.grid))
+
+    def get_optim_params(self) -> Any:
+        """Return the parameters that are trained."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        """Forget what lerobot's own loop has not executed yet."""
+        self._queue: deque[Tensor] = deque()
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a batch of training samples, and its parts."""
+        actions = batch[ACTION_KEY].float()
+        attention = self.config.attention(training=True)
+        counts = self._counts(batch, actions)
+        loss = token_loss(self.network, self.grid, self._inputs(batch), actions, counts, attention)
+        return loss, {"cross_entropy": loss.item()}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return normalised actions (B, chunk, action), the first of them for the frame that was given."""
+        self.eval()
+        attention, chunk = self.config.attention(training=False), self.config.chunk_size
+        return generated_actions(
+            self.network, self.grid, self._inputs(batch), chunk=chunk, attention=attention
+        )
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return (B, action) for lerobot's own loop: the first `n_action_steps` of each chunk in turn."""
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch)
+            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._queue.popleft()
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """Tell lerobot what LoRA trains."""
+        return self.config.lora_defaults()
+
+    def _inputs(self, batch: dict[str, Tensor]) -> Inputs:
+        """Return pictures, resized as PIL does it, the matrices of their cameras, and prompts."""
+        edge = self.network.sizes.image_px
+        pictures, matrices = [], []
+        for name in self.config.pictures:
+            if name not in batch:
+                raise SpecMismatchError(f"'{TYPE}': the batch has no picture '{name}'.")
+            levels = (batch[name].float() * MAX_LEVEL).round()
+            height_px, width_px = levels.shape[-2:]
+            camera = intrinsics(height_px=height_px, width_px=width_px, fov_rad=self.config.camera_fov_rad)
+            matrices.append(resized_intrinsics(camera, height_px=height_px, width_px=width_px, to_px=edge))
+            pictures.append(resize_bicubic(levels, Size(edge, edge)) / MAX_LEVEL)
+        shown = torch.stack(pictures, dim=1)
+        cameras = torch.stack(matrices).to(shown.device).expand(len(shown), -1, -1, -1)
+        return Inputs(shown, cameras, self._prompts(batch))
+
+    def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
+        ids, mask = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        if ids.shape[1] > self.config.prompt_max_tokens:
+            raise SpecMismatchError(
+                f"'{TYPE}': a prompt has {ids.shape[1]} tokens, expected at most "
+                f"{self.config.prompt_max_tokens} (prompt_max_tokens)."
+            )
+        return finished(ids, mask, self.network.sizes)
+
+    def _counts(self, batch: dict[str, Tensor], actions: Tensor) -> Tensor:
+        """Return (B, chunk) float: 0 for actions beyond an episode's end."""
+        is_pad = batch.get(PADDING_KEY)
+        if is_pad is None:
+            return torch.ones(actions.shape[:2], device=actions.device)
+        if not self.config.do_mask_loss_for_padding and bool(is_pad.any()):
+            raise TrainingError(
+                f"'{TYPE}': a chunk goes beyond its episode's end. Train with a sampler that leaves out the "
+                f"last drop_n_last_frames ({self.config.drop_n_last_frames}) frames, as `mikasa-vla "
+                "finetune` does, or set do_mask_loss_for_padding."
+            )
+        return (~is_pad).float()

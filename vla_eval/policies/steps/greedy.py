@@ -1,0 +1,92 @@
+"""Greedy decoding after a prefix, for several rows at once. Knows torch and transformers' cache, no policy.
+
+Legend: B rows, N places of the longest prefix, V tokens, D the language model's width.
+
+Prefixes of several lengths go together: padding stands between a prefix and its tokens in the cache and is
+never attended to, and positions are counted without it. So a row gets what it gets alone.
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from transformers import DynamicCache
+
+
+class Prefix(NamedTuple):
+    """What is read before the first token is told.
+
+    Attributes:
+        embeddings: (B, N, D), padded on the right.
+        mask: (B, N, N) bool: which place (second N) each place attends to.
+        lengths: (B,) places that are no padding.
+    """
+
+    embeddings: Tensor
+    mask: Tensor
+    lengths: Tensor
+
+
+class Told(NamedTuple):
+    """What was told.
+
+    Attributes:
+        tokens: (B, T) int64.
+        logits: (B, T, V) that they were chosen from.
+    """
+
+    tokens: Tensor
+    logits: Tensor
+
+
+class LanguageModel(Protocol):
+    """What decoding needs of a language model; places are counted from 0."""
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Return the embeddings (B, T, D) of tokens (B, T)."""
+
+    def read(self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None) -> Tensor:
+        """Return the last hidden states (B, T, D); keys and values are added to the cache.
+
+        Args:
+            embeddings: (B, T, D).
+            mask: (B, T, T with what the cache holds) bool.
+            places: (1 or B, T) int64.
+            cache: of the places before; None: there are none, and none are kept.
+        """
+
+    def logits(self, hidden: Tensor) -> Tensor:
+        """Return (…, V) of hidden states (…, D)."""
+
+
+def greedy_tokens(
+    model: LanguageModel, prefix: Prefix, n_tokens: int, *, never: tuple[int, ...] = ()
+) -> Told:
+    """Return the likeliest token, the likeliest after that, and so on, `n_tokens` of them.
+
+    Args:
+        model: see there.
+        prefix: see there.
+        n_tokens: how many to tell.
+        never: tokens that are not told, however likely; the logits that are returned keep them.
+    """
+    lengths, n = prefix.lengths, prefix.embeddings.shape[1]
+    cache = DynamicCache()
+    places = torch.arange(n, device=lengths.device)[None]
+    hidden = model.read(prefix.embeddings, prefix.mask, places, cache)
+    logits = [model.logits(hidden.take_along_dim((lengths - 1)[:, None, None], dim=1))]
+    tokens = [_likeliest(logits[0], never)]
+    seen = places < lengths[:, None]
+    for step in range(n_tokens - 1):
+        seen = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=1)
+        hidden = model.read(model.embed(tokens[-1]), seen[:, None, :], (lengths + step)[:, None], cache)
+        logits.append(model.logits(hidden))
+        tokens.append(_likeliest(logits[-1], never))
+    return Told(torch.cat(tokens, dim=1), torch.cat(logits, dim=1))
+
+
+def _likeliest(logits: Tensor, never: tuple[int, ...]) -> Tensor:
+    if never:
+        logits = logits.clone()
+        logits[..., list(never)] = -torch.inf
+    return logits.argmax(dim=-1)
