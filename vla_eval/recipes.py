@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from vla_eval.decoding import decode, find_field, load_yaml
 from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
@@ -241,6 +241,33 @@ def load_recipe[T](
         UnknownNameError: there is no such recipe.
         RecipeError: it cannot be read, has unknown or missing fields, or values of a wrong type.
     """
+    file = _read(folder, name)
+    if edit is not None:
+        edit(file.data)
+    value = decode(cls, file.data, where=file.where)
+    return Recipe(name=file.path.stem, path=file.path, sha256=file.sha256, value=value)
+
+
+def recipe_fields(folder: Folder, name: str) -> frozenset[str]:
+    """Return which fields a recipe sets: they tell kinds of one folder apart.
+
+    Raises:
+        UnknownNameError: there is no such recipe.
+        RecipeError: it cannot be read.
+    """
+    return frozenset(_read(folder, name).data)
+
+
+class _File(NamedTuple):
+    """A recipe as it was read, not yet checked."""
+
+    path: Path
+    where: str
+    sha256: str
+    data: dict[str, Any]  # Any: plain data of YAML
+
+
+def _read(folder: Folder, name: str) -> _File:
     path = find_recipe(folder, name)
     where = f"{folder}/{path.name}" if path.parent in recipe_folders(folder) else str(path)
     try:
@@ -251,10 +278,7 @@ def load_recipe[T](
     data = load_yaml(text, where=where)
     if not isinstance(data, dict):
         raise RecipeError(f"{where}: expected fields with values (`name: …`), found {data!r:.60}.")
-    if edit is not None:
-        edit(data)
-    value = decode(cls, data, where=where)
-    return Recipe(name=path.stem, path=path, sha256=hashlib.sha256(content).hexdigest(), value=value)
+    return _File(path, where, hashlib.sha256(content).hexdigest(), data)
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str], *, cls: type) -> None:

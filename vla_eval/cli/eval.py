@@ -1,14 +1,17 @@
 """`mikasa-vla eval`: run an evaluation, or go on with it, and print its table."""
 
 import argparse
+import importlib
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, workers_argument
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.model_table import is_model_table
 from vla_eval.policies.recipe import policy_name
 from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
 
@@ -95,6 +98,11 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--baseline", metavar="NAME", help="policy that the others are compared with")
     parser.add_argument("--paper", action="store_true", help="print the paper's figures beside ours")
     parser.add_argument(
+        "--tiny",
+        action="store_true",
+        help="of a table of learned policies: do all of it with tiny random models, without a simulator",
+    )
+    parser.add_argument(
         "--html", type=Path, metavar="DIR", help="also write a page: DIR/index.html; its path comes last"
     )
 
@@ -106,6 +114,10 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluate import default_run_folder, evaluate
     from vla_eval.results.store import read_run
 
+    if args.config is not None and is_model_table(args.config):
+        return importlib.import_module("vla_eval.cli.model_table").evaluate_table(args)
+    if args.tiny:
+        raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
     _check_baseline(args.baseline, config)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
@@ -130,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
         )
         return stop.exit_code
     found = read_run(out)
-    _print_table(found, args)
+    print_table([found], args)
     if summary.n_errors:
         print(
             f"{summary.n_errors} episodes ended in an error and are not in the rates; the same command "
@@ -138,24 +150,26 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     if args.html is not None:
-        _write_page(found, args)
+        write_html([found], args)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
 
 
-def _print_table(run: "StoredRun", args: argparse.Namespace) -> None:
+def print_table(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    """Print the table of all runs in the format that was asked for."""
     from vla_eval.results.report import build_table, render
 
-    table = build_table([run], baseline=args.baseline)
+    table = build_table(runs, baseline=args.baseline)
     print(render(table, args.format, paper=args.paper))
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
 
 
-def _write_page(run: "StoredRun", args: argparse.Namespace) -> None:
+def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    """Write the report page and say where."""
     from vla_eval.page.build import write_page
 
-    page = write_page([run], args.html, baseline=args.baseline)
+    page = write_page(runs, args.html, baseline=args.baseline)
     sys.stdout.flush()  # the table first, wherever the two go
     print(f"Report page: {page}", file=sys.stderr)
 

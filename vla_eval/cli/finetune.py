@@ -2,12 +2,14 @@
 
 import argparse
 import contextlib
+import importlib
 import shlex
 import sys
 from typing import Any
 
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError
+from vla_eval.model_table import is_model_table
 from vla_eval.recipes import apply_overrides, load_recipe
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
@@ -16,6 +18,7 @@ DESCRIPTION = """Train a policy on a dataset: lerobot's training loop, the recip
 CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `evaluation`; or name
 --policy and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
 `finetune` section (--set policy.chunk_size=8). The same command again goes on after a kill, exactly.
+CONFIG may also be a table of learned policies, such as paper_vla_table: all its fine-tunings in turn.
 Then: mikasa-vla eval --policy RUN --task TASK"""
 
 
@@ -60,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.training.finetune import finetune
 
+    if args.config is not None and is_model_table(args.config):
+        return importlib.import_module("vla_eval.cli.model_table").finetune_table(args)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))

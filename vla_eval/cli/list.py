@@ -6,12 +6,14 @@ from typing import Any
 
 from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.errors import RecipeError
+from vla_eval.model_table import ModelTable, is_model_table
 from vla_eval.prompts import load_prompts
 from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
 from vla_eval.registry import policy_adapters
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 Row = Sequence[str]
+RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe]
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -66,13 +68,13 @@ def _chance(chance: float | None) -> str:
 
 
 def _policies() -> list[Row]:
-    rows = _recipes("policies", PolicyRecipe)
+    rows = _recipes("policies", lambda _name: PolicyRecipe)
     adapters = [name for name in policy_adapters() if name not in {row[0] for row in rows}]
     return [*rows, *((name, "adapter without a recipe of its own") for name in adapters)]
 
 
 def _configs() -> list[Row]:
-    return _recipes("configs", EvalConfig)
+    return _recipes("configs", lambda name: ModelTable if is_model_table(name) else EvalConfig)
 
 
 def _prompts() -> list[Row]:
@@ -80,14 +82,14 @@ def _prompts() -> list[Row]:
 
 
 def _datasets() -> list[Row]:
-    return _recipes("datasets", DatasetRecipe)
+    return _recipes("datasets", lambda _name: DatasetRecipe)
 
 
-def _recipes(folder: Folder, cls: type[PolicyRecipe] | type[EvalConfig] | type[DatasetRecipe]) -> list[Row]:
+def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> list[Row]:
     rows: list[Row] = []
     for name in list_recipes(folder):
         try:
-            rows.append((name, load_recipe(folder, name, cls).value.description))
+            rows.append((name, load_recipe(folder, name, class_of(name)).value.description))
         except RecipeError as exc:  # one broken file of the user's must not hide the others
             rows.append((name, f"CANNOT BE READ: {exc}"))
     return rows

@@ -1,0 +1,145 @@
+"""A table of learned policies: what it takes, what is missing of it, and all of it with tiny models."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from vla_eval.cli.main import main
+from vla_eval.errors import VlaEvalError
+from vla_eval.model_table import (
+    ModelTable,
+    evaluations,
+    finetunings,
+    gpu_hours,
+    is_model_table,
+    load_model_table,
+)
+from vla_eval.recipes import PolicyRecipe, load_recipe
+from vla_eval.results.paper_table import PAPER_TABLE
+
+PAPER = "paper_vla_table"
+TASK = "RememberColor3-v0"
+
+
+@pytest.fixture(autouse=True)
+def cache_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """Return the paper's table for one task and one training run."""
+    data = yaml.safe_load(Path("configs/paper_vla_table.yaml").read_text(encoding="utf-8"))
+    data |= {"name": "small", "tasks": [TASK], "run_seeds": [0], "datasets": str(tmp_path / "data")}
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return path
+
+
+def changed(small: Path, **changes: Any) -> Path:
+    path = small.with_name("changed.yaml")
+    path.write_text(yaml.safe_dump(yaml.safe_load(small.read_text()) | changes), encoding="utf-8")
+    return path
+
+
+def test_the_papers_table_is_five_rows_on_five_tasks_in_three_runs() -> None:
+    table = load_model_table(PAPER)
+    assert {(row.n_action_steps) for row in table.rows} == {4, 8} and len(table.rows) == 5
+    assert set(table.tasks) == {figure.task for figure in PAPER_TABLE}
+    every = finetunings(table, Path("out"))
+    assert len(every) == 5 * 5 * 3 and len({one.config.out for one in every}) == 75
+    assert all(one.config.finetune["steps"] == 50_000 for one in every)
+    assert (table.episodes, table.seed_start) == (100, 1)
+
+
+def test_each_row_executes_no_more_than_the_chunk_that_its_policy_is_trained_for() -> None:
+    for row in load_model_table(PAPER).rows:
+        recipe = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
+        assert recipe is not None and recipe.policy["chunk_size"] == row.n_action_steps, row.name
+
+
+def test_chance_and_ceiling_are_measured_at_the_number_of_action_steps_of_each_row(tmp_path: Path) -> None:
+    configs = dict(evaluations(load_model_table(PAPER), tmp_path))
+    assert len(configs) == 1 + 5 * 3
+    controls = configs[tmp_path / "evaluation" / "controls"]
+    assert controls.n_action_steps == (4, 8) and set(controls.policies) == {"random", "cue_blind", "oracle"}
+    one = configs[tmp_path / "evaluation" / f"{TASK}-run-2"]
+    assert one.tasks == (TASK,) and one.n_action_steps is None
+    recipe = yaml.safe_load(Path(one.policies[0]).read_text())
+    assert recipe["args"]["checkpoint"] == str(tmp_path / "training" / "octo_small" / TASK / "run-2")
+    assert recipe["default_n_action_steps"] == 4
+
+
+def test_gpu_hours_count_the_passes_that_training_needs() -> None:
+    """π0, all weights, batch 32: 6 · 3.3e9 · 570 · 32 · 50,000 operations at 1e14 per second."""
+    rows = {row.name: row for row in load_model_table(PAPER).rows}
+    assert gpu_hours(rows["pi0"], steps=50_000) == pytest.approx(50.16, rel=1e-3)
+
+
+def test_a_table_is_told_from_an_evaluation() -> None:
+    assert is_model_table(PAPER) and not is_model_table("demo")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"run_seeds": [0, 0]}, "run_seeds"),
+        ({"tasks": []}, "tasks"),
+        ({"steps": 0}, "steps"),
+        ({"controls": ["pi0"]}, "share a name"),
+        ({"tasks": ["RememberColour3-v0"]}, "Did you mean"),
+    ],
+)
+def test_what_makes_no_table_is_refused(small: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(VlaEvalError, match=message):
+        load_model_table(str(changed(small, **changes)))
+
+
+def test_a_missing_dataset_is_found_before_the_first_training(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["finetune", str(small), "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "5 fine-tunings" in told and "GPU hours" in told and "mikasa-vla record" in told
+
+
+def test_an_evaluation_says_what_has_not_been_trained(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["eval", str(small), "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "octo_small on RememberColor3-v0, run seed 0" in told and "2 more" in told
+    assert f"mikasa-vla finetune {small}" in told
+
+
+def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(small), "--episodes", "3"]) == 1
+    assert "--episodes" in capsys.readouterr().err
+    assert main(["eval", "demo", "--tiny"]) == 1
+    assert "--tiny" in capsys.readouterr().err
+
+
+def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_figures(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["eval", str(small), "--tiny", "--paper", "--format", "json", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    first = capsys.readouterr()
+    told = json.loads(first.out)
+    rows = {(row["policy"], row["n_action_steps"]) for row in told["rows"]}
+    models = {(row.name, row.n_action_steps) for row in load_model_table(PAPER).rows}
+    controls = {(name, n) for name in ("random", "cue_blind", "oracle") for n in (4, 8)}
+    assert rows == models | controls
+    assert len(told["paper"]["rows"]) == 5
+    assert "mean nothing" in first.err
+
+    assert main(arguments) == 0  # everything is there
+    again = capsys.readouterr()
+    assert json.loads(again.out) == told and "[1/" not in again.err
+
+
+def test_the_configuration_is_a_table(small: Path) -> None:
+    assert isinstance(load_model_table(str(small)), ModelTable)

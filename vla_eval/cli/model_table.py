@@ -1,0 +1,211 @@
+"""`mikasa-vla finetune` and `eval` of a table of learned policies: every part that is not there yet."""
+
+import argparse
+import contextlib
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS
+from vla_eval.errors import RecipeError
+from vla_eval.model_table import (
+    Finetuning,
+    ModelTable,
+    describe_effort,
+    evaluations,
+    finetunings,
+    load_model_table,
+)
+
+RUNS_FOLDER = Path("runs")
+FINETUNE_FLAGS = ("policy", "dataset", "steps", "batch_size", "run_seed", "base_checkpoint", "eval_every")
+EVAL_FLAGS = (
+    *("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "overrides"),
+    *("record_video", "record_rrd"),
+)
+
+
+class _Work(NamedTuple):
+    """A table, where it goes, and which rows have an adapter of their own."""
+
+    table: ModelTable
+    out: Path
+    adapters: dict[str, str]
+
+
+def finetune_table(args: argparse.Namespace) -> int:
+    """Fine-tune what is not finished; the folders of the checkpoints go to standard output.
+
+    Raises:
+        VlaEvalError: a flag that a table does not take, a missing dataset, a mistake in a recipe.
+    """
+    _refuse(args, FINETUNE_FLAGS)
+    work = _work(args)
+    _finetune(work, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
+    for one in finetunings(work.table, work.out):
+        print(one.config.out)
+    return 0
+
+
+def evaluate_table(args: argparse.Namespace) -> int:
+    """Evaluate every checkpoint and the controls, then print one table.
+
+    Raises:
+        VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
+    """
+    from vla_eval.cli.eval import print_table, write_html
+    from vla_eval.cli.progress import Progress, stop_on_signals
+    from vla_eval.evaluate import evaluate
+    from vla_eval.results.store import read_run
+
+    _refuse(args, EVAL_FLAGS)
+    work = _work(args)
+    if args.tiny:
+        _record_tiny(work)
+        _finetune(work, device="cpu", allow_unreplayed=True)
+    _refuse_unfinished(work, args.config)
+    command = _command()
+    n_errors, folders = 0, []
+    with stop_on_signals() as stop, _tiny_models(work):
+        for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
+            config = replace(config, workers=1 if args.tiny else (args.workers or config.workers))
+            progress = Progress(stop, out=str(folder))
+            try:
+                summary = evaluate(
+                    config,
+                    out=folder,
+                    command=command,
+                    allow_environment_change=args.allow_environment_change,
+                    observer=progress,
+                )
+            finally:
+                progress.close()
+            if summary.was_stopped:
+                print(f"Stopped. To go on: {command}", file=sys.stderr)
+                return stop.exit_code
+            n_errors += summary.n_errors
+            folders.append(folder)
+    runs = [read_run(folder) for folder in folders]
+    print_table(runs, args)
+    if args.html is not None:
+        write_html(runs, args)
+    return EXIT_EPISODE_ERRORS if n_errors else 0
+
+
+def _work(args: argparse.Namespace) -> _Work:
+    table = load_model_table(args.config)
+    is_tiny = getattr(args, "tiny", False)
+    out = Path(args.out) if args.out else RUNS_FOLDER / (table.name + ("_tiny" if is_tiny else ""))
+    if not is_tiny:
+        return _Work(table, out, {})
+    from vla_eval.training.tiny_table import tiny_table
+
+    tiny, adapters = tiny_table(table, out)
+    return _Work(tiny, out, adapters)
+
+
+def _finetune(work: _Work, *, device: str, allow_unreplayed: bool) -> None:
+    """Run one fine-tuning after the other."""
+    from vla_eval.training.finetune import finetune
+
+    everything = finetunings(work.table, work.out)
+    unfinished = _unfinished(work)
+    _say(describe_effort(work.table, n_finished=len(everything) - len(unfinished)))
+    _check(work.table, unfinished)
+    with contextlib.redirect_stdout(sys.stderr), _tiny_models(work):
+        for index, one in enumerate(unfinished):
+            _say(f"[{index + 1}/{len(unfinished)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
+            allowed = allow_unreplayed or one.config.allow_unreplayed
+            config = replace(one.config, device=device, allow_unreplayed=allowed)
+            finetune(config, command=_command(), say=_say)
+            _free_memory()
+
+
+def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
+    """Find now what would otherwise stop the work after days: datasets and bases that are not there."""
+    from vla_eval.policies.checkpoint import find_checkpoint
+    from vla_eval.training.finetune import load_finetune_recipe
+
+    missing = [one.config.dataset for one in ahead if not Path(one.config.dataset).is_dir()]
+    if missing:
+        raise RecipeError(
+            f"{table.name}: {', '.join(dict.fromkeys(missing))}: expected a dataset, found no folder. Record "
+            f"them: mikasa-vla record --task {' '.join(table.tasks)} --out {table.datasets}"
+        )
+    for config in {one.row.name: one.config for one in ahead}.values():
+        base = load_finetune_recipe(config).value.base_checkpoint
+        if base is not None:
+            find_checkpoint(Path(base))
+
+
+def _unfinished(work: _Work) -> list[Finetuning]:
+    from vla_eval.training.run_folder import whole_checkpoints
+
+    found = []
+    for one in finetunings(work.table, work.out):
+        whole = whole_checkpoints(Path(str(one.config.out)))
+        if not whole or int(whole[-1].name) < work.table.steps:
+            found.append(one)
+    return found
+
+
+def _refuse_unfinished(work: _Work, config: str) -> None:
+    unfinished = _unfinished(work)
+    if unfinished:
+        names = [f"{one.row.name} on {one.task}, run seed {one.run_seed}" for one in unfinished[:3]]
+        more = f" and {len(unfinished) - 3} more" if len(unfinished) > 3 else ""
+        raise RecipeError(
+            f"{work.table.name}: not fine-tuned for {work.table.steps} steps yet: {'; '.join(names)}{more}. "
+            f"First: mikasa-vla finetune {config} --out {work.out}"
+        )
+
+
+def _record_tiny(work: _Work) -> None:
+    from vla_eval.data.recording import record
+    from vla_eval.training.tiny_table import tiny_dataset
+
+    _say(f"{work.table.name}: tiny random models on a stand-in for the simulator. The figures mean nothing.")
+    record(tiny_dataset(work.table), out=Path(work.table.datasets), command=_command())
+
+
+@contextlib.contextmanager
+def _tiny_models(work: _Work) -> Iterator[None]:
+    """Build lerobot's π0 in its tiny form if the table is a tiny one."""
+    if not work.adapters:
+        yield
+        return
+    from vla_eval.training.tiny_models import tiny_paligemma
+
+    with tiny_paligemma("pi0"):
+        yield
+
+
+def _free_memory() -> None:
+    """Give a GPU's memory back before the next model."""
+    import gc
+
+    import torch
+
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+def _refuse(args: argparse.Namespace, flags: Sequence[str]) -> None:
+    given = [f"--{name.replace('_', '-')}" for name in flags if getattr(args, name, None)]
+    if given:
+        raise RecipeError(
+            f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "
+            "./configs/ and change it there."
+        )
+
+
+def _command() -> str:
+    return shlex.join(["mikasa-vla", *sys.argv[1:]])
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

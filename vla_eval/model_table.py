@@ -1,0 +1,242 @@
+"""A table of learned policies: which fine-tunings and evaluations it takes, and where each of them lies.
+
+`configs/paper_vla_table.yaml` is one. A row is a policy at its own number of action steps; it is fine-tuned
+for each task and run seed by itself, and each such checkpoint is evaluated on the same seeds. Nothing is run
+here. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait for torch.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import yaml
+
+from vla_eval.envs.settings import Simulator
+from vla_eval.errors import RecipeError
+from vla_eval.policies.recipe import LEROBOT_ADAPTER
+from vla_eval.recipes import EvalConfig, PolicyRecipe, check_run_name, load_recipe, recipe_fields
+from vla_eval.results.durable import replace_file
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.training.recipe import FinetuneConfig
+
+Trained = Literal["all", "adapters", "heads"]
+
+FLOPS_PER_WEIGHT_AND_TOKEN: dict[Trained, int] = {"all": 6, "adapters": 4, "heads": 2}
+"""Forward pass 2, gradients of activations 2, gradients of weights 2; attention not counted.
+
+Source: Kaplan et al. 2020, "Scaling laws for neural language models", section 2.1. Adapters need the first
+two, heads on frozen features the first.
+"""
+SUSTAINED_TFLOPS = 100
+"""What a data-centre GPU is assumed to keep up in bfloat16; an assumption, not a measurement."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableRow:
+    """One row: a policy at one number of action steps.
+
+    Attributes:
+        name: what the table calls it.
+        policy: recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`.
+        n_action_steps: actions executed per inference.
+        parameters: weights that each sample goes through; for the estimate of GPU hours.
+        tokens: of a sample, likewise.
+        trained: likewise.
+    """
+
+    name: str
+    policy: str
+    n_action_steps: int
+    parameters: float
+    tokens: int
+    trained: Trained
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_run_name(self.name)
+        for name in ("n_action_steps", "parameters", "tokens"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"row {self.name}: {name} is {getattr(self, name)}, expected ≥ 1.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelTable:
+    """`configs/*.yaml` with `rows`: a table of learned policies. `docs/paper_table.md` explains it.
+
+    Attributes:
+        tasks: task ids; each row is fine-tuned for each of them.
+        datasets: folder with one dataset per task, named like the task.
+        steps: gradient steps of each fine-tuning.
+        run_seeds: one fine-tuning each; the SEM is over them.
+        episodes, seed_start: of each evaluation.
+        controls: scripted policies beside the rows, at every number of action steps of a row.
+        simulator: what the evaluations run on.
+        finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
+        allow_unreplayed: see `FinetuneConfig`.
+    """
+
+    name: str
+    tasks: tuple[str, ...]
+    datasets: str
+    rows: tuple[TableRow, ...]
+    steps: int
+    description: str = ""
+    run_seeds: tuple[int, ...] = (0,)
+    episodes: int = 100
+    seed_start: int = 1
+    controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
+    simulator: Simulator = "maniskill"
+    finetune: dict[str, Any] | None = None  # Any: decoded with each row's recipe
+    allow_unreplayed: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        check_run_name(self.name)
+        for name in ("steps", "episodes"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        for name, values in (
+            ("tasks", self.tasks),
+            ("rows", [row.name for row in self.rows]),
+            ("run_seeds", self.run_seeds),
+        ):
+            if not values or len(set(values)) != len(values):
+                raise RecipeError(f"{name} is {list(values)}, expected at least one, none of them twice.")
+        if set(self.controls) & {row.name for row in self.rows}:
+            raise RecipeError("rows and controls share a name; records tell them apart by it.")
+        for task in self.tasks:
+            task_spec(task)
+
+
+class Finetuning(NamedTuple):
+    """One fine-tuning of a table."""
+
+    row: TableRow
+    task: str
+    run_seed: int
+    config: FinetuneConfig
+
+
+def is_model_table(name: str) -> bool:
+    """Whether a configuration is a table of learned policies, and no evaluation.
+
+    Raises:
+        UnknownNameError, RecipeError: there is no such configuration, or it cannot be read.
+    """
+    return "rows" in recipe_fields("configs", name)
+
+
+def load_model_table(name: str) -> ModelTable:
+    """Read a table.
+
+    Raises:
+        UnknownNameError, RecipeError: see `load_recipe`.
+    """
+    return load_recipe("configs", name, ModelTable).value
+
+
+def finetunings(table: ModelTable, out: Path) -> tuple[Finetuning, ...]:
+    """Return every fine-tuning of a table, in a fixed order: rows, then tasks, then run seeds."""
+    return tuple(
+        Finetuning(
+            row=row,
+            task=task,
+            run_seed=run_seed,
+            config=FinetuneConfig(
+                policy=row.policy,
+                dataset=str(Path(table.datasets) / task),
+                out=str(out / "training" / row.name / task / f"run-{run_seed}"),
+                run_seed=run_seed,
+                finetune={"steps": table.steps, **(table.finetune or {})},
+                allow_unreplayed=table.allow_unreplayed,
+            ),
+        )
+        for row in table.rows
+        for task in table.tasks
+        for run_seed in table.run_seeds
+    )
+
+
+def evaluations(
+    table: ModelTable, out: Path, *, adapters: dict[str, str] | None = None
+) -> Iterator[tuple[Path, EvalConfig]]:
+    """Yield run folder and configuration of every evaluation: the controls first, then task by task.
+
+    The recipes that name the checkpoints are written to `out`: a row keeps its name and its number of action
+    steps, wherever its weights lie.
+
+    Args:
+        table: what to evaluate.
+        out: folder of the table.
+        adapters: row -> adapter where it is not lerobot's.
+    """
+    if table.controls:
+        yield out / "evaluation" / "controls", _evaluation(table, "controls", table.tasks, table.controls)
+    for task in table.tasks:
+        for run_seed in table.run_seeds:
+            name = f"{task}-run-{run_seed}"
+            own = adapters or {}
+            recipes = [
+                _write_recipe(table, out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
+                for row in table.rows
+            ]
+            yield out / "evaluation" / name, _evaluation(table, name, (task,), recipes)
+
+
+def _evaluation(table: ModelTable, name: str, tasks: Sequence[str], policies: Sequence[str]) -> EvalConfig:
+    is_controls = name == "controls"
+    return EvalConfig(
+        name=name,
+        tasks=tuple(tasks),
+        policies=tuple(policies),
+        # Chance and ceiling are those of the same number of action steps.
+        n_action_steps=tuple(sorted({row.n_action_steps for row in table.rows})) if is_controls else None,
+        episodes=table.episodes,
+        seed_start=table.seed_start,
+        simulator=table.simulator,
+    )
+
+
+def _write_recipe(table: ModelTable, out: Path, row: TableRow, task: str, run_seed: int, adapter: str) -> str:
+    folder = out / "policies" / f"{task}-run-{run_seed}"
+    checkpoint = out / "training" / row.name / task / f"run-{run_seed}"
+    recipe = {
+        "version": 1,
+        "description": f"{row.policy}, fine-tuned on {task} for {table.steps} steps, run seed {run_seed}.",
+        "adapter": adapter,
+        "args": {"checkpoint": str(checkpoint)},
+        "default_n_action_steps": row.n_action_steps,
+        "max_workers": load_recipe("policies", row.policy, PolicyRecipe).value.max_workers,
+    }
+    path = folder / f"{row.name}.yaml"
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_file(path, yaml.safe_dump(recipe, sort_keys=False, allow_unicode=True))
+    return str(path)
+
+
+def gpu_hours(row: TableRow, *, steps: int) -> float:
+    """Return a rough estimate of one fine-tuning's GPU hours, from operations alone.
+
+    Operations of a step over `SUSTAINED_TFLOPS`; loading and decoding are not counted. Good for telling a
+    day from a month.
+    """
+    recipe = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
+    if recipe is None:
+        raise RecipeError(f"policies/{row.policy}.yaml has no section `finetune`: there is nothing to train.")
+    per_step = FLOPS_PER_WEIGHT_AND_TOKEN[row.trained] * row.parameters * row.tokens * recipe.batch_size
+    return per_step * steps / (SUSTAINED_TFLOPS * 1e12) / 3600
+
+
+def describe_effort(table: ModelTable, *, n_finished: int) -> str:
+    """Return what is ahead, for a person."""
+    n_all = len(table.rows) * len(table.tasks) * len(table.run_seeds)
+    per_row = {row.name: gpu_hours(row, steps=table.steps) for row in table.rows}
+    total = sum(per_row.values()) * len(table.tasks) * len(table.run_seeds)
+    each = ", ".join(f"{name} {hours:.2g}" for name, hours in per_row.items())
+    return (
+        f"{table.name}: {n_all} fine-tunings ({len(table.rows)} rows, {len(table.tasks)} tasks, "
+        f"{len(table.run_seeds)} run seeds), {n_finished} of them finished. All of them take about "
+        f"{total:.0f} GPU hours at {SUSTAINED_TFLOPS} TFLOP/s (operations only, an assumption and no "
+        f"measurement; each: {each})."
+    )
