@@ -18,6 +18,7 @@ from vla_eval.cli.main import VERBS, build_parser, main
 from vla_eval.cli.show import task_arguments
 from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.decoding import decode
+from vla_eval.model_table import is_model_table, load_model_table
 from vla_eval.recipes import EvalConfig, PolicyRecipe, find_recipe, load_recipe
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_open_arguments
@@ -80,7 +81,9 @@ def check_task(name: str, env: dict[str, Any]) -> None:
 def check_names(args: argparse.Namespace) -> None:
     """Look up tasks, policies and recipes, and read what `--set` says, as the verb would do it."""
     verb = importlib.import_module(f"vla_eval.cli.{args.verb.replace('-', '_')}")
-    if args.verb == "eval":
+    if args.verb in ("eval", "finetune") and args.config is not None and is_model_table(args.config):
+        load_model_table(args.config)  # which looks up its tasks
+    elif args.verb == "eval":
         config = verb._config(args)
         for task in config.tasks:
             check_task(task, dict(config.env))
