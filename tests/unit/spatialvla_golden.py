@@ -42,6 +42,19 @@ SMALL = {
     "image_token": 36,
     "first_action_token": 40,
 }
+DEPTH = {
+    "depth_px": 64,
+    "depth_width": 32,
+    "depth_layers": 4,
+    "depth_heads": 2,
+    "depth_mlp": 64,
+    "depth_neck": 32,
+    "depth_fusion": 16,
+    "depth_features": 8,
+    "depth_embedding": 16,
+    "depth_bins": 16,
+}
+"""Sizes of a tiny depth model, for what the golden files do not hold."""
 SIZES = NetworkSizes(**SMALL)
 CHUNK = 4
 

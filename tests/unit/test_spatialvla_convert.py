@@ -11,11 +11,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.unit import spatialvla_golden as golden
-from tests.unit.test_spatialvla_depth import DEPTH
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.spatialvla.action_grid import AXES
+from vla_eval.policies.spatialvla.action_tokens import from_tokens
 from vla_eval.policies.spatialvla.convert import GRID_PARTS, ConvertOptions, convert_spatialvla
 from vla_eval.policies.spatialvla.depth import zoe_depth
 from vla_eval.policies.spatialvla.generation import generated_tokens
@@ -23,7 +23,7 @@ from vla_eval.policies.spatialvla.sizes import NetworkSizes
 from vla_eval.policies.spatialvla.weight_names import EMBEDDINGS, HEAD
 from vla_eval.policies.verify import verify_checkpoint
 
-SMALL = {**golden.SMALL, **DEPTH}
+SMALL = {**golden.SMALL, **golden.DEPTH}
 OPTIONS = ConvertOptions(sizes=SMALL, dtype="float32", unnorm_key="mikasa")
 
 
@@ -95,8 +95,6 @@ def test_a_converted_checkpoint_says_what_the_original_says(published: Path, tmp
         depth_is_finite = torch.isfinite(loaded.policy.network.depth(given.pictures[:, 0])).all()
     assert torch.equal(told.tokens, values["infer1.generated_ids"]) and depth_is_finite
     ids = values["unnorm.ids"].reshape(1, 4, 3)
-    from vla_eval.policies.spatialvla.action_tokens import from_tokens
-
     actions = loaded.postprocessor(from_tokens(ids, loaded.policy.grid, loaded.policy.network.sizes).float())
     expected = values["unnorm.actions"].float()
     torch.testing.assert_close(actions[0, :, :6], expected[:, :6], atol=golden.ELSEWHERE, rtol=0)

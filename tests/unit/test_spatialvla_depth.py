@@ -9,24 +9,12 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
-from tests.unit.spatialvla_golden import SMALL
+from tests.unit.spatialvla_golden import DEPTH, SMALL
 from vla_eval.policies.spatialvla.depth import PAD_PX, DepthModel, cut_depth, shown_pictures
 from vla_eval.policies.spatialvla.network import Inputs, Prompts, SpatialVLANetwork
 from vla_eval.policies.spatialvla.sizes import NetworkSizes
 from vla_eval.policies.steps.precision import default_dtype
 
-DEPTH = {
-    "depth_px": 64,
-    "depth_width": 32,
-    "depth_layers": 4,
-    "depth_heads": 2,
-    "depth_mlp": 64,
-    "depth_neck": 32,
-    "depth_fusion": 16,
-    "depth_features": 8,
-    "depth_embedding": 16,
-    "depth_bins": 16,
-}
 SIZES = NetworkSizes(**{**SMALL, **DEPTH})
 
 

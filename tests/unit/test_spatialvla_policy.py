@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.stats import norm
 
 from tests.unit import spatialvla_golden as golden
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import MissingInstructionError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.spatialvla.action_grid import uniform_grid
+from vla_eval.policies.spatialvla.action_tokens import to_tokens
 from vla_eval.policies.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
 from vla_eval.policies.spatialvla.grid_refit import refitted
 from vla_eval.policies.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
@@ -192,8 +194,6 @@ class TestGrid:
         normalized = before({**frames(1), "action": actions[None], "task": ["touch"]})["action"][0]
         roll = normalized[:, 3].double()
         mu, sigma = float(roll.mean()), max(float(roll.std(correction=0)), 0.01)
-        from scipy.stats import norm
-
         # Of four equally likely bins the middle edge is the median of what lies in [-1, 1].
         middle = norm.ppf((norm.cdf(-1, mu, sigma) + norm.cdf(1, mu, sigma)) / 2, mu, sigma)
         assert policy.grid.edges[3][2] == pytest.approx(middle, abs=1e-6)
@@ -259,8 +259,6 @@ class TestPolicy:
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        from vla_eval.policies.spatialvla.action_tokens import to_tokens
-
         told, sizes = policy.predict_action_chunk(batch), policy.network.sizes
         wanted = to_tokens(batch["action"], policy.grid, sizes)
         assert torch.equal(to_tokens(told, policy.grid, sizes), wanted)

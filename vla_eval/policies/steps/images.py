@@ -1,8 +1,9 @@
 """Pictures as TensorFlow's image functions make them: resize, crop, augment. Knows only torch.
 
 The published VLAs were trained on pictures resized by `tf.image.resize(method="lanczos3", antialias=True)`;
-PIL's filter of that name differs by up to 11 levels of 255 on hard edges. Pictures are (…, 3, height,
-width) float in levels [0, 255] here, unless a function says otherwise.
+PIL's filter of that name differs by up to 11 levels of 255 on hard edges. SpatialVLA's were resized by PIL's
+bicubic filter, which is here, too. Pictures are (…, 3, height, width) float in levels [0, 255] here, unless
+a function says otherwise.
 
 Source of the formulas: TensorFlow v2.19.1, tensorflow/core/kernels/image/{scale_and_translate_op.cc,
 sampling_kernels.h,crop_and_resize_op.cc}.
