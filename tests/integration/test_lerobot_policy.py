@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import importlib
 import json
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -50,6 +49,8 @@ from vla_eval.training.tiny_models import (
     write_tiny_tokenizer,
 )
 
+pytestmark = pytest.mark.usefixtures("no_network")
+
 TASK = "RememberColor3-v0"
 FAKE = EnvSettings(task=TASK, simulator="fake", cameras=("base_camera", "hand_camera"))
 BATCH_TOLERANCE = 1e-5  # float32, sums of some hundred terms in another order
@@ -59,14 +60,6 @@ STATISTICS_SHAPES = {
     "observation.state": (10,),
     "action": (7,),
 }
-
-
-@pytest.fixture(autouse=True)
-def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*args: Any) -> None:
-        raise AssertionError("a test tried to reach the network")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
 
 
 @pytest.fixture(scope="module")

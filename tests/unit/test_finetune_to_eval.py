@@ -1,7 +1,6 @@
 """From a dataset to a table by the two commands, for tiny π0, π0.5 and SmolVLA, without a network."""
 
 import json
-import socket
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +25,9 @@ FAKE = ["--set", "simulator=fake", "--set", "env.horizon_steps=6"]
 
 
 @pytest.fixture(autouse=True)
-def offline_with_a_cache_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: socket.socket, address: Any) -> None:
-        raise AssertionError(f"a test tried to reach {address}")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
+def offline_with_a_cache_of_its_own(
+    no_network: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
