@@ -10,6 +10,7 @@ from vla_eval import recipes
 from vla_eval.decoding import decode, load_yaml
 from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
 from vla_eval.job_queue import JobQueue
+from vla_eval.model_table import is_model_table, load_model_table
 from vla_eval.plan import fingerprint, make_plan, results_config
 from vla_eval.recipes import (
     EvalConfig,
@@ -169,7 +170,9 @@ class TestFinding:
     def test_every_recipe_that_is_shipped_can_be_read_and_planned(self) -> None:
         for name in list_recipes("policies"):
             assert load_recipe("policies", name, PolicyRecipe).value.description
-        for name in list_recipes("configs"):
+        tables = [name for name in list_recipes("configs") if is_model_table(name)]
+        assert tables == [load_model_table(name).name for name in tables] == ["paper_vla_table"]
+        for name in list_recipes("configs").keys() - set(tables):
             loaded = load_recipe("configs", name, EvalConfig).value
             assert loaded.name == name
             assert make_plan(loaded).jobs

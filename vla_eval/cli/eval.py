@@ -1,7 +1,6 @@
 """`mikasa-vla eval`: run an evaluation, or go on with it, and print its table."""
 
 import argparse
-import importlib
 import shlex
 import sys
 from collections.abc import Sequence
@@ -115,7 +114,9 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.results.store import read_run
 
     if args.config is not None and is_model_table(args.config):
-        return importlib.import_module("vla_eval.cli.model_table").evaluate_table(args)
+        from vla_eval.cli.model_table import evaluate_table
+
+        return evaluate_table(args)
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import importlib
 import shlex
 import sys
 from typing import Any
@@ -64,7 +63,9 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.training.finetune import finetune
 
     if args.config is not None and is_model_table(args.config):
-        return importlib.import_module("vla_eval.cli.model_table").finetune_table(args)
+        from vla_eval.cli.model_table import finetune_table
+
+        return finetune_table(args)
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
