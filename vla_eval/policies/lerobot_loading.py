@@ -5,6 +5,8 @@ answer a failed load with random weights. Here every parameter is compared with 
 Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
 """
 
+import importlib
+import importlib.util
 import os
 from collections.abc import Sequence
 
@@ -264,6 +266,7 @@ def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[An
     Raises:
         CheckpointError: one is missing, or names code or a tokenizer that is not there.
     """
+    _register_steps(config)
     described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
     before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
     overrides: dict[str, dict[str, Any]] = {}
@@ -294,6 +297,17 @@ def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[An
             f"recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
             f"HF_HUB_OFFLINE=0 is set."
         ) from exc
+
+
+def _register_steps(config: Any) -> None:
+    """Import the module in which a policy registers its processors' steps, found as lerobot names it.
+
+    lerobot imports it for a training only: a new process that evaluates a checkpoint would not know them.
+    """
+    module = type(config).__module__
+    name = module.replace("configuration_", "processor_")
+    if name != module and importlib.util.find_spec(name) is not None:
+        importlib.import_module(name)
 
 
 def _tokenizer(folder: Path, options: LoadOptions) -> str | None:
