@@ -1,6 +1,8 @@
 """Shared steps of ported policies: numbers of the original code, and nothing missing without an error."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -253,3 +255,19 @@ class TestTrainable:
         model.get_base_model().v.base_layer.weight.requires_grad_(True)
         with pytest.raises(TrainingError, match=r"v\.base_layer\.weight"):
             check_lora(model, "q|v", ["head"])
+
+
+REGISTERED = """
+from lerobot.processor import ProcessorStepRegistry
+from vla_eval.policies.lerobot_loading import config_class, register_steps
+for kind in ("mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"):
+    register_steps(config_class(kind, where="test"))
+print(*ProcessorStepRegistry.list())
+"""
+
+
+def test_a_new_process_knows_the_steps_of_every_ported_policy() -> None:
+    """One that has trained nothing: it evaluates a checkpoint."""
+    done = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True, check=True)
+    own = {"mikasa_encoder", "mikasa_decoder", "mikasa_openvla_prompt", "mikasa_spatialvla_prompt"}
+    assert own <= set(done.stdout.split())

@@ -266,7 +266,7 @@ def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[An
     Raises:
         CheckpointError: one is missing, or names code or a tokenizer that is not there.
     """
-    _register_steps(config)
+    register_steps(type(config))
     described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
     before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
     overrides: dict[str, dict[str, Any]] = {}
@@ -299,12 +299,12 @@ def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[An
         ) from exc
 
 
-def _register_steps(config: Any) -> None:
+def register_steps(cls: type) -> None:
     """Import the module in which a policy registers its processors' steps, found as lerobot names it.
 
     lerobot imports it for a training only: a new process that evaluates a checkpoint would not know them.
     """
-    module = type(config).__module__
+    module = cls.__module__
     name = module.replace("configuration_", "processor_")
     if name != module and importlib.util.find_spec(name) is not None:
         importlib.import_module(name)
