@@ -6,13 +6,10 @@ from vla_eval.tasks.catalog import TASKS
 
 SAMPLE = (
     "RememberColor9-v0",
-    "RememberShapeAndColor3x2-v0",
-    "BunchOfColors3-v0",
     "ChainOfColors3-v0",
     "ShellGameTouch-v0",
     "ShellGamePick-v0",
     "InterceptMedium-v0",
-    "InterceptGrabMedium-v0",
     "RotateStrictPosNeg-v0",
     "TakeItBack-v0",
 )
