@@ -64,7 +64,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
     _refuse(args, EVAL_FLAGS)
     work = _work(args)
     if args.tiny:
-        _record_tiny(work)
+        _record_tiny(work, allow_environment_change=args.allow_environment_change)
         _finetune(work, device="cpu", allow_unreplayed=True)
     _refuse_unfinished(work, args.config)
     command = _command()
@@ -163,12 +163,17 @@ def _refuse_unfinished(work: _Work, config: str) -> None:
         )
 
 
-def _record_tiny(work: _Work) -> None:
+def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
     from vla_eval.data.recording import record
     from vla_eval.training.tiny_table import tiny_dataset
 
     _say(f"{work.table.name}: tiny random models on a stand-in for the simulator. The figures mean nothing.")
-    record(tiny_dataset(work.table), out=Path(work.table.datasets), command=_command())
+    record(
+        tiny_dataset(work.table),
+        out=Path(work.table.datasets),
+        command=_command(),
+        allow_environment_change=allow_environment_change,
+    )
 
 
 @contextlib.contextmanager
