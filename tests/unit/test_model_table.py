@@ -122,6 +122,7 @@ def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.
     assert "--tiny" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_figures(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
