@@ -1,5 +1,6 @@
 """A table of learned policies: what it takes, what is missing of it, and all of it with tiny models."""
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,8 @@ from typing import Any
 import pytest
 import yaml
 
-from vla_eval.cli.main import main
+from vla_eval.cli.main import build_parser, main
+from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.errors import VlaEvalError
 from vla_eval.model_table import (
     ModelTable,
@@ -22,6 +24,20 @@ from vla_eval.results.paper_table import PAPER_TABLE
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
+USED = {
+    "eval": {
+        "out",
+        "workers",
+        "allow_environment_change",
+        "format",
+        "baseline",
+        "paper",
+        "tiny",
+        "html",
+        "help",
+    },
+    "finetune": {"out", "device", "allow_unreplayed", "help"},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -120,6 +136,35 @@ def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.
     assert "--episodes" in capsys.readouterr().err
     assert main(["eval", "demo", "--tiny"]) == 1
     assert "--tiny" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("eval", "--task", TASK),
+        ("eval", "--seed-start", "0"),
+        ("eval", "--set", "runs=2"),
+        ("finetune", "--run-seed", "0"),
+        ("finetune", "--eval-episodes", "3"),
+        ("finetune", "--set", "batch_size=2"),
+    ],
+)
+def test_no_flag_is_passed_over(
+    small: Path, tmp_path: Path, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, flag, value = flags
+    assert main([verb, str(small), flag, value, "--out", str(tmp_path / "out")]) == 1
+    assert f"{flag}: a table of learned policies sets this itself" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("verb", "refused"), [("eval", EVAL_FLAGS), ("finetune", FINETUNE_FLAGS)])
+def test_a_flag_is_refused_or_used(verb: str, refused: dict[str, str]) -> None:
+    (choices,) = [
+        a.choices for a in build_parser((verb,))._actions if isinstance(a, argparse._SubParsersAction)
+    ]
+    flags = {action.dest: action.option_strings for action in choices[verb]._actions if action.option_strings}
+    assert all(flag in flags[name] for name, flag in refused.items())
+    assert flags.keys() - refused.keys() == USED[verb]
 
 
 @pytest.mark.slow

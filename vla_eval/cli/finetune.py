@@ -59,13 +59,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 def run(args: argparse.Namespace) -> int:
     """Fine-tune; lines for a person go to standard error, the checkpoint's folder to standard output."""
-    # Here and not above: `mikasa-vla --help` need not wait for torch.
-    from vla_eval.training.finetune import finetune
-
     if args.config is not None and is_model_table(args.config):
         from vla_eval.cli.model_table import finetune_table
 
         return finetune_table(args)
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from vla_eval.training.finetune import finetune
+
     command = shlex.join(["mikasa-vla", *sys.argv[1:]])
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,11 +21,29 @@ from vla_eval.model_table import (
 )
 
 RUNS_FOLDER = Path("runs")
-FINETUNE_FLAGS = ("policy", "dataset", "steps", "batch_size", "run_seed", "base_checkpoint", "eval_every")
-EVAL_FLAGS = (
-    *("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "overrides"),
-    *("record_video", "record_rrd"),
-)
+FINETUNE_FLAGS = {
+    "policy": "--policy",
+    "dataset": "--dataset",
+    "steps": "--steps",
+    "batch_size": "--batch-size",
+    "run_seed": "--run-seed",
+    "base_checkpoint": "--base-checkpoint",
+    "eval_every": "--eval-every",
+    "eval_episodes": "--eval-episodes",
+    "overrides": "--set",
+}
+EVAL_FLAGS = {
+    "tasks": "--task",
+    "policies": "--policy",
+    "n_action_steps": "--n-action-steps",
+    "episodes": "--episodes",
+    "seed_start": "--seed-start",
+    "runs": "--runs",
+    "overrides": "--set",
+    "record_video": "--record-video",
+    "record_rrd": "--record-rrd",
+}
+"""Flags that a table does not take, by the name of their value."""
 
 
 class _Work(NamedTuple):
@@ -199,8 +217,8 @@ def _free_memory() -> None:
         torch.cuda.empty_cache()
 
 
-def _refuse(args: argparse.Namespace, flags: Sequence[str]) -> None:
-    given = [f"--{name.replace('_', '-')}" for name in flags if getattr(args, name, None)]
+def _refuse(args: argparse.Namespace, flags: Mapping[str, str]) -> None:
+    given = [flag for name, flag in flags.items() if getattr(args, name) not in (None, [])]
     if given:
         raise RecipeError(
             f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "
