@@ -1,12 +1,11 @@
 """`mikasa-vla audit`: which tasks can be won without remembering?"""
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
 from vla_eval.decoding import decode
 from vla_eval.recipes import EvalConfig, apply_overrides
 
@@ -66,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluate import evaluate
 
     configs = _configs(args)
-    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    command = typed_command()
     with stop_on_signals() as stop:
         n_errors = 0
         for config in configs:

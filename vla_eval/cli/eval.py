@@ -1,13 +1,12 @@
 """`mikasa-vla eval`: run an evaluation, or go on with it, and print its table."""
 
 import argparse
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.model_table import is_model_table
@@ -121,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
     _check_baseline(args.baseline, config)
-    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    command = typed_command()
     out = args.out or default_run_folder(config)
     with stop_on_signals() as stop:
         progress = Progress(stop, out=str(out))

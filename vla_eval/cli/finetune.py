@@ -2,10 +2,10 @@
 
 import argparse
 import contextlib
-import shlex
 import sys
 from typing import Any
 
+from vla_eval.cli.arguments import typed_command
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError
 from vla_eval.model_table import is_model_table
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.training.finetune import finetune
 
-    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    command = typed_command()
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
     print(summary.checkpoint)

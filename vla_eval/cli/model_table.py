@@ -2,14 +2,13 @@
 
 import argparse
 import contextlib
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
 from vla_eval.errors import RecipeError
 from vla_eval.model_table import (
     Finetuning,
@@ -85,7 +84,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
         _record_tiny(work, allow_environment_change=args.allow_environment_change)
         _finetune(work, device="cpu", allow_unreplayed=True)
     _refuse_unfinished(work, args.config)
-    command = _command()
+    command = typed_command()
     n_errors, folders = 0, []
     with stop_on_signals() as stop, _tiny_models(work):
         for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
@@ -138,7 +137,7 @@ def _finetune(work: _Work, *, device: str, allow_unreplayed: bool) -> None:
             _say(f"[{index + 1}/{len(unfinished)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
             allowed = allow_unreplayed or one.config.allow_unreplayed
             config = replace(one.config, device=device, allow_unreplayed=allowed)
-            finetune(config, command=_command(), say=_say)
+            finetune(config, command=typed_command(), say=_say)
             _free_memory()
 
 
@@ -189,7 +188,7 @@ def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
     record(
         tiny_dataset(work.table),
         out=Path(work.table.datasets),
-        command=_command(),
+        command=typed_command(),
         allow_environment_change=allow_environment_change,
     )
 
@@ -224,10 +223,6 @@ def _refuse(args: argparse.Namespace, flags: Mapping[str, str]) -> None:
             f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "
             "./configs/ and change it there."
         )
-
-
-def _command() -> str:
-    return shlex.join(["mikasa-vla", *sys.argv[1:]])
 
 
 def _say(line: str) -> None:

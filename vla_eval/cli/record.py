@@ -1,12 +1,11 @@
 """`mikasa-vla record`: record demonstrations, or go on with it."""
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import workers_argument
+from vla_eval.cli.arguments import typed_command, workers_argument
 from vla_eval.data.recipe import DatasetRecipe, fingerprint
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError
@@ -67,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.data.recording import record
 
     recipe = _recipe(args)
-    command = shlex.join(["mikasa-vla", *sys.argv[1:]])
+    command = typed_command()
     out = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
     with stop_on_signals() as stop:
         progress = RecordingProgress(stop)
