@@ -146,7 +146,7 @@ def finetunings(table: ModelTable, out: Path) -> tuple[Finetuning, ...]:
             config=FinetuneConfig(
                 policy=row.policy,
                 dataset=str(Path(table.datasets) / task),
-                out=str(out / "training" / row.name / task / f"run-{run_seed}"),
+                out=str(_training_folder(out, row, task, run_seed)),
                 run_seed=run_seed,
                 finetune={"steps": table.steps, **(table.finetune or {})},
                 allow_unreplayed=table.allow_unreplayed,
@@ -156,6 +156,10 @@ def finetunings(table: ModelTable, out: Path) -> tuple[Finetuning, ...]:
         for task in table.tasks
         for run_seed in table.run_seeds
     )
+
+
+def _training_folder(out: Path, row: TableRow, task: str, run_seed: int) -> Path:
+    return out / "training" / row.name / task / f"run-{run_seed}"
 
 
 def evaluations(
@@ -172,11 +176,14 @@ def evaluations(
         adapters: row -> adapter where it is not lerobot's.
     """
     if table.controls:
-        yield out / "evaluation" / "controls", _evaluation(table, "controls", table.tasks, table.controls)
+        # Chance and ceiling are those of the same number of action steps.
+        steps = tuple(sorted({row.n_action_steps for row in table.rows}))
+        config = _evaluation(table, "controls", table.tasks, table.controls, n_action_steps=steps)
+        yield out / "evaluation" / config.name, config
+    own = adapters or {}
     for task in table.tasks:
         for run_seed in table.run_seeds:
             name = f"{task}-run-{run_seed}"
-            own = adapters or {}
             recipes = [
                 _write_recipe(table, out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
                 for row in table.rows
@@ -184,14 +191,18 @@ def evaluations(
             yield out / "evaluation" / name, _evaluation(table, name, (task,), recipes)
 
 
-def _evaluation(table: ModelTable, name: str, tasks: Sequence[str], policies: Sequence[str]) -> EvalConfig:
-    is_controls = name == "controls"
+def _evaluation(
+    table: ModelTable,
+    name: str,
+    tasks: Sequence[str],
+    policies: Sequence[str],
+    n_action_steps: tuple[int, ...] | None = None,
+) -> EvalConfig:
     return EvalConfig(
         name=name,
         tasks=tuple(tasks),
         policies=tuple(policies),
-        # Chance and ceiling are those of the same number of action steps.
-        n_action_steps=tuple(sorted({row.n_action_steps for row in table.rows})) if is_controls else None,
+        n_action_steps=n_action_steps,
         episodes=table.episodes,
         seed_start=table.seed_start,
         simulator=table.simulator,
@@ -200,12 +211,11 @@ def _evaluation(table: ModelTable, name: str, tasks: Sequence[str], policies: Se
 
 def _write_recipe(table: ModelTable, out: Path, row: TableRow, task: str, run_seed: int, adapter: str) -> str:
     folder = out / "policies" / f"{task}-run-{run_seed}"
-    checkpoint = out / "training" / row.name / task / f"run-{run_seed}"
     recipe = {
         "version": 1,
         "description": f"{row.policy}, fine-tuned on {task} for {table.steps} steps, run seed {run_seed}.",
         "adapter": adapter,
-        "args": {"checkpoint": str(checkpoint)},
+        "args": {"checkpoint": str(_training_folder(out, row, task, run_seed))},
         "default_n_action_steps": row.n_action_steps,
         "max_workers": load_recipe("policies", row.policy, PolicyRecipe).value.max_workers,
     }

@@ -61,8 +61,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit import read_audit
     from vla_eval.audit_table import render_audit
-    from vla_eval.cli.progress import Progress, stop_on_signals
-    from vla_eval.evaluate import evaluate
+    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
     configs = _configs(args)
     command = typed_command()
@@ -70,11 +69,7 @@ def run(args: argparse.Namespace) -> int:
         n_errors = 0
         for config in configs:
             out = args.out / config.name
-            progress = Progress(stop, out=str(out))
-            try:
-                summary = evaluate(config, out=out, command=command, observer=progress)
-            finally:
-                progress.close()
+            summary = evaluate_with_progress(config, out=out, command=command, stop=stop)
             n_errors += summary.n_errors
             if summary.was_stopped:
                 print(f"Stopped. To go on: {command}", file=sys.stderr)

@@ -108,8 +108,8 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.cli.progress import Progress, stop_on_signals
-    from vla_eval.evaluate import default_run_folder, evaluate
+    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
+    from vla_eval.evaluate import default_run_folder
     from vla_eval.results.store import read_run
 
     if args.config is not None and is_model_table(args.config):
@@ -119,21 +119,17 @@ def run(args: argparse.Namespace) -> int:
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
-    _check_baseline(args.baseline, config)
+    check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
     out = args.out or default_run_folder(config)
     with stop_on_signals() as stop:
-        progress = Progress(stop, out=str(out))
-        try:
-            summary = evaluate(
-                config,
-                out=out,
-                command=command,
-                allow_environment_change=args.allow_environment_change,
-                observer=progress,
-            )
-        finally:
-            progress.close()
+        summary = evaluate_with_progress(
+            config,
+            out=out,
+            command=command,
+            stop=stop,
+            allow_environment_change=args.allow_environment_change,
+        )
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
         print(
@@ -174,9 +170,12 @@ def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
     print(f"Report page: {page}", file=sys.stderr)
 
 
-def _check_baseline(baseline: str | None, config: EvalConfig) -> None:
-    """Refuse a baseline that is not evaluated: now, and not when the night is over."""
-    policies = [policy_name(policy) for policy in config.policies]
+def check_baseline(baseline: str | None, policies: "Sequence[str]") -> None:
+    """Refuse a baseline that is not evaluated: now, and not when the night is over.
+
+    Raises:
+        UnknownNameError: it is none of the policies.
+    """
     if baseline is not None and baseline not in policies:
         raise unknown_name("policy", baseline, policies, where="--baseline")
 

@@ -73,33 +73,29 @@ def evaluate_table(args: argparse.Namespace) -> int:
     Raises:
         VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
     """
-    from vla_eval.cli.eval import print_table, write_html
-    from vla_eval.cli.progress import Progress, stop_on_signals
-    from vla_eval.evaluate import evaluate
+    from vla_eval.cli.eval import check_baseline, print_table, write_html
+    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.results.store import read_run
 
     _refuse(args, EVAL_FLAGS)
     work = _work(args)
+    check_baseline(args.baseline, [*work.table.controls, *(row.name for row in work.table.rows)])
     if args.tiny:
         _record_tiny(work, allow_environment_change=args.allow_environment_change)
-        _finetune(work, device="cpu", allow_unreplayed=True)
+        _finetune(work, device="cpu")
     _refuse_unfinished(work, args.config)
     command = typed_command()
     n_errors, folders = 0, []
     with stop_on_signals() as stop, _tiny_models(work):
         for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
             config = replace(config, workers=1 if args.tiny else (args.workers or config.workers))
-            progress = Progress(stop, out=str(folder))
-            try:
-                summary = evaluate(
-                    config,
-                    out=folder,
-                    command=command,
-                    allow_environment_change=args.allow_environment_change,
-                    observer=progress,
-                )
-            finally:
-                progress.close()
+            summary = evaluate_with_progress(
+                config,
+                out=folder,
+                command=command,
+                stop=stop,
+                allow_environment_change=args.allow_environment_change,
+            )
             if summary.was_stopped:
                 print(f"Stopped. To go on: {command}", file=sys.stderr)
                 return stop.exit_code
@@ -124,7 +120,7 @@ def _work(args: argparse.Namespace) -> _Work:
     return _Work(tiny, out, adapters)
 
 
-def _finetune(work: _Work, *, device: str, allow_unreplayed: bool) -> None:
+def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> None:
     """Run one fine-tuning after the other."""
     from vla_eval.training.finetune import finetune
 

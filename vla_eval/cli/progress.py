@@ -6,12 +6,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from tqdm import tqdm
 
+from vla_eval.evaluate import EvaluationSummary, evaluate
 from vla_eval.plan import Plan
+from vla_eval.recipes import EvalConfig
 from vla_eval.results.records import EpisodeRecord
 
 LINE_EVERY_SECONDS = 60.0
@@ -54,6 +57,27 @@ def stop_on_signals() -> Iterator[StopRequest]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def evaluate_with_progress(
+    config: EvalConfig, *, out: Path, command: str, stop: StopRequest, allow_environment_change: bool = False
+) -> EvaluationSummary:
+    """Run an evaluation, say on standard error how far it has come, and end early if asked to stop.
+
+    Raises:
+        VlaEvalError: see `evaluate`.
+    """
+    progress = Progress(stop, out=str(out))
+    try:
+        return evaluate(
+            config,
+            out=out,
+            command=command,
+            allow_environment_change=allow_environment_change,
+            observer=progress,
+        )
+    finally:
+        progress.close()
 
 
 class Progress:
