@@ -12,7 +12,6 @@ from vla_eval.cli.main import build_parser, main
 from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.errors import VlaEvalError
 from vla_eval.model_table import (
-    ModelTable,
     evaluations,
     finetunings,
     gpu_hours,
@@ -185,7 +184,3 @@ def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_fig
     assert main(arguments) == 0  # everything is there
     again = capsys.readouterr()
     assert json.loads(again.out) == told and "[1/" not in again.err
-
-
-def test_the_configuration_is_a_table(small: Path) -> None:
-    assert isinstance(load_model_table(str(small)), ModelTable)

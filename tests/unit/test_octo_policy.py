@@ -351,7 +351,7 @@ def frames(slot: int, first: int, stop: int) -> tuple[Observation, ...]:
 
 
 def in_float64(policy: LeRobotPolicy) -> LeRobotPolicy:
-    """So that what is left of a difference is float32 of the actions, not twenty rounded steps of diffusion."""
+    """So that a difference is no more than float32 of the actions: twenty steps add up rounding."""
     network: Any = policy._loaded.policy
     network.double()
     pictures = network._pictures

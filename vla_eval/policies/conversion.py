@@ -3,8 +3,9 @@
 No code of the checkpoint is run, and only safetensors are read here. The result is a whole folder or none.
 """
 
+import contextlib
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any  # JSON, lerobot and transformers
 
@@ -28,6 +29,21 @@ def check_free(out: Path) -> None:
     """
     if out.exists():
         raise CheckpointError(f"{out} exists already. Name another folder.")
+
+
+@contextlib.contextmanager
+def folder_when_whole(out: Path) -> Iterator[Path]:
+    """Give a folder to write into, which gets its name once everything is in it.
+
+    Raises:
+        CheckpointError: `out` exists.
+    """
+    check_free(out)
+    partial = out.with_name(f".partial-{out.name}")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    yield partial
+    partial.rename(out)
 
 
 def read_safetensors(source: Path) -> dict[str, Tensor]:
@@ -99,19 +115,17 @@ def write_checkpoint(
         check_tokenizer: is given the tokenizer, and raises if it is not the model's.
 
     Raises:
-        CheckpointError: there is no tokenizer.
+        CheckpointError: there is no tokenizer, or `out` exists.
     """
-    partial = out.with_name(f".partial-{out.name}")
-    shutil.rmtree(partial, ignore_errors=True)
-    policy.config.tokenizer_name = str(_copy_tokenizer(source, partial / TOKENIZER_FOLDER))
-    processors = make_processors()
-    steps = (step for step in processors[0].steps if hasattr(step, "input_tokenizer"))
-    check_tokenizer(next(steps).input_tokenizer)
-    policy.config.tokenizer_name = str(out / TOKENIZER_FOLDER)
-    policy.save_pretrained(partial)
-    for processor in processors:
-        processor.save_pretrained(partial)
-    partial.rename(out)
+    with folder_when_whole(out) as partial:
+        policy.config.tokenizer_name = str(_copy_tokenizer(source, partial / TOKENIZER_FOLDER))
+        processors = make_processors()
+        steps = (step for step in processors[0].steps if hasattr(step, "input_tokenizer"))
+        check_tokenizer(next(steps).input_tokenizer)
+        policy.config.tokenizer_name = str(out / TOKENIZER_FOLDER)
+        policy.save_pretrained(partial)
+        for processor in processors:
+            processor.save_pretrained(partial)
     return out
 
 

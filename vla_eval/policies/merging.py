@@ -15,6 +15,7 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
+from vla_eval.policies.conversion import check_free, folder_when_whole
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, read_config
 
 NOT_COPIED = (ADAPTER_CONFIG_FILE, ADAPTER_WEIGHTS_FILE, "README.md", "train_config.json")
@@ -37,14 +38,14 @@ def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, 
     folder = find_checkpoint(path)
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         raise CheckpointError(f"{folder}: expected a LoRA adapter, found no LoRA adapter but a whole model.")
-    if out.exists():
-        raise CheckpointError(f"{out} exists already. Name another folder.")
+    check_free(out)
     options = LoadOptions(device=device, base_checkpoint=base_checkpoint)
     config = read_config(folder, options)
     merged = load_weights(folder, config, options).merge_and_unload()
-    shutil.copytree(folder, out, ignore=shutil.ignore_patterns(*NOT_COPIED))
     described = {**read_json(folder / CONFIG_FILE), "use_peft": False, "pretrained_path": None}
-    (out / CONFIG_FILE).write_text(f"{json.dumps(described, indent=4)}\n", encoding="utf-8")
     weights = {name: tensor.cpu().contiguous() for name, tensor in merged.state_dict().items()}
-    save_file(weights, out / WEIGHTS_FILE)
+    with folder_when_whole(out) as partial:
+        shutil.copytree(folder, partial, ignore=shutil.ignore_patterns(*NOT_COPIED), dirs_exist_ok=True)
+        (partial / CONFIG_FILE).write_text(f"{json.dumps(described, indent=4)}\n", encoding="utf-8")
+        save_file(weights, partial / WEIGHTS_FILE)
     return out

@@ -9,6 +9,7 @@ from torch import Tensor
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
+from vla_eval.policies.conversion import check_free, folder_when_whole
 from vla_eval.policies.lerobot_loading import make_empty_policy, save_tokenizer
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
 from vla_eval.policies.octo.flax_names import from_flax
@@ -36,26 +37,26 @@ def convert(
 
     Args:
         source: the original's folder: parameters and `dataset_statistics.json`.
-        out: an empty folder, or none.
+        out: a folder that is not there yet.
         fields: of `MikasaOctoConfig`, such as `SIZES["small"]`.
         dataset: which statistics, where there are several.
         tokenizer: folder of T5's tokenizer; None: the one that the configuration names, from the cache.
 
     Raises:
-        CheckpointError: something lacks, is too much, or `out` holds something.
+        CheckpointError: something lacks, is too much, or `out` exists.
     """
-    if out.exists() and any(out.iterdir()):
-        raise CheckpointError(f"{out}: expected an empty folder. Name another one with --out.")
+    check_free(out)
     named = {"tokenizer_name": tokenizer} if tokenizer is not None else {}
     config = octo_config({**fields, **named})
     statistics = read_statistics(source if source.is_dir() else source.parent, dataset=dataset)
     policy = make_empty_policy(config)
     put_weights(policy, _with_shared(policy, from_flax(read_parameters(source))), where=str(source))
     before, after = make_mikasa_octo_pre_post_processors(config, {ACTION_KEY: dict(statistics)})
-    policy.save_pretrained(out)
-    before.save_pretrained(out)
-    after.save_pretrained(out)
-    save_tokenizer(before, out / TOKENIZER_FOLDER)
+    with folder_when_whole(out) as partial:
+        policy.save_pretrained(partial)
+        before.save_pretrained(partial)
+        after.save_pretrained(partial)
+        save_tokenizer(before, partial / TOKENIZER_FOLDER)
     return out
 
 
