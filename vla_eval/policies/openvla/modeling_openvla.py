@@ -1,27 +1,26 @@
 """OpenVLA and OpenVLA-OFT as a LeRobot policy: loss of a chunk, chunks of several episodes at once."""
 
-from collections import deque
 from typing import Any  # lerobot and transformers are untyped
 
 import torch
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
-from vla_eval.errors import SpecMismatchError, TrainingError
+from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
 from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
 from vla_eval.policies.openvla.lora import FULL_MODULES
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
 from vla_eval.policies.openvla.prompt import finished
+from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
 from vla_eval.policies.steps.precision import default_dtype
 
 PADDING_KEY = "action_is_pad"
 
 
-class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
     """See `MikasaOpenVLAConfig`."""
 
     config_class = MikasaOpenVLAConfig
@@ -44,18 +43,10 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
                 part.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
         self.reset()
 
-    def get_optim_params(self) -> Any:
-        """Return the parameters that are trained."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
-    def reset(self) -> None:
-        """Forget what lerobot's own loop has not executed yet."""
-        self._queue: deque[Tensor] = deque()
-
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         actions = batch[ACTION_KEY].float()
-        counts = self._counts(batch, actions)
+        counts = self._counts(batch.get(PADDING_KEY), actions)
         inputs = self._inputs(batch, changed=self.training)
         if self.config.head != "l1":
             loss = token_loss(self.network, inputs, actions, counts)
@@ -73,18 +64,6 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
             return self.network.actions(inputs)
         told = generated_actions if self.config.head == "tokens" else parallel_actions
         return told(self.network, inputs)
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return (B, action) for lerobot's own loop: the first `n_action_steps` of each chunk in turn."""
-        if not self._queue:
-            chunk = self.predict_action_chunk(batch)
-            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
-        return self._queue.popleft()
-
-    def _get_default_peft_targets(self) -> dict[str, Any]:
-        """Tell lerobot what LoRA trains."""
-        return self.config.lora_defaults()
 
     def _inputs(self, batch: dict[str, Tensor], *, changed: bool) -> Inputs:
         proprio = batch[STATE_KEY] if self.config.use_proprio else None
@@ -106,23 +85,4 @@ class MikasaOpenVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is
         return torch.stack(pictures, dim=1)
 
     def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
-        ids, mask = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
-        if ids.shape[1] > self.config.prompt_max_tokens:
-            raise SpecMismatchError(
-                f"'{TYPE}': a prompt has {ids.shape[1]} tokens, expected at most "
-                f"{self.config.prompt_max_tokens} (prompt_max_tokens)."
-            )
-        return finished(ids, mask, self.network.sizes)
-
-    def _counts(self, batch: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Return (B, chunk) float: 0 for actions beyond an episode's end."""
-        is_pad = batch.get(PADDING_KEY)
-        if is_pad is None:
-            return torch.ones(actions.shape[:2], device=actions.device)
-        if not self.config.do_mask_loss_for_padding and bool(is_pad.any()):
-            raise TrainingError(
-                f"'{TYPE}': a chunk goes beyond its episode's end. Train with a sampler that leaves out the "
-                f"last drop_n_last_frames ({self.config.drop_n_last_frames}) frames, as `mikasa-vla "
-                "finetune` does, or set do_mask_loss_for_padding."
-            )
-        return (~is_pad).float()
+        return finished(*self._prompt(batch), self.network.sizes)

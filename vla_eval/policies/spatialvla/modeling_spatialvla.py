@@ -1,28 +1,27 @@
 """SpatialVLA as a LeRobot policy: loss of a chunk, chunks of several episodes at once."""
 
-from collections import deque
 from typing import Any  # lerobot and transformers are untyped
 
 import torch
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY
-from vla_eval.errors import SpecMismatchError, TrainingError
+from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.policies.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
 from vla_eval.policies.spatialvla.generation import generated_actions, token_loss
 from vla_eval.policies.spatialvla.grid_refit import refitted
 from vla_eval.policies.spatialvla.network import Inputs, Prompts, SpatialVLANetwork
 from vla_eval.policies.spatialvla.prompt import finished
+from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, resize_bicubic
 from vla_eval.policies.steps.precision import default_dtype
 
 PADDING_KEY = "action_is_pad"
 
 
-class MikasaSpatialVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
     """See `MikasaSpatialVLAConfig`."""
 
     config_class = MikasaSpatialVLAConfig
@@ -61,19 +60,11 @@ class MikasaSpatialVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot
         for table in (network.spatial_embed_tokens.weight, told):
             table.copy_(refitted(table, former, self.grid))
 
-    def get_optim_params(self) -> Any:
-        """Return the parameters that are trained."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
-    def reset(self) -> None:
-        """Forget what lerobot's own loop has not executed yet."""
-        self._queue: deque[Tensor] = deque()
-
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         actions = batch[ACTION_KEY].float()
         attention = self.config.attention(training=True)
-        counts = self._counts(batch, actions)
+        counts = self._counts(batch.get(PADDING_KEY), actions)
         loss = token_loss(self.network, self.grid, self._inputs(batch), actions, counts, attention)
         return loss, {"cross_entropy": loss.item()}
 
@@ -85,18 +76,6 @@ class MikasaSpatialVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot
         return generated_actions(
             self.network, self.grid, self._inputs(batch), chunk=chunk, attention=attention
         )
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return (B, action) for lerobot's own loop: the first `n_action_steps` of each chunk in turn."""
-        if not self._queue:
-            chunk = self.predict_action_chunk(batch)
-            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
-        return self._queue.popleft()
-
-    def _get_default_peft_targets(self) -> dict[str, Any]:
-        """Tell lerobot what LoRA trains."""
-        return self.config.lora_defaults()
 
     def _inputs(self, batch: dict[str, Tensor]) -> Inputs:
         """Return pictures, resized as PIL does it, the matrices of their cameras, and prompts."""
@@ -115,23 +94,4 @@ class MikasaSpatialVLAPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot
         return Inputs(shown, cameras, self._prompts(batch))
 
     def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
-        ids, mask = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
-        if ids.shape[1] > self.config.prompt_max_tokens:
-            raise SpecMismatchError(
-                f"'{TYPE}': a prompt has {ids.shape[1]} tokens, expected at most "
-                f"{self.config.prompt_max_tokens} (prompt_max_tokens)."
-            )
-        return finished(ids, mask, self.network.sizes)
-
-    def _counts(self, batch: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Return (B, chunk) float: 0 for actions beyond an episode's end."""
-        is_pad = batch.get(PADDING_KEY)
-        if is_pad is None:
-            return torch.ones(actions.shape[:2], device=actions.device)
-        if not self.config.do_mask_loss_for_padding and bool(is_pad.any()):
-            raise TrainingError(
-                f"'{TYPE}': a chunk goes beyond its episode's end. Train with a sampler that leaves out the "
-                f"last drop_n_last_frames ({self.config.drop_n_last_frames}) frames, as `mikasa-vla "
-                "finetune` does, or set do_mask_loss_for_padding."
-            )
-        return (~is_pad).float()
+        return finished(*self._prompt(batch), self.network.sizes)
