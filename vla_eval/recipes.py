@@ -16,11 +16,11 @@ from vla_eval.decoding import decode, find_field, load_yaml
 from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.shipped import search_folders
 from vla_eval.training.recipe import FinetuneRecipe
 from vla_eval.viz.settings import RecordingConfig
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
-PACKAGE_ROOT = Path(__file__).parent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,10 +185,7 @@ def check_run_name(name: str) -> None:
 
 def recipe_folders(folder: Folder) -> tuple[Path, ...]:
     """Return the folders that recipes of a kind are looked for in, in this order."""
-    packaged = PACKAGE_ROOT / "recipes_data" / folder
-    # An editable checkout has no recipes_data: its recipes lie beside the package.
-    shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / folder
-    return tuple(dict.fromkeys((Path.cwd() / folder, shipped)))
+    return search_folders(folder)
 
 
 def list_recipes(folder: Folder) -> dict[str, Path]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vla_eval import recipes
+from vla_eval import shipped
 from vla_eval.decoding import decode, load_yaml
 from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
 from vla_eval.job_queue import JobQueue
@@ -153,7 +153,7 @@ class TestFinding:
         data = tmp_path / "site" / "vla_eval" / "recipes_data" / "prompts"
         data.mkdir(parents=True)
         (data / "other.yaml").write_text("")
-        monkeypatch.setattr(recipes, "PACKAGE_ROOT", tmp_path / "site" / "vla_eval")
+        monkeypatch.setattr(shipped, "PACKAGE_ROOT", tmp_path / "site" / "vla_eval")
         monkeypatch.chdir(tmp_path)
 
         assert list_recipes("prompts") == {"other": data / "other.yaml"}

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.decoding import decode
-from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.shipped import search_folders
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -30,6 +31,7 @@ INSIDE = (
     Path("checkpoints/last") / MODEL_FOLDER,
     Path("train/checkpoints/last") / MODEL_FOLDER,
 )
+SHIPPED_FOLDER = "checkpoints"
 FACTS_VERSION = 1
 """Of `mikasa_training.json`. Raise it when a field changes its meaning."""
 CHUNK_BYTES = 1 << 20
@@ -68,11 +70,16 @@ class TrainingFacts:
 def find_checkpoint(path: Path) -> Path:
     """Return the folder with the weights, given that folder, a checkpoint, or a fine-tuning run.
 
+    Args:
+        path: the folder; or the name alone of one in `checkpoints/`, the user's or the package's.
+
     Raises:
         CheckpointError: there is none.
     """
-    for inside in INSIDE:
-        folder = path / inside
+    places = [path]
+    if path.name == str(path):
+        places += [folder / path for folder in search_folders(SHIPPED_FOLDER)]
+    for folder in (place / inside for place in places for inside in INSIDE):
         if (folder / CONFIG_FILE).is_file() and weights_file(folder) is not None:
             return folder
     if not path.is_dir():
@@ -83,8 +90,14 @@ def find_checkpoint(path: Path) -> Path:
     raise CheckpointError(
         f"{path}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder that "
         f"holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) are "
-        f"never loaded: convert them to safetensors."
+        f"never loaded: convert them to safetensors.{did_you_mean(str(path), list_checkpoints())}"
     )
+
+
+def list_checkpoints() -> list[str]:
+    """Return the names in `checkpoints/`, the user's and the package's."""
+    entries = [entry for folder in search_folders(SHIPPED_FOLDER) for entry in folder.glob("*/")]
+    return sorted({entry.name for entry in entries})
 
 
 def weights_file(folder: Path) -> Path | None:

@@ -1,0 +1,17 @@
+"""Where files that come with the package lie: recipes and small trained weights. Standard library only."""
+
+from pathlib import Path
+
+PACKAGE_ROOT = Path(__file__).parent
+
+
+def search_folders(kind: str) -> tuple[Path, ...]:
+    """Return the folders in which files of a kind are looked for, in this order: the user's, the package's.
+
+    Args:
+        kind: name of the folder: `configs`, `policies`, `prompts`, `datasets` or `checkpoints`.
+    """
+    packaged = PACKAGE_ROOT / "recipes_data" / kind
+    # An editable checkout has no recipes_data: these folders lie beside the package.
+    shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / kind
+    return tuple(dict.fromkeys((Path.cwd() / kind, shipped)))
