@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, TaskArgumentError
 from vla_eval.policies.checkpoint import checkpoint_hashes
 from vla_eval.policies.recipe import LEROBOT_ADAPTER, load_policy_recipe
 from vla_eval.prompts import instruction_for, load_prompts
@@ -22,6 +22,9 @@ from vla_eval.rollout import RolloutSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_open_arguments
 from vla_eval.tasks.spec import TaskSpec
+
+CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
+"""Arguments of tasks with candidates alone."""
 
 
 class GroupKey(NamedTuple):
@@ -104,12 +107,14 @@ def make_plan(config: EvalConfig) -> Plan:
         UnknownNameError: a task, policy, adapter or prompt set does not exist.
         RecipeError: a recipe is wrong, or two policies have the same name.
         MissingInstructionError: a task has no instruction in the prompt set.
-        TaskArgumentError: a family of tasks is named, but not which of its tasks.
+        TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
+            tasks with candidates, and one of the tasks has none.
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
     policies = [load_policy_recipe(name) for name in config.policies]
     _refuse_doubles("tasks", [task.id for task in tasks])
+    _refuse_choice_arguments(config, tasks)
     _refuse_doubles("policies", [policy.name for policy in policies])
     prompts = load_prompts(config.prompt_set)
     groups: list[Group] = []
@@ -180,6 +185,16 @@ def _refuse_instruction(config: EvalConfig) -> None:
         raise RecipeError(
             "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
             "./prompts/ and name that file in prompt_set."
+        )
+
+
+def _refuse_choice_arguments(config: EvalConfig, tasks: Iterable[TaskSpec]) -> None:
+    given = [f"env.{name}" for name in CHOICE_ARGUMENTS if name in config.env]
+    without = [task.id for task in tasks if task.candidates is None]
+    if given and without:
+        raise TaskArgumentError(
+            f"{', '.join(given)}: {', '.join(without)}: there are no candidates to choose among. Evaluate "
+            f"these tasks without it, in a run of their own."
         )
 
 

@@ -280,6 +280,37 @@ def test_strict_choice_makes_the_first_wrong_touch_a_failure_for_good() -> None:
     assert not bool(info["success"][0])
 
 
+@pytest.mark.parametrize(
+    "task",
+    ["RememberShape3-v0", "BunchOfColors3-v0", "SeqOfColors3-v0", "ShellGameTouch-v0", "ShellGamePush-v0"],
+)
+def test_without_its_cue_an_episode_shows_nothing_before_the_choice_and_is_otherwise_the_same(
+    task: str,
+) -> None:
+    episodes = []
+    for show_cue in (True, False):
+        env = make(task, show_cue=show_cue)
+        env.reset(seed=[4])
+        states = []
+        for _ in range(int(env._response_step[0]) + 2):
+            is_response = bool(env.response_begun()[0])
+            shown = list(visible(env))
+            ball = getattr(env, "ball", None)
+            if ball is not None and float(ball.pose.p[0, 0]) < PARK_X_M - 1:
+                shown.append(-1)
+            states.append((is_response, shown, env.get_state()[0].numpy().copy()))
+            env.step(np.zeros(7, dtype=np.float32))
+        episodes.append(states)
+        env.close()
+    usual, without = episodes
+    assert any(shown for is_response, shown, _ in usual if not is_response)
+    assert not any(shown for is_response, shown, _ in without if not is_response)
+    for (is_response, shown, state), (_, same, other) in zip(usual, without, strict=True):
+        if is_response:
+            assert shown == same
+            np.testing.assert_array_equal(state, other)
+
+
 def test_freeze_until_choice_holds_arm_and_gripper() -> None:
     env = make("RememberColor3-v0", freeze_until_choice=True)
     env.reset(seed=[1])

@@ -71,6 +71,13 @@ def test_a_family_without_its_arguments_is_refused_before_anything_starts() -> N
     assert make_plan(config(env={"n_items": 4})).task_versions == {"RememberColor": 1}
 
 
+def test_a_final_choice_where_there_is_none_to_make_is_refused_before_anything_starts() -> None:
+    strict = {"strict_choice": True}
+    with pytest.raises(TaskArgumentError, match="InterceptMedium-v0: there are no candidates"):
+        make_plan(config(tasks=["RememberColor3-v0", "InterceptMedium-v0"], env=strict))
+    assert make_plan(config(tasks=["RememberColor3-v0"], env=strict)).jobs
+
+
 def test_an_environment_of_a_family_without_its_arguments_is_refused() -> None:
     with pytest.raises(TaskArgumentError, match="n_shown must say which one"):
         make_env(EnvSettings(task="SeqOfColors", simulator="fake"))

@@ -26,6 +26,8 @@ class ChoiceEnv(MemoryTableEnv):
     Args:
         goal_threshold_m: how near the tool centre point must come.
         strict_choice: the first wrong candidate that is touched ends the episode as a failure.
+        show_cue: False: the cue's time passes and nothing is shown. All else is as with the same seed, so
+            that a policy which is as good without the cue as with it does not need it.
     """
 
     REACH_SCALE_PER_M: float
@@ -34,13 +36,19 @@ class ChoiceEnv(MemoryTableEnv):
     """Whether right candidates, if there are several, must be touched in the order of `right_candidates`."""
 
     def __init__(
-        self, *args: Any, goal_threshold_m: float, strict_choice: bool = False, **kwargs: Any
+        self,
+        *args: Any,
+        goal_threshold_m: float,
+        strict_choice: bool = False,
+        show_cue: bool = True,
+        **kwargs: Any,
     ) -> None:
         """Check the threshold and build the scene."""
         if not goal_threshold_m > 0:
             raise TaskArgumentError(f"goal_threshold_m={goal_threshold_m}: expected > 0.")
         self.goal_threshold_m = goal_threshold_m
         self.strict_choice = strict_choice
+        self.show_cue = show_cue
         super().__init__(*args, **kwargs)
 
     def _load_scene(self, options: dict[str, Any]) -> None:

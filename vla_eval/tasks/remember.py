@@ -60,7 +60,7 @@ class RememberEnv(ItemChoiceEnv):
         self._sample_slots(env)
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
-        cue_begins = mask & (step == 0) & (self._cue_end_step > 0)
+        cue_begins = mask & (step == 0) & (self._cue_end_step > 0) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
         for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):

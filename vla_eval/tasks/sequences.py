@@ -140,7 +140,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         self._near_steps[mask] = 0
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
-        in_cue = mask & (step < self._cue_end_step)
+        in_cue = mask & (step < self._cue_end_step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
         if self.ONE_BY_ONE:

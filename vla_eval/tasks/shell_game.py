@@ -107,7 +107,8 @@ class ShellGameEnv(ChoiceEnv):
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
         choice_begins = mask & (step == self._response_step)
-        hidden = mask & (step >= self._cue_end_step) & (step < self._response_step)
+        begun = self._cue_end_step if self.show_cue else torch.zeros_like(self._cue_end_step)
+        hidden = mask & (step >= begun) & (step < self._response_step)
         self.reveal(choice_begins, self._mug_orientation_wxyz())
         # Between cue and choice the ball is out of sight; later it goes where its mug goes.
         self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
