@@ -79,6 +79,15 @@ def test_the_end_of_an_episode_is_padded_with_its_last_action(root: Path, tmp_pa
     assert torch.equal(last["action"], last["action"][:1].expand(8, -1))
 
 
+def test_a_sample_may_be_the_whole_episode_for_each_of_its_frames(root: Path, tmp_path: Path) -> None:
+    theirs = load(root, delta_timestamps=WINDOWS)
+    ours = MemoryDataset(theirs, cache=tmp_path, whole_episodes=True)
+    assert len(ours) == len(theirs)
+    for first, last in ((0, 5), (6, 12)):  # the first two episodes
+        assert_same(ours[first], theirs[last])
+        assert_same(ours[last], theirs[last])
+
+
 def test_samples_are_copies(root: Path, tmp_path: Path) -> None:
     ours = MemoryDataset(load(root), storage="memory", cache=tmp_path)
     before = ours[0]

@@ -41,6 +41,9 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
         storage: `disk` keeps the frames in a memory-mapped file in the user's cache; `memory` in this
             process (loader processes share them), for machines whose disk is smaller than their memory.
         cache: the folder for decoded frames; by default in the user's cache.
+        whole_episodes: serve for each frame the sample of its episode's last frame. For policies with a
+            memory, whose window reaches back to the beginning: a window that ends in the middle is a part
+            of the same sample.
 
     Raises:
         DatasetError: cameras that are not videos, a damaged file, or no room for the frames.
@@ -48,10 +51,15 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
     """
 
     def __init__(
-        self, source: LeRobotDataset, *, storage: Storage = "disk", cache: Path | None = None
+        self,
+        source: LeRobotDataset,
+        *,
+        storage: Storage = "disk",
+        cache: Path | None = None,
+        whole_episodes: bool = False,
     ) -> None:
         reader = source._ensure_reader()
-        self.source = source
+        self.source, self._whole_episodes = source, whole_episodes
         self.meta, self.episodes = source.meta, source.episodes
         self._deltas: Mapping[str, list[int]] | None = reader.delta_indices
         self._transforms: Callable[[Any], Any] | None = reader._image_transforms
@@ -110,6 +118,8 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
         index %= len(self)
+        if self._whole_episodes:
+            index = int(self._bounds[index, 1]) - 1
         fields = {
             key: column[index].clone() if isinstance(column, torch.Tensor) else column[index]
             for key, column in self._columns.items()

@@ -161,6 +161,12 @@ def _train(
         if held_out is not None and held_out.is_due(int(checkpoint.name)):
             held_out.evaluate(checkpoint)
 
+    whole_episodes = getattr(policy, "whole_episodes", False)
+    if whole_episodes and not recipe.decode_ahead:
+        raise RecipeError(
+            f"finetune.decode_ahead is false; '{recipe.type}' is trained on whole episodes, which are served "
+            "from decoded frames alone. Leave the field out."
+        )
     hooks = LoopHooks(
         facts=_facts(dataset, policy, config, out),
         metrics_file=out / METRICS_FILE,
@@ -170,6 +176,7 @@ def _train(
         cast=base is not None,
         begins_from_base=base is not None and resume_from is None,
         decode_ahead=recipe.decode_ahead,
+        whole_episodes=whole_episodes,
         tokenizer=recipe.tokenizer,
         on_model=describe,
         on_metrics=report,

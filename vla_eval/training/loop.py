@@ -72,6 +72,7 @@ class LoopHooks:
         cast: whether the weights' precision may differ from the model's.
         begins_from_base: whether they are a base's, which need not have what fine-tuning begins anew.
         decode_ahead, tokenizer: see `FinetuneRecipe`.
+        whole_episodes: see `MemoryDataset`.
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
@@ -85,6 +86,7 @@ class LoopHooks:
     cast: bool
     begins_from_base: bool
     decode_ahead: bool
+    whole_episodes: bool
     tokenizer: str | None
     on_model: Callable[[Any], None]
     on_metrics: Callable[[Mapping[str, float]], None]
@@ -153,7 +155,9 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
 
     def make_train_eval_datasets(cfg: Any) -> Any:
         training, held_out = originals["make_train_eval_datasets"](cfg)
-        return (MemoryDataset(training) if hooks.decode_ahead else training), held_out
+        if not hooks.decode_ahead:
+            return training, held_out
+        return MemoryDataset(training, whole_episodes=hooks.whole_episodes), held_out
 
     def update_policy(tracker: Any, *args: Any, **kwargs: Any) -> Any:
         process = kwargs["accelerator"].process_index
@@ -161,7 +165,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         answer = originals["update_policy"](tracker, *args, **kwargs)
         step = tracker.steps + 1
         if step % hooks.log_every_steps == 0 and process == 0:
-            _write_metrics(hooks, step, tracker)
+            _write_metrics(hooks, step, tracker, answer[1] or {})
         return answer
 
     def save_checkpoint(checkpoint_dir: Path, **kwargs: Any) -> None:
@@ -190,9 +194,11 @@ def seed_step(run_seed: int, step: int, process: int) -> None:
     set_seed(int(drawn[0]))
 
 
-def _write_metrics(hooks: LoopHooks, step: int, tracker: Any) -> None:
+def _write_metrics(hooks: LoopHooks, step: int, tracker: Any, parts: Mapping[str, Any]) -> None:
+    """Write means since the last line and, of the loss, the parts that the policy tells of this step."""
     values = {name: value for name, value in tracker.to_dict().items() if name != "steps"}
-    line = {"step": step, **{name: float(value) for name, value in values.items()}}
+    told = {name: value for name, value in parts.items() if isinstance(value, float | int)}
+    line = {"step": step, **{name: float(value) for name, value in {**told, **values}.items()}}
     append_metrics(hooks.metrics_file, line)
     hooks.on_metrics(line)
     if not np.isfinite(line["loss"]):

@@ -1,7 +1,7 @@
 """lerobot's configuration of the positive control; `docs/positive_control.md` explains it."""
 
 from dataclasses import dataclass, field
-from typing import Any  # lerobot is untyped
+from typing import Any, ClassVar  # lerobot is untyped
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -19,6 +19,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     further. So any loop that follows `*_delta_indices` trains it.
 
     Attributes:
+        whole_episodes: `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it.
         remembers: False for the twin, whose memory begins anew at each step.
         window_steps: frames of history in a training sample; at least the longest episode, so that no
             memory begins in its middle. None: our `finetune` takes the dataset's longest.
@@ -35,6 +36,8 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps, scheduler_decay_lr: AdamW, warm-up, cosine.
     """
+
+    whole_episodes: ClassVar[bool] = True
 
     remembers: bool = True
     window_steps: int | None = None

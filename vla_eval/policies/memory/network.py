@@ -9,15 +9,17 @@ The memory is a minimal gated recurrence: gate and candidate depend on the input
 that it can be compared with the pictures that come later.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+P, R = ParamSpec("P"), TypeVar("R")
 STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
 RGB, PLACE, GOAL = 3, 2, 3  # numbers of a colour, of a place in a picture, of a position in space
 
@@ -173,6 +175,18 @@ class Likeness(nn.Module):
         return scores.transpose(1, 2).softmax(dim=-1) @ places
 
 
+def _in_float32(method: Callable[P, R]) -> Callable[P, R]:
+    """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
+
+    @functools.wraps(method)
+    def kept(*args: P.args, **kwargs: P.kwargs) -> R:
+        network: Any = args[0]
+        with torch.autocast(network.first_rest.device.type, enabled=False):
+            return method(*args, **kwargs)
+
+    return kept
+
+
 class Memory(NamedTuple):
     """What is kept from step to step: (B, cameras · heads, value) things seen, and (B, memory) the rest."""
 
@@ -237,7 +251,10 @@ class MemoryNetwork(nn.Module):
             pictures: (N, cameras, 3, H, W) in [0, 1].
             state: (N, state) in SI units.
         """
-        places = [eye(pictures[:, index]) for index, eye in enumerate(self.eyes)]
+        return self._sight([eye(pictures[:, index]) for index, eye in enumerate(self.eyes)], state)
+
+    @_in_float32
+    def _sight(self, places: list[Tensor], state: Tensor) -> Sight:
         keys = [key(place) for key, place in zip(self.keys, places, strict=True)]
         looks = zip(self.standing_out, places, keys, strict=True)
         things = torch.cat([look(place, key) for look, place, key in looks], dim=1)
@@ -245,6 +262,7 @@ class MemoryNetwork(nn.Module):
         known = torch.cat([things.flatten(1), *strongest, state * STATE_SCALE], dim=-1)
         return Sight(places, keys, things, self.summary(known))
 
+    @_in_float32
     def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
         """Return the memories (B, T, …) after each step of what was seen at B · T steps.
 
@@ -270,6 +288,7 @@ class MemoryNetwork(nn.Module):
             torch.stack([one.rest for one in memories], dim=1),
         )
 
+    @_in_float32
     def act(self, sight: Sight, memory: Memory, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions (N, chunk, action) and goal (N, 3) for N steps whose memory is written."""
         sizes = self.sizes
