@@ -75,7 +75,8 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             episodes.pictures[:, 0].flatten(0, 1), episodes.pictures.shape[-1] // config.thumbnail_px
         )
         firsts = by_episode(firsts, (len(real), -1))
-        recall = _in_variances(answer.first_pictures, firsts, real)
+        # What all episodes begin with need not be remembered: told is what differs.
+        recall = _in_variances(answer.first_pictures, firsts - firsts.mean(dim=0), real)
         loss = imitation + config.goal_weight * goal + config.recall_weight * recall
         parts = {"imitation": imitation, "goal": goal, "recall": recall}
         return loss, {name: float(part.detach()) for name, part in parts.items()}

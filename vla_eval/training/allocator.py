@@ -1,0 +1,25 @@
+"""Keep freed memory in the process: what a training step frees, the next one needs again.
+
+By default glibc takes each large tensor from the kernel and gives it back, and the kernel fills every page
+with zeros. On a processor that can take longer than the arithmetic (docs/finetuning.md has a measurement).
+"""
+
+import ctypes
+import sys
+
+# glibc's malloc.h
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
+NEVER_BYTES = (1 << 31) - 1
+
+
+def keep_freed_memory() -> bool:
+    """Let malloc neither map large blocks one by one nor give free memory back; return whether it will.
+
+    Without glibc (macOS, musl) nothing is changed. No result depends on it.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "gnu_get_libc_version"):
+        return False
+    return bool(libc.mallopt(M_MMAP_MAX, 0)) and bool(libc.mallopt(M_TRIM_THRESHOLD, NEVER_BYTES))
