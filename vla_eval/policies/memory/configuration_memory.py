@@ -86,6 +86,8 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
             raise ValueError(
                 f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
             )
+        if self.patch_px % 2 or self.patch_px < 2:
+            raise ValueError(f"patch_px is {self.patch_px}, expected an even number: colours are of quarters")
         for name in ("first_action_weight", "waiting_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")

@@ -71,15 +71,22 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         imitation = (errors * episodes.counts).sum() / episodes.counts.sum()
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal = _in_variances(answer.goal_m, episodes.goal_m, real)
-        firsts = functional.avg_pool2d(
-            episodes.pictures[:, 0].flatten(0, 1), episodes.pictures.shape[-1] // config.thumbnail_px
-        )
-        firsts = by_episode(firsts, (len(real), -1))
-        # What all episodes begin with need not be remembered: told is what differs.
-        recall = _in_variances(answer.first_pictures, firsts - firsts.mean(dim=0), real)
+        recall = self._recall(episodes.pictures[:, 0], answer.first_pictures, real)
         loss = imitation + config.goal_weight * goal + config.recall_weight * recall
         parts = {"imitation": imitation, "goal": goal, "recall": recall}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    def _recall(self, pictures: Tensor, told: Tensor, real: Tensor) -> Tensor:
+        """Return the loss of what is told of the first pictures (B, cameras, 3, H, W); cameras count alike.
+
+        What all episodes begin with need not be remembered, and is not asked for.
+        """
+        edge_px = pictures.shape[-1] // self.config.thumbnail_px
+        firsts = by_episode(functional.avg_pool2d(pictures.flatten(0, 1), edge_px), pictures.shape[:2])
+        differ = firsts - firsts.mean(dim=0)
+        spread = differ.square().mean(dim=(0, 2, 3, 4), keepdim=True).clamp(min=LEAST_VARIANCE).sqrt()
+        errors = (told - (differ / spread)[:, None]).square().flatten(2).mean(dim=-1)
+        return (errors * real).sum() / real.sum()
 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:

@@ -21,6 +21,9 @@ from torch.nn import functional
 
 P, R = ParamSpec("P"), TypeVar("R")
 STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
+GOAL_SCALE_M = (
+    0.1  # numbers of about 1 to metres: else a step of the optimizer moves the goal across the table
+)
 RGB, PLACE, GOAL = 3, 2, 3  # numbers of a colour, of a place in a picture, of a position in space
 
 
@@ -35,7 +38,7 @@ class NetworkSizes:
         action: dimensions of an action.
         chunk: actions of a chunk.
         channels: learned features of a place in a picture.
-        patch_px: edge of such a place.
+        patch_px: edge of such a place, an even number.
         heads: questions per camera: so many fixed ones, and so many of the memory.
         key: numbers of a question.
         memory: units of the memory.
@@ -76,8 +79,8 @@ class Answer(NamedTuple):
         actions: (B, T, chunk, action).
         goal_m: (B, T, 3) where the demonstration's tool centre point ends, told from what the memory looked
             up alone.
-        first_pictures: (B, T, cameras, 3, thumbnail, thumbnail) the episode's first pictures, told from the
-            memory alone.
+        first_pictures: (B, T, cameras, 3, thumbnail, thumbnail) by how many standard deviations the
+            episode's first pictures differ from those of other episodes, told from the memory alone.
     """
 
     actions: Tensor
@@ -102,7 +105,11 @@ class Sight(NamedTuple):
 
 
 class Eye(nn.Module):
-    """One camera's picture to features of places, with mean colour and coordinates beside them."""
+    """One camera's picture to features of places; beside them colour and coordinates of a quarter of each.
+
+    It is the quarter whose hue differs most from the picture's: a cube of 4 pixels keeps its colour in a
+    place of 8.
+    """
 
     coordinates: Tensor
 
@@ -113,7 +120,7 @@ class Eye(nn.Module):
         self.patches = nn.Conv2d(RGB * sizes.patch_px**2, width, 1)
         self.around = nn.Conv2d(width, width, 3, padding=1)
         self.mix = nn.Conv2d(width, width, 1)
-        line = torch.linspace(-1, 1, sizes.image_px // sizes.patch_px)
+        line = torch.linspace(-1, 1, 2 * sizes.image_px // sizes.patch_px)
         y, x = torch.meshgrid(line, line, indexing="ij")
         self.register_buffer("coordinates", torch.stack([x, y]), persistent=False)
 
@@ -122,9 +129,13 @@ class Eye(nn.Module):
         centred = 2 * pictures - 1
         features = self.patches(functional.pixel_unshuffle(centred, self.patch_px))
         features = features + self.mix(functional.gelu(self.around(functional.gelu(features))))
-        colors = functional.avg_pool2d(centred, self.patch_px)
-        places = self.coordinates.expand(len(pictures), -1, -1, -1)
-        return torch.cat([features.float(), colors, places], dim=1).flatten(2).transpose(1, 2)
+        colors = functional.avg_pool2d(centred, self.patch_px // 2)
+        hues = colors - colors.mean(dim=1, keepdim=True)
+        apart = (hues - hues.mean(dim=(2, 3), keepdim=True)).square().sum(dim=1, keepdim=True)
+        quarters = functional.max_pool2d(apart, 2, return_indices=True)[1].flatten(2)
+        placed = torch.cat([colors, self.coordinates.expand(len(pictures), -1, -1, -1)], dim=1).flatten(2)
+        chosen = placed.gather(2, quarters.expand(-1, RGB + PLACE, -1))
+        return torch.cat([features.float().flatten(2), chosen], dim=1).transpose(1, 2)
 
 
 class Keys(nn.Module):
@@ -299,7 +310,7 @@ class MemoryNetwork(nn.Module):
             for index, look in enumerate(self.likeness)
         ]
         looked_up = torch.cat(found, dim=1).flatten(1)
-        goal = self.goal(looked_up)
+        goal = GOAL_SCALE_M * self.goal(looked_up)
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * STATE_SCALE]
         actions = self.acts(torch.cat([*known, goal.detach()], dim=-1))
         return actions.reshape(-1, sizes.chunk, sizes.action), goal
