@@ -13,13 +13,12 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-P, R = ParamSpec("P"), TypeVar("R")
 STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
 GOAL_SCALE_M = (
     0.1  # numbers of about 1 to metres: else a step of the optimizer moves the goal across the table
@@ -186,7 +185,7 @@ class Likeness(nn.Module):
         return scores.transpose(1, 2).softmax(dim=-1) @ places
 
 
-def _in_float32(method: Callable[P, R]) -> Callable[P, R]:
+def _in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
 
     @functools.wraps(method)
