@@ -1,5 +1,6 @@
 """The positive control: a memory reaches back to the first frame, its twin has none, all else is alike."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy
-from vla_eval.policies.memory.network import MemoryNetwork, NetworkSizes
+from vla_eval.policies.memory.network import GOAL_SCALE_M, MemoryNetwork, NetworkSizes
 from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
@@ -130,7 +131,7 @@ class TestTraining:
         for parameter in policy.network.goal[-1].parameters():
             torch.nn.init.zeros_(parameter)
         with torch.no_grad():
-            policy.network.goal[-1].bias.copy_(goals.mean(dim=0))
+            policy.network.goal[-1].bias.copy_(goals.mean(dim=0) / GOAL_SCALE_M)
         _, parts = policy.forward(batch)
         assert parts["goal"] == pytest.approx(1.0, rel=1e-4)
 
@@ -154,16 +155,19 @@ class TestTraining:
     ) -> None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         short = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
-        summary = finetune(
-            FinetuneConfig(
-                policy=name,
-                dataset=str(recorded),
-                out=str(tmp_path / "run"),
-                finetune={**short, "policy": TINY},
-                device="cpu",
-                allow_unreplayed=True,
-            )
+        config = FinetuneConfig(
+            policy=name,
+            dataset=str(recorded),
+            out=str(tmp_path / "run"),
+            finetune={**short, "policy": TINY},
+            device="cpu",
+            allow_unreplayed=True,
         )
+        summary = finetune(config)
+        again = replace(
+            config, out=str(tmp_path / "again"), finetune={**short, "policy": {**TINY, "use_amp": False}}
+        )
+        finetune(again)  # in the same process, in another precision
         made: Any = make_env(EnvSettings(task=TASK, simulator="fake"))
         context = PolicyContext(
             name=name, env=made.spec, chunking=ChunkingSpec(n_action_steps=2), n_candidates=3

@@ -26,6 +26,7 @@ from typing import Any  # lerobot is untyped
 from unittest.mock import patch
 
 import numpy as np
+from accelerate.state import AcceleratorState
 from lerobot.utils.random_utils import set_seed
 
 from vla_eval.data.memory_loader import MemoryDataset
@@ -119,6 +120,8 @@ def run_loop(config: Any, hooks: LoopHooks, *, resume_from: Path | None) -> None
     ):
         for name, replacement in _replacements(module, hooks).items():
             stack.enter_context(patch.object(module, name, replacement))
+        # It is one for the whole process, and refuses a second training in another precision.
+        AcceleratorState._reset_state()
         module.train(config)
 
 
