@@ -1,8 +1,8 @@
 """Keep freed memory in the process: what a training step frees, the next one needs again.
 
 By default glibc takes each large tensor from the kernel and gives it back, and the kernel fills every page
-with zeros: 84,000 to 110,000 page faults in a step of the positive control on ten episodes, against 0 to 25,000
-so (two cores, torch 2.13; how much time that is depends on the kernel and was not measured apart).
+with zeros: 84,000 to 110,000 page faults in a step of the positive control on ten episodes, against 0 to
+25,000 so (two cores, torch 2.13; how much time that is depends on the kernel and was not measured apart).
 """
 
 import ctypes
