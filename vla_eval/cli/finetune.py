@@ -64,10 +64,8 @@ def run(args: argparse.Namespace) -> int:
 
         return finetune_table(args)
     # Here and not above: `mikasa-vla --help` need not wait for torch.
-    from vla_eval.training.allocator import keep_freed_memory
     from vla_eval.training.finetune import finetune
 
-    keep_freed_memory()
     command = typed_command()
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))

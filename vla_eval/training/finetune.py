@@ -26,6 +26,7 @@ from vla_eval.policies.steps.trainable import check_lora
 from vla_eval.provenance import collect_environment
 from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
 from vla_eval.results.durable import FolderLock
+from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut, check_held_out
@@ -99,6 +100,8 @@ def finetune(
     if config.evaluation is not None:
         task = check_held_out(config.evaluation, recipe.value, dataset)
     device = choose_device(config.device)
+    if device == "cpu":
+        keep_freed_memory()
     policy = policy_config(recipe.value, dataset, device=device)
     frames = used_frames(policy, dataset)
     out = Path(config.out) if config.out is not None else default_out(config)
