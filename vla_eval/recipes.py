@@ -183,15 +183,10 @@ def check_run_name(name: str) -> None:
 # ------------------------------------------------------------------------------------------ finding
 
 
-def recipe_folders(folder: Folder) -> tuple[Path, ...]:
-    """Return the folders that recipes of a kind are looked for in, in this order."""
-    return search_folders(folder)
-
-
 def list_recipes(folder: Folder) -> dict[str, Path]:
     """Return name -> file of all recipes of a kind; the working directory's hide the package's."""
     found: dict[str, Path] = {}
-    for place in reversed(recipe_folders(folder)):
+    for place in reversed(search_folders(folder)):
         found.update({path.stem: path for path in sorted(place.glob("*.yaml"))})
     return dict(sorted(found.items()))
 
@@ -266,7 +261,7 @@ class _File(NamedTuple):
 
 def _read(folder: Folder, name: str) -> _File:
     path = find_recipe(folder, name)
-    where = f"{folder}/{path.name}" if path.parent in recipe_folders(folder) else str(path)
+    where = f"{folder}/{path.name}" if path.parent in search_folders(folder) else str(path)
     try:
         content = path.read_bytes()
         text = content.decode("utf-8")
