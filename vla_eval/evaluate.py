@@ -156,6 +156,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
         environment=collect_environment(),
         options=options_of(config),
         command=command,
+        normalization=dict(plan.normalization),
     )
 
 

@@ -11,20 +11,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import RecipeError, TaskArgumentError
-from vla_eval.policies.checkpoint import checkpoint_hashes
-from vla_eval.policies.recipe import LEROBOT_ADAPTER, load_policy_recipe
+from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
+from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.prompts import instruction_for, load_prompts
 from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
 from vla_eval.registry import check_adapter
 from vla_eval.results.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
-
-CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
-"""Arguments of tasks with candidates alone."""
 
 
 class GroupKey(NamedTuple):
@@ -86,6 +83,7 @@ class Plan:
         jobs: every episode, in a fixed order.
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
             policies, and the datasets that these were trained on.
+        normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
@@ -94,6 +92,7 @@ class Plan:
 
     jobs: tuple[EpisodeJob, ...]
     recipe_hashes: Mapping[str, str]
+    normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
     task_versions: Mapping[str, int]
     policy_names: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -109,18 +108,18 @@ def make_plan(config: EvalConfig) -> Plan:
         MissingInstructionError: a task has no instruction in the prompt set.
         TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
             tasks with candidates, and one of the tasks has none.
+        CheckpointError: the weights that a recipe names are not there, or not whole.
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
     policies = [load_policy_recipe(name) for name in config.policies]
     _refuse_doubles("tasks", [task.id for task in tasks])
-    _refuse_choice_arguments(config, tasks)
     _refuse_doubles("policies", [policy.name for policy in policies])
     prompts = load_prompts(config.prompt_set)
     groups: list[Group] = []
     left_out: list[str] = []
     for task in tasks:
-        check_open_arguments(task, config.env, TASKS.values())
+        check_arguments(task, config.env, TASKS.values())
         instruction = instruction_for(task, config.prompt_set)
         for policy in policies:
             check_adapter(policy.value.adapter)
@@ -143,7 +142,18 @@ def make_plan(config: EvalConfig) -> Plan:
         recipe_hashes={
             f"prompts/{prompts.name}": prompts.sha256,
             **{f"policies/{policy.name}": policy.sha256 for policy in policies},
-            **_weights_hashes(policies),
+            **{
+                name: digest
+                for policy in policies
+                for name, digest in checkpoint_hashes(
+                    policy.value.adapter, policy.value.args, policy=policy.name
+                ).items()
+            },
+        },
+        normalization={
+            policy.name: notes
+            for policy in policies
+            if (notes := normalization_notes(policy.value.adapter, policy.value.args))
         },
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
@@ -172,29 +182,11 @@ def fingerprint(config: EvalConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _weights_hashes(policies: Iterable[Recipe[PolicyRecipe]]) -> dict[str, str]:
-    hashes: dict[str, str] = {}
-    for policy in policies:
-        if policy.value.adapter == LEROBOT_ADAPTER:
-            hashes.update(checkpoint_hashes(policy.value.args, policy=policy.name))
-    return hashes
-
-
 def _refuse_instruction(config: EvalConfig) -> None:
     if "instruction" in config.env:
         raise RecipeError(
             "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
             "./prompts/ and name that file in prompt_set."
-        )
-
-
-def _refuse_choice_arguments(config: EvalConfig, tasks: Iterable[TaskSpec]) -> None:
-    given = [f"env.{name}" for name in CHOICE_ARGUMENTS if name in config.env]
-    without = [task.id for task in tasks if task.candidates is None]
-    if given and without:
-        raise TaskArgumentError(
-            f"{', '.join(given)}: {', '.join(without)}: there are no candidates to choose among. Evaluate "
-            f"these tasks without it, in a run of their own."
         )
 
 

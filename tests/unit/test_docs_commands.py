@@ -21,7 +21,7 @@ from vla_eval.decoding import decode
 from vla_eval.model_table import is_model_table, load_model_table
 from vla_eval.recipes import EvalConfig, PolicyRecipe, find_recipe, load_recipe
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.families import check_arguments
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -73,7 +73,7 @@ def is_name(text: str) -> bool:
 
 def check_task(name: str, env: dict[str, Any]) -> None:
     spec = task_spec(name)
-    check_open_arguments(spec, env, TASKS.values())
+    check_arguments(spec, env, TASKS.values())
     if env:  # reading the sources of a task's classes takes a while
         assert set(env) <= {argument.name for argument in task_arguments(spec)} | {"horizon_steps"}
 

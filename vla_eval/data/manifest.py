@@ -102,7 +102,8 @@ class DatasetFacts:
         state: which proprioception `observation.state` is.
         n_episodes, n_frames, n_failed_seeds: counts.
         recipe: the resolved recipe; `recipe_sha256` is the digest of the part that content depends on.
-        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts.
+        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts, and the weights of a
+            learned expert.
         environment: commit, versions and machine, see `provenance.collect_environment`.
         device: what the environment says of the device it rendered on.
         files: path below the dataset -> digest; lerobot's files and the manifest.

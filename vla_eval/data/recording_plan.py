@@ -7,11 +7,13 @@ from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.recording_jobs import TaskPlan
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.plan import Group, GroupKey
+from vla_eval.policies.checkpoint_notes import checkpoint_hashes
 from vla_eval.prompts import instruction_for, load_prompts
 from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe
 from vla_eval.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
 
 
@@ -21,7 +23,8 @@ class RecordingPlan:
 
     Attributes:
         tasks: what is recorded of each task.
-        recipe_files: `policies/oracle` -> sha256; likewise the prompts.
+        recipe_files: `policies/oracle` -> sha256; likewise the prompts, and the
+            weights of a learned expert.
     """
 
     tasks: tuple[TaskPlan, ...]
@@ -35,17 +38,24 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
         UnknownNameError: a task, expert or prompt set does not exist.
         RecipeError: the expert's recipe is wrong.
         MissingInstructionError: a task has no instruction.
+        TaskArgumentError: see `check_arguments`.
+        CheckpointError: the expert's weights are not there.
     """
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)
     return RecordingPlan(
         tasks=tuple(_task_plan(recipe, expert, task_spec(task)) for task in recipe.tasks),
-        recipe_files={f"policies/{expert.name}": expert.sha256, f"prompts/{prompts.name}": prompts.sha256},
+        recipe_files={
+            f"policies/{expert.name}": expert.sha256,
+            f"prompts/{prompts.name}": prompts.sha256,
+            **checkpoint_hashes(expert.value.adapter, expert.value.args, policy=expert.name),
+        },
     )
 
 
 def _task_plan(recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec) -> TaskPlan:
+    check_arguments(spec, recipe.env, TASKS.values())
     return TaskPlan(
         group=Group(
             key=GroupKey(spec.id, expert.name, 1),

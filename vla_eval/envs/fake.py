@@ -26,7 +26,7 @@ from vla_eval.errors import unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
-from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
@@ -95,7 +95,7 @@ class FakeEnv:
     def __init__(self, settings: EnvSettings) -> None:
         """Check the arguments."""
         task = task_spec(settings.task)
-        check_open_arguments(task, settings.kwargs, TASKS.values())
+        check_arguments(task, settings.kwargs, TASKS.values())
         defaults = _defaults(task)
         known = ("horizon_steps", *defaults)
         for name in settings.kwargs:

@@ -28,7 +28,7 @@ from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
-from vla_eval.tasks.families import check_open_arguments
+from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.memory_env import CAMERA_FOV_RAD, CAMERA_SIZE_PX, PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
@@ -87,7 +87,7 @@ class ManiSkillEnv:
     def __init__(self, settings: EnvSettings) -> None:
         """Build the scenes."""
         row = task_spec(settings.task)
-        check_open_arguments(row, settings.kwargs, TASKS.values())
+        check_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
         _check_arguments(env_class(row), kwargs, row.id)

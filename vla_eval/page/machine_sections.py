@@ -178,6 +178,11 @@ def _reproduction(run: StoredRun) -> list[Markup]:
         element("pre", "\n".join(commands)) if any(commands) else paragraph("The command was not recorded."),
         _listing("Recipes, sha256", dict(description.recipes), "No recipe hashes were recorded."),
         _listing(
+            "Statistics that normalise",
+            dict(leaves(description.normalization, prefix="")),
+            "No policy of this run normalises.",
+        ),
+        _listing(
             "Environment", dict(leaves(description.environment, prefix="")), "No environment was recorded."
         ),
         details("Configuration as resolved", element("pre", config)),

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,7 @@ def checkpoint_sha256(path: Path) -> str:
     folder = find_checkpoint(path)
     digest = hashlib.sha256()
     for name, file in _hashed_files(folder):
-        digest.update(f"{name}\0{_file_sha256(file)}\n".encode())
+        digest.update(f"{name}\0{file_sha256(file)}\n".encode())
     base = adapter_base(folder)
     if base is not None and base.is_dir():
         digest.update(f"base\0{checkpoint_sha256(base)}\n".encode())
@@ -179,27 +179,6 @@ def read_facts(folder: Path) -> TrainingFacts | None:
         raise CheckpointError(f"{exc} The file was changed; fetch the checkpoint again.") from exc
 
 
-def checkpoint_hashes(args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
-    """Return what an evaluation notes of the weights that a recipe names: name -> digest.
-
-    Args:
-        args: the arguments of the recipe's adapter.
-        policy: the recipe's name.
-    """
-    checkpoint = args.get("checkpoint")
-    if not isinstance(checkpoint, str):
-        return {}
-    folder = find_checkpoint(Path(checkpoint))
-    hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
-    base = args.get("base_checkpoint")
-    if isinstance(base, str):
-        hashes[f"checkpoints/{policy}/base"] = checkpoint_sha256(Path(base))
-    facts = read_facts(folder)
-    if facts is not None:
-        hashes[f"datasets/{facts.dataset}"] = facts.dataset_sha256
-    return hashes
-
-
 def _hashed_files(folder: Path) -> Iterator[tuple[str, Path]]:
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder).as_posix()
@@ -207,7 +186,8 @@ def _hashed_files(folder: Path) -> Iterator[tuple[str, Path]]:
             yield name, file
 
 
-def _file_sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of one file."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(CHUNK_BYTES):

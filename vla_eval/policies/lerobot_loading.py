@@ -43,15 +43,10 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
+from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
 from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 from vla_eval.policies.weights import check_same, put_weights
 
-NEEDED_STATISTICS = {
-    NormalizationMode.MEAN_STD: ("mean", "std"),
-    NormalizationMode.MIN_MAX: ("min", "max"),
-    NormalizationMode.QUANTILES: ("q01", "q99"),
-    NormalizationMode.QUANTILE10: ("q10", "q90"),
-}
 TOKENIZER_STEP = "tokenizer_processor"
 PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
 """Where a processor step that is named by its import path may come from; others are never imported."""

@@ -5,7 +5,7 @@ Knows nothing of episodes; the values it keeps are plain JSON and mean nothing t
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ class RunDescription:
         environment: commit, versions, device; compared on resume unless a change is allowed.
         options: workers, timeouts and the like; recorded, never compared.
         command: what the user typed.
+        normalization: learned policy -> by which statistics it normalises; recorded only, since the digest
+            of the weights in `recipes` covers them.
     """
 
     name: str
@@ -41,6 +43,7 @@ class RunDescription:
     environment: Mapping[str, JsonValue]
     options: Mapping[str, JsonValue]
     command: str
+    normalization: Mapping[str, JsonValue] = field(default_factory=dict)
 
 
 class Change(NamedTuple):
@@ -198,7 +201,7 @@ def _session(data: dict[str, Any]) -> Session:  # Any: JSON
 
 
 def _fields(value: RunDescription | Session) -> dict[str, Any]:  # Any: JSON
-    return {field.name: getattr(value, field.name) for field in fields(value)}
+    return {one.name: getattr(value, one.name) for one in fields(value)}
 
 
 def _plain(value: object) -> dict[str, JsonValue]:

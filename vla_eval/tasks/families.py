@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.spec import TaskSpec
 
+CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
+"""Arguments of tasks with candidates alone."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
@@ -85,8 +88,8 @@ def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
     )
 
 
-def check_open_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[TaskSpec]) -> None:
-    """Raise unless all that a family leaves open is given.
+def check_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[TaskSpec]) -> None:
+    """Raise what can be said of a task's arguments by their names, without a simulator.
 
     Args:
         spec: a row of the catalogue, or a family.
@@ -94,7 +97,8 @@ def check_open_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[
         rows: the catalogue, for the message.
 
     Raises:
-        TaskArgumentError: an argument without which it is not known which task is meant.
+        TaskArgumentError: an argument without which it is not known which task is meant; or one for tasks
+            with candidates, and this one has none.
     """
     missing = [name for name in spec.open_arguments if name not in given]
     if missing:
@@ -103,4 +107,10 @@ def check_open_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[
         raise TaskArgumentError(
             f"{spec.id} is a family of tasks: {', '.join(missing)} must say which one. Add {wanted}, or name "
             f"one of {', '.join(known)}."
+        )
+    of_choices = [f"env.{name}" for name in CHOICE_ARGUMENTS if name in given]
+    if of_choices and spec.candidates is None:
+        raise TaskArgumentError(
+            f"{', '.join(of_choices)}: {spec.id}: there are no candidates to choose among. Use this task "
+            f"without it, in a run of its own."
         )

@@ -1,0 +1,148 @@
+"""What an evaluation notes of the weights that a policy's recipe names: digests, and statistics.
+
+Knows nothing of models, and does not import torch: planning an evaluation must not wait for it.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any  # JSON of another program
+
+from vla_eval.errors import CheckpointError
+from vla_eval.policies.checkpoint import (
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    checkpoint_sha256,
+    file_sha256,
+    find_checkpoint,
+    read_facts,
+    read_json,
+)
+
+LEROBOT_CHECKPOINTS = frozenset({"lerobot", "openvla"})
+"""Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
+PPO_EXPERT = "ppo_expert"
+PPO_FILES = ("config.json", "expert.safetensors")
+"""What the actions of a learned expert depend on; the rest of its folder is for people."""
+
+NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""What each of lerobot's kinds of normalisation takes; its other kind, IDENTITY, takes none. Source:
+https://github.com/huggingface/lerobot/blob/v0.6.1/src/lerobot/processor/normalize_processor.py"""
+LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
+OWN_STEPS = frozenset({"mikasa_encoder", "mikasa_decoder"})
+
+
+def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
+    """Return digests of all that a policy's weights consist of, and of what they were trained on.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+        policy: the recipe's name.
+
+    Returns:
+        `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
+        without weights, or whose adapter is another package's.
+
+    Raises:
+        CheckpointError: the weights are not there.
+    """
+    checkpoint = args.get("checkpoint")
+    if not isinstance(checkpoint, str):
+        return {}
+    if adapter == PPO_EXPERT:
+        return {
+            f"checkpoints/{policy}/{name}": _expert_file_sha256(Path(checkpoint) / name) for name in PPO_FILES
+        }
+    if adapter not in LEROBOT_CHECKPOINTS:
+        return {}
+    folder = find_checkpoint(Path(checkpoint))
+    hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
+    base = args.get("base_checkpoint")
+    if isinstance(base, str):
+        hashes[f"checkpoints/{policy}/base"] = checkpoint_sha256(Path(base))
+    facts = read_facts(folder)
+    if facts is not None:
+        hashes[f"datasets/{facts.dataset}"] = facts.dataset_sha256
+    return hashes
+
+
+def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by which statistics a policy normalises what it sees and un-normalises what it does.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Returns:
+        `of`: the dataset whose statistics they are, by its name, or `the checkpoint` where that is not
+        known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
+        is used. Empty for a policy without a checkpoint of LeRobot's.
+
+    Raises:
+        CheckpointError: a file that the checkpoint names is missing or damaged.
+    """
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return {}
+    folder = find_checkpoint(Path(checkpoint))
+    facts = read_facts(folder)
+    return {
+        "of": "the checkpoint" if facts is None else facts.dataset,
+        "before": _used(folder, PREPROCESSOR_FILE),
+        "after": _used(folder, POSTPROCESSOR_FILE),
+    }
+
+
+def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:
+    used: dict[str, dict[str, list[float]]] = {}
+    for step in read_json(folder / processor).get("steps", []):
+        file = step.get("state_file")
+        if file is None or step.get("registry_name") not in LEROBOT_STEPS | OWN_STEPS:
+            continue
+        state = _numbers(folder / file)
+        for field, name, key in _names(step):
+            if key not in state:
+                raise CheckpointError(
+                    f"{folder / file}: has no statistic '{name}' of '{field}', by which {processor} "
+                    f"normalises. Fetch the complete checkpoint."
+                )
+            used.setdefault(field, {})[name] = state[key]
+    return used
+
+
+def _names(step: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Yield field, statistic and the name of its tensor for all that a step uses."""
+    config = step.get("config", {})
+    if step["registry_name"] in OWN_STEPS:
+        kinds = {"mean_std": "MEAN_STD", "q01_q99": "QUANTILES"}
+        for field, spec in config.get("fields", {}).items():
+            for name in NEEDED_STATISTICS[kinds[spec["kind"]]]:
+                yield field, name, f"{field}/{name}"
+        return
+    for field, feature in config.get("features", {}).items():
+        mode = config.get("norm_map", {}).get(feature["type"], "IDENTITY")
+        for name in NEEDED_STATISTICS.get(mode, ()):
+            yield field, name, f"{field}.{name}"
+
+
+def _numbers(file: Path) -> dict[str, list[float]]:
+    from safetensors.numpy import load_file  # with numpy, which most of planning does without
+
+    try:
+        tensors = load_file(file)
+    except Exception as exc:  # safetensors raises its own class, which is no public name
+        raise CheckpointError(
+            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
+        ) from exc
+    return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}
+
+
+def _expert_file_sha256(path: Path) -> str:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: expected a file of `mikasa-vla train-expert`, found none.")
+    return file_sha256(path)
