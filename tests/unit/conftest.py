@@ -1,8 +1,10 @@
 """Fixtures of several test files."""
 
+import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,3 +100,27 @@ def small_act_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     from vla_eval.training.tiny_models import tiny_worker_main
 
     monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
+
+
+@pytest.fixture
+def killed_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """Training stops at a step: nothing is written after the last checkpoint before, as with kill -9."""
+    from vla_eval.training import loop
+
+    class Killed(BaseException):
+        pass
+
+    @contextlib.contextmanager
+    def killed(step: int) -> Iterator[None]:
+        def seed_step(run_seed: int, at: int, process: int, original: Any = loop.seed_step) -> None:
+            if at == step:
+                raise Killed
+            original(run_seed, at, process)
+
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(loop, "seed_step", seed_step)
+            yield
+
+    return killed

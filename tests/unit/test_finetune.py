@@ -1,8 +1,8 @@
 """Fine-tuning end to end on a tiny dataset, offline: train, kill, go on, load, evaluate."""
 
-import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -41,6 +41,7 @@ from vla_eval.training.tiny_models import (
 )
 
 pytestmark = pytest.mark.usefixtures("small_act")
+KilledAt = Callable[[int], AbstractContextManager[None]]
 
 TASK = "RememberColor3-v0"
 TINY_ACT = {
@@ -105,24 +106,6 @@ def tokenizer(tmp_path: Path, recorded: Path) -> Path:
     return write_tiny_tokenizer(tmp_path / "tokenizer")
 
 
-@contextlib.contextmanager
-def killed_at(step: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Nothing is written after the last checkpoint before `step`, as with kill -9."""
-    from vla_eval.training import loop
-
-    class Killed(BaseException):
-        pass
-
-    def seed_step(run_seed: int, at: int, process: int, original: Any = loop.seed_step) -> None:
-        if at == step:
-            raise Killed
-        original(run_seed, at, process)
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(loop, "seed_step", seed_step)
-        yield
-
-
 def weights(run: Path) -> dict[str, torch.Tensor]:
     return dict(load_file(find_checkpoint(run) / "model.safetensors"))
 
@@ -146,12 +129,12 @@ def run_an_episode(policy: Any) -> int:
 
 class TestRuns:
     def test_a_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
-        self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, recorded: Path, tmp_path: Path, killed_at: KilledAt
     ) -> None:
         straight, broken = tmp_path / "straight", tmp_path / "broken"
         lines: list[str] = []
         finetune(act(recorded, straight), say=lines.append)
-        with killed_at(3, monkeypatch):
+        with killed_at(3):
             finetune(act(recorded, broken))
         assert [line["step"] for line in metrics(broken)] == [1, 2, 3]
         summary = finetune(act(recorded, broken))
@@ -178,13 +161,13 @@ class TestRuns:
             finetune(act(recorded, straight, batch_size=3))
 
     def test_a_tiny_pi0_goes_the_whole_way_and_resumes_exactly(
-        self, recorded: Path, tmp_path: Path, tokenizer: Path, monkeypatch: pytest.MonkeyPatch
+        self, recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt
     ) -> None:
         straight, broken = tmp_path / "straight", tmp_path / "broken"
         lines: list[str] = []
         with tiny_paligemma():
             finetune(pi0(recorded, straight, tokenizer), say=lines.append)
-            with killed_at(3, monkeypatch):
+            with killed_at(3):
                 finetune(pi0(recorded, broken, tokenizer))
             finetune(pi0(recorded, broken, tokenizer))
         one, other = weights(straight), weights(broken)
@@ -196,14 +179,14 @@ class TestRuns:
         assert run_an_episode(make_tiny_pi0(context(), checkpoint=str(straight))) == 3
 
     def test_lora_trains_adapters_on_a_base_and_is_evaluated_with_it(
-        self, recorded: Path, tmp_path: Path, tokenizer: Path, monkeypatch: pytest.MonkeyPatch
+        self, recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt
     ) -> None:
         base, lora = tmp_path / "base", tmp_path / "lora"
         changes: dict[str, Any] = {"base_checkpoint": str(base), "lora": {"rank": 4}}
         lines: list[str] = []
         with tiny_paligemma():
             finetune(pi0(recorded, base, tokenizer, steps=2))
-            with killed_at(3, monkeypatch):
+            with killed_at(3):
                 finetune(pi0(recorded, lora, tokenizer, **changes))
             finetune(pi0(recorded, lora, tokenizer, **changes), say=lines.append)
         folder = find_checkpoint(lora)

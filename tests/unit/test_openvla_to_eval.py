@@ -1,10 +1,13 @@
 """From a dataset to episodes: a tiny OpenVLA-OFT at K = 4 and 8, and LoRA on top of a plain OpenVLA."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
@@ -21,6 +24,8 @@ from vla_eval.training.finetune import finetune
 from vla_eval.training.recipe import FinetuneConfig
 
 TASK = "RememberColor3-v0"
+PLAIN = {"head": "tokens", "chunk_size": 1, "n_action_steps": 1}
+OFT = {"head": "l1", "chunk_size": 4, "n_action_steps": 4, "use_proprio": True}
 SHORT = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
 
 
@@ -72,11 +77,9 @@ def test_a_tiny_one_goes_from_a_dataset_to_an_episode(recorded: Path, tmp_path: 
 
 
 def test_lora_begins_a_head_on_a_plain_openvla_and_merges_exactly(recorded: Path, tmp_path: Path) -> None:
-    plain = {"head": "tokens", "chunk_size": 1, "n_action_steps": 1}
-    base = train(recorded, tmp_path / "base", policy=plain)
-    oft = {"head": "l1", "chunk_size": 4, "n_action_steps": 4, "use_proprio": True}
+    base = train(recorded, tmp_path / "base", policy=PLAIN)
     lora = {"base_checkpoint": str(base), "lora": {"rank": 2, "alpha": 1}}
-    adapter = train(recorded, tmp_path / "oft", policy=oft, **lora)
+    adapter = train(recorded, tmp_path / "oft", policy=OFT, **lora)
     assert (adapter / ADAPTER_WEIGHTS_FILE).is_file() and not (adapter / WEIGHTS_FILE).is_file()
     _, record = run(adapter, 4)
     assert record.n_steps == 8
@@ -96,3 +99,21 @@ def test_lora_begins_a_head_on_a_plain_openvla_and_merges_exactly(recorded: Path
     torch.testing.assert_close(told[0], told[1], atol=1e-5, rtol=1e-5)
     with pytest.raises(CheckpointError, match="no LoRA adapter"):
         merge_adapter(merged, tmp_path / "again")
+
+
+def test_a_lora_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
+    recorded: Path, tmp_path: Path, killed_at: Callable[[int], AbstractContextManager[None]]
+) -> None:
+    base = train(recorded, tmp_path / "base", policy=PLAIN)
+    lora = {"base_checkpoint": str(base), "lora": {"rank": 2, "alpha": 1}, "save_every_steps": 1, "steps": 3}
+    straight = train(recorded, tmp_path / "straight", policy=OFT, **lora)
+    with killed_at(2):
+        train(recorded, tmp_path / "broken", policy=OFT, **lora)
+    broken = train(recorded, tmp_path / "broken", policy=OFT, **lora)
+
+    one, other = (load_file(folder / ADAPTER_WEIGHTS_FILE) for folder in (straight, broken))
+    assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+    # The head, which is trained whole, is among them, and has moved since the checkpoint.
+    before = load_file(tmp_path / "broken/train/checkpoints/000002/pretrained_model" / ADAPTER_WEIGHTS_FILE)
+    moved = {key for key in one if not torch.equal(one[key], before[key])}
+    assert any("lora" in key for key in moved) and any("head" in key for key in moved)
