@@ -6,6 +6,7 @@
 #
 #   PYTHON=/path/to/python3.12   the interpreter to use instead of the one that is found
 #   MIKASA_SKIP_SYSTEM=1         do not look at drivers and system libraries at all
+#   MIKASA_NO_UV=1               install packages with pip alone
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/system.sh
@@ -15,6 +16,7 @@ VENV=.venv
 VENV_PYTHON=.venv/bin/python
 LOG=.venv/setup.log
 STAMP=.venv/setup.stamp
+UV='uv>=0.9,<1' # of the machine, not of the environment: it is in no constraint
 NEEDED_GB=10 # the environment has 7 GB; wheels are unpacked beside it while they are installed
 
 say() { printf 'setup: %s\n' "$*"; }
@@ -49,11 +51,34 @@ make_venv() {
   "$PYTHON" -m venv --clear "$VENV"
 }
 
-# Tell of large downloads and of the installation, keep the rest for the log.
+# Tell of large downloads and of the installation, keep the rest for the log: first pip's words, then uv's.
 show_progress() {
   sed -u -nE \
     -e 's/^ *Downloading (.*\/)?([^-/]+-[^-]+)-.*\(([0-9.]+ GB|[0-9]{3,}\.[0-9] MB)\).*/setup:   downloading \2 (\3)/p' \
-    -e 's/^Installing collected packages:(.*,){3}.*/setup:   installing/p'
+    -e 's/^Installing collected packages:(.*,){3}.*/setup:   installing/p' \
+    -e 's/^ *Downloading ([^ ]+) \(([0-9.]+GiB|[0-9]{3,}\.[0-9]MiB)\).*/setup:   downloading \1 (\2)/p' \
+    -e 's/^Prepared [0-9]{2,} packages.*/setup:   installing/p'
+}
+
+# uv unpacks a wheel once per machine and links it into each environment; pip unpacks 7 GB each time.
+# It reads neither pip's files nor its variables, so what it needs of them is handed on.
+uv_install() {
+  local index handed=("UV_HTTP_TIMEOUT=${UV_HTTP_TIMEOUT:-180}")
+  if [ -n "${PIP_NO_INDEX:-}${MIKASA_NO_UV:-}" ]; then return 1; fi
+  "$VENV_PYTHON" -m pip install --quiet --disable-pip-version-check "$UV" >>"$LOG" 2>&1 || return 1
+  index=${PIP_INDEX_URL:-$("$VENV_PYTHON" -m pip config get global.index-url 2>/dev/null || true)}
+  if [ -n "$index" ]; then handed+=("UV_DEFAULT_INDEX=$index"); fi
+  if [ -n "${PIP_FIND_LINKS:-}" ]; then handed+=("UV_FIND_LINKS=${PIP_FIND_LINKS// /,}"); fi
+  if [ -n "${PIP_CERT:-}" ]; then handed+=("SSL_CERT_FILE=$PIP_CERT"); fi
+  env "${handed[@]}" "$VENV/bin/uv" pip install --python "$VENV_PYTHON" "$@" 2>&1 |
+    tee -a "$LOG" | show_progress
+}
+
+# Where uv cannot, pip may: it knows this machine's mirrors, wheel folders and certificates.
+install_packages() {
+  if uv_install "$@"; then return; fi
+  say "  by pip"
+  pip_install "$@"
 }
 
 pip_install() {
@@ -98,7 +123,7 @@ main() {
   : >"$LOG"
   say "installing the packages of constraints.txt (several GB the first time)"
   install_empty_wheels
-  pip_install -c constraints.txt -e '.[dev]'
+  install_packages -c constraints.txt -e '.[dev]'
   repair_cv2
   fingerprint >"$STAMP"
   say "done. Next: make demo, or $VENV/bin/mikasa-vla doctor"

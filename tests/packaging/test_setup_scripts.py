@@ -266,10 +266,77 @@ class TestPython:
         assert shell(f"{functions}python_package").stdout.strip() == f"{version}-venv"
 
 
+class TestPackages:
+    @pytest.fixture
+    def venv(self, tmp_path: Path) -> Path:
+        """An environment whose pip is told of a mirror, and whose uv says what it was told."""
+        venv = tmp_path / "venv"
+        (venv / "bin").mkdir(parents=True)
+        python = '#!/bin/sh\n[ "$3 $4" = "config get" ] && echo http://conf.example/simple\nexit 0\n'
+        (venv / "bin" / "python").write_text(python)
+        (venv / "bin" / "uv").write_text('#!/bin/sh\nenv\necho "arguments $*"\n')
+        for file in (venv / "bin").iterdir():
+            file.chmod(0o755)
+        return venv
+
+    def told(self, venv: Path, **variables: str) -> str:
+        names = f"VENV={venv} VENV_PYTHON={venv}/bin/python LOG={venv}/log"
+        done = shell(f"{names}\nuv_install -c constraints.txt -e '.[dev]'", **variables)
+        assert done.returncode == 0, done.stderr
+        return (venv / "log").read_text()
+
+    def test_uv_gets_the_index_the_wheels_and_the_certificates_that_pip_has(self, venv: Path) -> None:
+        told = self.told(venv, PIP_FIND_LINKS="/a /b", PIP_CERT="/c.pem")
+        for line in (
+            "UV_DEFAULT_INDEX=http://conf.example/simple",
+            "UV_FIND_LINKS=/a,/b",
+            "SSL_CERT_FILE=/c.pem",
+            f"arguments pip install --python {venv}/bin/python -c constraints.txt -e .[dev]",
+        ):
+            assert f"{line}\n" in told
+        told = self.told(venv, PIP_INDEX_URL="http://variable.example/simple")
+        assert "UV_DEFAULT_INDEX=http://variable.example/simple\n" in told
+
+    @pytest.mark.parametrize(
+        ("uv", "variables"),
+        [
+            ("return 1", {}),
+            # Its last word is what counts, not that of the filter of its lines.
+            ("false | show_progress", {}),
+            (None, {"PIP_NO_INDEX": "1"}),
+            (None, {"MIKASA_NO_UV": "1"}),
+        ],
+    )
+    def test_where_uv_cannot_install_pip_does(
+        self, venv: Path, uv: str | None, variables: dict[str, str]
+    ) -> None:
+        names = f"VENV={venv} VENV_PYTHON={venv}/bin/python LOG={venv}/log"
+        uv_install = "" if uv is None else f"uv_install() {{ {uv}; }}\n"
+        done = shell(
+            f'{names}\n{uv_install}pip_install() {{ echo "pip: $*"; }}\ninstall_packages -e .', **variables
+        )
+        assert done.stdout == "setup:   by pip\npip: -e .\n"
+
+    def test_large_downloads_are_told_whoever_makes_them(self) -> None:
+        lines = [
+            "  Downloading torch-2.11.0-cp312-cp312-manylinux_2_28_x86_64.whl (530.7 MB)",
+            "  Downloading six-1.17.0-py2.py3-none-any.whl (11 kB)",
+            "Downloading torch (506.1MiB)",
+            "Downloading pillow (6.3MiB)",
+            "Prepared 199 packages in 1m 2s",
+        ]
+        done = shell("printf '%s\\n' \"$LINES_SHOWN\" | show_progress", LINES_SHOWN="\n".join(lines))
+        assert done.stdout.splitlines() == [
+            "setup:   downloading torch-2.11.0 (530.7 MB)",
+            "setup:   downloading torch (506.1MiB)",
+            "setup:   installing",
+        ]
+
+
 def test_a_finished_set_up_does_nothing_when_run_again() -> None:
     functions = (
         "is_up_to_date() { return 0; }\nensure_system() { :; }\n"
-        "make_venv() { echo made; }\npip_install() { echo installed; }\n"
+        "make_venv() { echo made; }\npip_install() { echo installed; }\nuv_install() { echo installed; }\n"
     )
     done = shell(f"{functions}main")
     assert (done.returncode, done.stdout) == (0, "")
