@@ -10,6 +10,9 @@ import yaml
 
 from vla_eval.cli.main import build_parser, main
 from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
+from vla_eval.core import EpisodeStart
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import VlaEvalError
 from vla_eval.model_table import (
     evaluations,
@@ -18,8 +21,13 @@ from vla_eval.model_table import (
     is_model_table,
     load_model_table,
 )
+from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.scripted import make_oracle
 from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.results.paper_table import PAPER_TABLE
+from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.tasks.catalog import task_spec
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
@@ -164,6 +172,19 @@ def test_a_flag_is_refused_or_used(verb: str, refused: dict[str, str]) -> None:
     flags = {action.dest: action.option_strings for action in choices[verb]._actions if action.option_strings}
     assert all(flag in flags[name] for name, flag in refused.items())
     assert flags.keys() - refused.keys() == USED[verb]
+
+
+@pytest.mark.parametrize("task", load_model_table(PAPER).tasks)
+def test_demonstrations_of_every_task_of_the_table_can_be_recorded_on_the_stand_in(task: str) -> None:
+    env = make_env(EnvSettings(task=task, simulator="fake", privileged=True))
+    chunking = ChunkingSpec(n_action_steps=1)
+    n_candidates = 0 if task_spec(task).candidates is None else 9
+    context = PolicyContext(name="oracle", env=env.spec, chunking=chunking, n_candidates=n_candidates)
+    start = EpisodeStart(
+        slot=0, task=task, seed=1000, run=0, instruction="go", horizon_steps=env.spec.horizon_steps
+    )
+    (record,) = rollout(env, make_oracle(context), [start], RolloutSettings(chunking=chunking))
+    assert record.success_once
 
 
 @pytest.mark.slow

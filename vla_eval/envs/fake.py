@@ -36,6 +36,7 @@ TCP_START_M = (-0.07, 0.0, 0.318)
 CANDIDATE_SPACING_M = 0.1
 CANDIDATE_Z_M = 0.02
 REACH_M = 0.05
+MUG_REACH_M = 0.07  # the arm comes to rest on a mug, which is taller than a cube
 STATIC_ACTION = 0.2  # below it in each dimension the point counts as at rest
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
@@ -105,6 +106,7 @@ class FakeEnv:
         self._n_items: int = arguments.get("n_items", 0)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
         self._in_order = task.memory == "sequential"
+        self._touch_reach_m = MUG_REACH_M if task.id.startswith("ShellGame") else REACH_M
         self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
         self._cue_steps: int = arguments.get("cue_steps", 0)
         self._response_step: int = self._cue_steps + arguments.get("delay_steps", 0)
@@ -189,7 +191,7 @@ class FakeEnv:
             return None
         distances = np.linalg.norm(episode.candidates_m - episode.tcp_m, axis=1)
         nearest = int(np.argmin(distances))
-        return nearest if distances[nearest] <= REACH_M else None
+        return nearest if distances[nearest] <= self._touch_reach_m else None
 
     def _is_complete(self, episode: _Episode) -> bool:
         """Whether all right candidates have been touched; where there are several, nothing else may be."""
