@@ -1,8 +1,12 @@
 """`mikasa-vla view`: which recordings it finds, and what it says where there are none."""
 
+import shutil
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
+from rerun.experimental import RrdReader
 
 from vla_eval.cli.main import main
 from vla_eval.results.recording_files import rrd_file
@@ -69,8 +73,79 @@ def test_without_a_screen_it_says_what_else_can_be_done(
     assert "--web" in capsys.readouterr().err
 
 
-def test_a_dataset_is_shown_by_lerobots_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    assert main(["view", str(tmp_path)]) == 1
-    assert "lerobot-dataset-viz" in capsys.readouterr().err
+class TestDataset:
+    @pytest.fixture(autouse=True)
+    def cache_of_its_own(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def curves(self, path: Path) -> dict[str, list[float]]:
+        """Return each curve of a recording, as rerun's own reader gives it, in the order of steps."""
+        found: dict[str, dict[int, float]] = {}
+        for chunk in RrdReader(path).store().stream().to_chunks():
+            batch = chunk.to_record_batch().to_pydict()
+            if "Scalars:scalars" in batch:
+                values = [value for (value,) in batch["Scalars:scalars"]]
+                found.setdefault(chunk.entity_path, {}).update(zip(batch["step"], values, strict=True))
+        return {entity: [points[step] for step in sorted(points)] for entity, points in found.items()}
+
+    def test_an_episode_is_shown_with_its_pictures_numbers_and_phases(
+        self, recorded: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["view", str(recorded), "--episode", "1", "--print"]) == 0
+        path = Path(capsys.readouterr().out.strip())
+        assert path.name == "episode_000001.rrd" and not list(path.parent.glob("*.part"))
+
+        table = pd.read_parquet(next(recorded.glob("data/*/*.parquet")))
+        rows = table[table["episode_index"] == 1]
+        curves = self.curves(path)
+        stored = np.stack(rows["action"].to_list())
+        for dim, name in enumerate(("dx", "dy", "dz", "drx", "dry", "drz", "gripper")):
+            np.testing.assert_array_equal(curves[f"/actions/{name}/stored"], stored[:, dim])
+        x = np.stack(rows["observation.state"].to_list())[:, 0]
+        np.testing.assert_array_equal(curves["/state/x"], x)
+        # 14 frames: 5 of the cue, 5 of the delay, and the rest.
+        phases = {name: curves[f"/phase/{name}"] for name in ("cue", "delay", "response")}
+        assert phases["cue"] == [1.0] * 5 + [0.0] * 9
+        assert phases["delay"] == [0.0] * 5 + [1.0] * 5 + [0.0] * 4
+        assert phases["response"] == [0.0] * 10 + [1.0] * 4
+        entities = set(RrdReader(path).store().schema().entity_paths())
+        assert {"/cameras/base", "/cameras/wrist", "/world/tcp", "/world/tcp_path"} <= entities
+        assert {"/reward", "/success", "/events", "/instruction"} <= entities
+        assert len(RrdReader(path).blueprints()) == 1
+
+    def test_without_a_choice_the_first_are_shown_and_a_seed_picks_one(
+        self, recorded: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["view", str(recorded), "--print"]) == 0
+        names = [Path(line).name for line in capsys.readouterr().out.split()]
+        assert names == [f"episode_{number:06d}.rrd" for number in range(4)]
+        # Seeds 1000, 1001, 1003, 1004.
+        assert main(["view", str(recorded), "--seed", "1003", "--print"]) == 0
+        assert Path(capsys.readouterr().out.strip()).name == "episode_000002.rrd"
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--episode", "4"], "there is no episode 4; they are 0 to 3."),
+            (["--seed", "1002"], "no episode of seed 1002. Its seeds: 1000, 1001, 1003, 1004."),
+            (["--policy", "p"], "is a dataset; --policy is of runs."),
+        ],
+    )
+    def test_what_it_does_not_have_is_answered(
+        self, recorded: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    ) -> None:
+        assert main(["view", str(recorded), *arguments, "--print"]) == 1
+        assert said in capsys.readouterr().err
+
+    def test_a_dataset_that_nobody_recorded_here_is_shown_without_phases(
+        self, recorded: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        shutil.rmtree(recorded / "meta" / "mikasa")
+        assert main(["view", str(recorded), "--episode", "0", "--print"]) == 0
+        curves = self.curves(Path(capsys.readouterr().out.strip()))
+        assert "/actions/dx/stored" in curves and not any(name.startswith("/phase") for name in curves)
+
+
+def test_a_run_has_no_numbered_episodes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(folder), "--episode", "0", "--print"]) == 1
+    assert "--episode is of datasets" in capsys.readouterr().err

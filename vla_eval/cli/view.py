@@ -1,6 +1,7 @@
-"""`mikasa-vla view`: open recorded episodes of a run in the rerun viewer."""
+"""`mikasa-vla view`: open recorded episodes of a run, or episodes of a dataset, in the rerun viewer."""
 
 import argparse
+import hashlib
 import os
 import subprocess
 import sys
@@ -9,26 +10,31 @@ from typing import Any
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --record-rrd …` recorded in the rerun viewer.
 
+RUN may also be a dataset (OUT/TASK of `mikasa-vla record`, or any LeRobotDataset v3): its episodes are shown.
 Without a choice, the first five are opened. On a machine without a screen, --web serves the viewer to a
 browser, and --print names the files, to be copied to a machine with one (`rerun FILE…` opens them)."""
 DATASET_FILE = Path("meta") / "info.json"
+RUN_FLAGS = {"--task": "task", "--policy": "policy", "--n-action-steps": "n_action_steps"}
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "view",
-        help="open recorded episodes in the rerun viewer",
+        help="open recorded episodes, or a dataset's, in the rerun viewer",
         description=DESCRIPTION,
         epilog="docs/recordings.md says what is in a recording.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder (runs/…)")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder (runs/…), or a dataset")
     parser.add_argument("--seed", type=int, metavar="S", help="only this seed")
     parser.add_argument("--task", metavar="T", help="only this task")
     parser.add_argument("--policy", metavar="P", help="only this policy")
     parser.add_argument("--n-action-steps", type=int, metavar="K", help="only this K")
+    parser.add_argument(
+        "--episode", type=int, nargs="+", metavar="I", help="of a dataset: only these numbers"
+    )
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--web", action="store_true", help="serve the viewer to a browser")
     how.add_argument("--print", action="store_true", help="print the paths of the files, open nothing")
@@ -38,20 +44,13 @@ def run(args: argparse.Namespace) -> int:
     """Find the recordings and open them.
 
     Raises:
-        VlaEvalError: RUN is no run folder, holds no such recording, or there is no screen.
+        VlaEvalError: RUN is neither run folder nor dataset, holds no such episode, or there is no screen.
     """
     # Here and not above: `mikasa-vla --help` need not wait for them.
     from vla_eval.errors import ViewingError
-    from vla_eval.results.store import read_run
-    from vla_eval.viz.picking import MOST_OPENED, Wish, pick
+    from vla_eval.viz.picking import MOST_OPENED
 
-    if (args.run / DATASET_FILE).is_file():
-        raise ViewingError(
-            f"{args.run}: is a dataset, not a run. LeRobot's own viewer shows it: lerobot-dataset-viz "
-            f"--repo-id {args.run.name} --root {args.run} --episode-index 0"
-        )
-    wish = Wish(task=args.task, policy=args.policy, n_action_steps=args.n_action_steps, seed=args.seed)
-    found = pick(read_run(args.run), wish)
+    found = _of_dataset(args) if (args.run / DATASET_FILE).is_file() else _of_run(args)
     if args.print:
         print("\n".join(map(str, found)))
         return 0
@@ -64,6 +63,34 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(found)} recordings; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr)
     command = [sys.executable, "-m", "rerun", *map(str, found[:MOST_OPENED])]
     return subprocess.run([*command, "--web-viewer"] if args.web else command, check=False).returncode
+
+
+def _of_run(args: argparse.Namespace) -> list[Path]:
+    from vla_eval.errors import ViewingError
+    from vla_eval.results.store import read_run
+    from vla_eval.viz.picking import Wish, pick
+
+    if args.episode is not None:
+        raise ViewingError(f"{args.run}: is a run; --episode is of datasets. --seed picks one of a run.")
+    wish = Wish(task=args.task, policy=args.policy, n_action_steps=args.n_action_steps, seed=args.seed)
+    return pick(read_run(args.run), wish)
+
+
+def _of_dataset(args: argparse.Namespace) -> list[Path]:
+    """Write the episodes into the user's cache, from where the viewer opens them."""
+    from vla_eval.cache import cache_dir
+    from vla_eval.errors import ViewingError
+    from vla_eval.viz.dataset_rrd import EpisodeWish, write_dataset_rrds
+    from vla_eval.viz.picking import MOST_OPENED
+
+    given = [flag for flag, name in RUN_FLAGS.items() if getattr(args, name) is not None]
+    if given:
+        raise ViewingError(
+            f"{args.run}: is a dataset; {', '.join(given)} is of runs. Use --episode or --seed."
+        )
+    place = hashlib.sha256(str(args.run.resolve()).encode()).hexdigest()[:12]
+    wish = EpisodeWish(episodes=tuple(args.episode or ()), seed=args.seed, most=MOST_OPENED)
+    return write_dataset_rrds(args.run, wish, cache_dir() / "rrd" / f"{args.run.resolve().name}-{place}")
 
 
 def _has_screen() -> bool:

@@ -5,12 +5,15 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 
-def layout(cameras: Sequence[str], action_dims: Sequence[str]) -> rrb.Blueprint:
+def layout(
+    cameras: Sequence[str], action_dims: Sequence[str], state_dims: Sequence[str] = ()
+) -> rrb.Blueprint:
     """Return the blueprint: the world and the cameras above, curves and words below.
 
     Args:
         cameras: the cameras that there are pictures of.
         action_dims: the entries of an action.
+        state_dims: the entries of the proprioception; of datasets alone.
     """
     views = [rrb.Spatial2DView(origin=f"cameras/{name}", name=name) for name in cameras]
     above = rrb.Horizontal(
@@ -25,12 +28,13 @@ def layout(cameras: Sequence[str], action_dims: Sequence[str]) -> rrb.Blueprint:
     )
     curves = rrb.Tabs(
         *(rrb.TimeSeriesView(origin=f"actions/{name}", name=name) for name in action_dims),
+        *([rrb.TimeSeriesView(origin="state", name="state")] if state_dims else []),
         name="actions",
     )
     states = rrb.Vertical(
         rrb.TimeSeriesView(origin="phase", name="phase"),
         rrb.TimeSeriesView(
-            origin="/", contents=["/gripper/**", "/reward", "/choice/**"], name="gripper, reward"
+            origin="/", contents=["/gripper/**", "/reward", "/success", "/choice/**"], name="gripper, reward"
         ),
     )
     below = rrb.Horizontal(curves, states, column_shares=[3, 2])
