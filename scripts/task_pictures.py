@@ -1,6 +1,6 @@
 """Make the pictures of `docs/tasks/*.md`: what the two cameras see in each phase of each task.
 
-Usage: .venv/bin/python scripts/task_pictures.py [DOCS_IMAGES_FOLDER]
+Usage: .venv/bin/python scripts/task_pictures.py [DOCS_IMAGES_FOLDER [TASK…]]
 """
 
 import sys
@@ -22,8 +22,18 @@ STEPS = {
     "RememberColor3-v0": (0, 5, 10, 16, 22),
     "RememberColor5-v0": (0, 5, 10, 16, 22),
     "RememberColor9-v0": (0, 5, 10, 16, 22),
+    "RememberShape9-v0": (0, 5, 10, 16, 22),
+    "RememberShapeAndColor3x3-v0": (0, 5, 10, 16, 22),
     "ShellGameTouch-v0": (0, 4, 5, 10, 16),
+    "ShellGamePush-v0": (0, 4, 5, 14, 22),
+    "ShellGamePick-v0": (0, 4, 5, 26, 38),
     "InterceptMedium-v0": (0, 8, 16, 24, 32),
+    "InterceptGrabMedium-v0": (0, 8, 14, 20, 28),
+    "RotateStrictPos-v0": (0, 12, 20, 28, 36),
+    "TakeItBack-v0": (0, 6, 10, 14, 20),
+    "BunchOfColors3-v0": (0, 5, 10, 24, 38),
+    "SeqOfColors3-v0": (0, 5, 10, 20, 48),
+    "ChainOfColors3-v0": (0, 5, 10, 20, 48),
 }
 SEED = 1
 GAP_PX = 2
@@ -62,7 +72,7 @@ def main() -> None:
     """Write one PNG per task."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images")
     folder.mkdir(parents=True, exist_ok=True)
-    for task in STEPS:
+    for task in sys.argv[2:] or STEPS:
         cv2.imwrite(str(folder / f"{task}.png"), cv2.cvtColor(picture(task), cv2.COLOR_RGB2BGR))
 
 
