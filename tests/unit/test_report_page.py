@@ -155,6 +155,14 @@ def test_every_section_is_there_and_speaks() -> None:
     assert "3.12.1" in sections["reproduce"]
 
 
+def test_targets_and_choices_are_called_by_the_colors_of_the_cubes() -> None:
+    choices = Page(full_page()).sections["choices"]
+    # Seeds 0 to 5 have targets 0, 1, 2, 0, 1, 2; seeds 4 and 5 end with the next color.
+    rows = ("red2000", "green0110", "blue1010")
+    matrix = "".join(choices.split("target ↓ ")[1].split())
+    assert matrix.startswith("chosen→redgreenbluenone" + "".join(rows))
+
+
 def test_what_is_missing_is_said_in_words() -> None:
     record = episode("p", 1, True, task=INTERCEPT)
     sections = Page(build_page([stored(record)])).sections

@@ -3,6 +3,7 @@
 from vla_eval.page.markup import UNKNOWN, Markup, details, element, joined, paragraph, section, table
 from vla_eval.page.material import Material
 from vla_eval.results.choices import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.tasks.item_names import item_names
 
 TITLES: dict[Cause, str] = {
     "right": "right choice",
@@ -35,14 +36,16 @@ def choices_section(material: Material) -> Markup:
         [
             material.name_of(row, with_task=True),
             *(str(report.causes[cause]) for cause in CAUSES),
-            _habit(report, "place"),
-            _habit(report, "item"),
+            _habit(report, "place", row.task),
+            _habit(report, "item", row.task),
         ]
         for row, report in found
     ]
     titles = ["policy", *(TITLES[cause] for cause in CAUSES), "habit of place", "habit of item"]
     numeric = [False, *[True] * len(CAUSES), False, False]
-    matrices = [details(material.name_of(row, with_task=True), *_matrices(report)) for row, report in found]
+    matrices = [
+        details(material.name_of(row, with_task=True), *_matrices(report, row.task)) for row, report in found
+    ]
     return section(
         "choices",
         title,
@@ -77,7 +80,7 @@ def _missing(reports: list[ChoiceReport]) -> Markup:
     return joined(paragraph(text, muted=True) for text in said)
 
 
-def _habit(report: ChoiceReport, kind: Kind) -> str:
+def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
     habit = report.habits[kind]
     if habit is None:
         return UNKNOWN
@@ -85,30 +88,35 @@ def _habit(report: ChoiceReport, kind: Kind) -> str:
         return f"not shown (p={habit.p_value:.2g})"
     share = f"{habit.n_chosen}/{habit.n_possible}"
     luck = f"{habit.by_luck:.2f} by luck, p={habit.p_value:.2g}"
-    return f"{kind} {habit.index}: {share} of the wrong choices ({luck})"
+    return f"{kind} {_names(report, kind, task)[habit.index]}: {share} of the wrong choices ({luck})"
 
 
-def _matrices(report: ChoiceReport) -> list[Markup]:
+def _matrices(report: ChoiceReport, task: str) -> list[Markup]:
     kinds: tuple[Kind, ...] = ("item", "place")
-    drawn = [_matrix(report, kind) for kind in kinds if report.confusion[kind]]
+    drawn = [_matrix(report, kind, task) for kind in kinds if report.confusion[kind]]
     if not drawn:
         return [paragraph("No single target was recorded for these episodes.")]
     return [element("div", *drawn, class_="plots")]
 
 
-def _matrix(report: ChoiceReport, kind: Kind) -> Markup:
+def _names(report: ChoiceReport, kind: Kind, task: str) -> tuple[str, ...]:
+    return item_names(task if kind == "item" else "", report.n_candidates)
+
+
+def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Markup:
     counts = report.confusion[kind]
     most = max(counts.values())
+    names = _names(report, kind, task)
     chosen: list[int | None] = [*range(report.n_candidates), None]
     head = element(
         "tr",
         element("th", "target ↓ chosen →", scope="col"),
-        *(element("th", "none" if i is None else str(i), scope="col") for i in chosen),
+        *(element("th", "none" if i is None else names[i], scope="col") for i in chosen),
     )
     body = [
         element(
             "tr",
-            element("th", str(target), scope="row"),
+            element("th", names[target], scope="row"),
             *(_cell(counts.get((target, choice), 0), most, is_right=target == choice) for choice in chosen),
         )
         for target in range(report.n_candidates)
