@@ -183,6 +183,22 @@ def test_the_same_episodes_in_two_folders_are_counted_once() -> None:
     assert has_note(table, "runs/b: 4 episodes with the same trajectory as in another run folder")
 
 
+@pytest.mark.parametrize("seeds", [(1, 2), (3, 4)])
+def test_episodes_of_other_weights_are_a_further_run_even_if_they_end_alike(seeds: tuple[int, ...]) -> None:
+    """Two trainings that learned nothing may move alike; they are two trainings all the same."""
+    one = stored(episodes("p", "--"))
+    other = stored([episode("p", seed, "-") for seed in seeds], path="runs/b")
+    weights = [{"checkpoints/p": digest, "policies/p": "f00d"} for digest in ("1", "2")]
+    described = [
+        replace(run, description=replace(run.description, recipes=recipes))
+        for run, recipes in zip((one, other), weights, strict=True)
+    ]
+    row = only_row(build_table(described), "p")
+    assert (row.n_runs, row.n_episodes) == (2, 4)
+    again = [described[0], replace(described[0], path=Path("runs/c"))]
+    assert only_row(build_table(again), "p").n_episodes == 2
+
+
 def test_equal_keys_with_other_trajectories_are_a_further_run() -> None:
     other = [episode("p", seed, "-", trajectory_sha256=f"other {seed}") for seed in (1, 2)]
     table = build_table([stored(episodes("p", "++")), stored(other, path="runs/b")])
@@ -305,6 +321,15 @@ def test_a_run_that_was_continued_elsewhere_is_named() -> None:
 def test_figures_of_the_fake_simulator_are_called_worthless() -> None:
     table = build_table([stored(episodes("p", "+"), simulator="fake")])
     assert has_note(table, "fake simulator", "mean nothing")
+
+
+def test_what_holds_for_many_folders_is_said_once() -> None:
+    runs = [stored([episode("p", seed, "+")], path=f"runs/{seed}", simulator="fake") for seed in range(1, 12)]
+    notes = [note for note in build_table(runs).notes if "fake simulator" in note]
+    assert notes == [
+        "runs/1 and 10 more run folders: made with the fake simulator, which has no physics; its rates mean "
+        "nothing."
+    ]
 
 
 # ------------------------------------------------------------------------------- comparison

@@ -21,6 +21,7 @@ VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", 
 POLICY_NAMES = "policy_names"  # the policies' names in records, in the configuration of a run
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
 PROMPTS = "prompts/"  # recipes of which the names begin so hold the instructions
+WEIGHTS = "checkpoints/"  # recipes of which the names begin so are the weights of a policy
 DIGITS = 8
 DEFAULT = "default"
 
@@ -40,7 +41,8 @@ class Run:
 
     Attributes:
         index: the run index that its records carry.
-        copy: 0, or 1, 2 … where further run folders hold the same episodes with other trajectories.
+        copy: 0, or 1, 2 … where further run folders hold the same episodes with other trajectories, or of
+            other weights.
         records: seed -> record.
     """
 
@@ -79,12 +81,19 @@ class Grouping:
     Attributes:
         groups: by key.
         n_doubles: run folder -> how many of its episodes had been in another folder already.
-        further: run folders that hold the episodes of another folder with other trajectories.
+        further: run folders that hold the episodes of another folder with other trajectories or weights.
     """
 
     groups: Mapping[RowKey, RowGroup]
     n_doubles: Mapping[str, int]
     further: tuple[str, ...]
+
+
+class _Copy(NamedTuple):
+    """Episodes of one run index with the same weights: seed -> record."""
+
+    weights: frozenset[tuple[str, str]]
+    records: dict[int, EpisodeRecord]
 
 
 def group_runs(runs: Sequence[StoredRun]) -> Grouping:
@@ -97,14 +106,14 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
         Rows in the order of tasks and policies in the configurations, then by `n_action_steps`.
     """
     labels = variant_labels(runs)
-    found: dict[RowKey, dict[int, list[dict[int, EpisodeRecord]]]] = defaultdict(lambda: defaultdict(list))
+    found: dict[RowKey, dict[int, list[_Copy]]] = defaultdict(lambda: defaultdict(list))
     n_doubles: dict[str, int] = defaultdict(int)
     further: dict[str, None] = {}
     for stored, label_of in zip(runs, labels, strict=True):
         for (key, index), records in _by_run(stored, label_of).items():
             copies = found[key][index]
             n_copies = len(copies)
-            n_new = _place(copies, records)
+            n_new = _place(copies, _Copy(_weights(stored, key.policy), records))
             if n_new < len(records):
                 n_doubles[str(stored.path)] += len(records) - n_new
             if 0 < n_copies < len(copies):
@@ -128,21 +137,31 @@ def _by_run(
     return found
 
 
-def _runs(by_index: Mapping[int, Sequence[Mapping[int, EpisodeRecord]]]) -> tuple[Run, ...]:
+def _weights(stored: StoredRun, policy: str) -> frozenset[tuple[str, str]]:
+    """Return the digests of a policy's weights; none for a policy without."""
+    name = f"{WEIGHTS}{policy}"
+    recipes = stored.description.recipes.items()
+    return frozenset((key, digest) for key, digest in recipes if key == name or key.startswith(f"{name}/"))
+
+
+def _runs(by_index: Mapping[int, Sequence[_Copy]]) -> tuple[Run, ...]:
     return tuple(
-        Run(index=index, copy=copy, records=records)
+        Run(index=index, copy=number, records=copy.records)
         for index, copies in sorted(by_index.items())
-        for copy, records in enumerate(copies)
+        for number, copy in enumerate(copies)
     )
 
 
-def _place(copies: list[dict[int, EpisodeRecord]], own: Mapping[int, EpisodeRecord]) -> int:
+def _place(copies: list[_Copy], found: _Copy) -> int:
     """Put one folder's episodes of one run where they belong; return how many were new.
 
-    They belong to a run that is known already if they do not contradict it (the seeds of one run may
-    be spread over folders, and one folder may be a copy of another); else they are a further run.
+    They belong to a run that is known already if its policy had the same weights and they do not contradict
+    it (the seeds of one run may be spread over folders, and one folder may be a copy of another); else they
+    are a further run.
     """
-    for known in copies:
+    own = found.records
+    alike = [copy.records for copy in copies if copy.weights == found.weights]
+    for known in alike:
         if _belongs(known, own):
             fresh = {
                 seed: record
@@ -154,9 +173,9 @@ def _place(copies: list[dict[int, EpisodeRecord]], own: Mapping[int, EpisodeReco
     fresh = {
         seed: record
         for seed, record in own.items()
-        if not any(seed in known and _is_same(known[seed], record) for known in copies)
+        if not any(seed in known and _is_same(known[seed], record) for known in alike)
     }
-    copies.append(fresh)
+    copies.append(_Copy(found.weights, fresh))
     return len(fresh)
 
 

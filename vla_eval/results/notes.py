@@ -129,34 +129,43 @@ def _error_notes(rows: Sequence[Row]) -> list[str]:
 
 def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
     """Say what is particular about the run folders."""
-    notes = [
-        note for run in runs for note in (*_no_evidence(run), *_incomplete(run), *_continued_elsewhere(run))
-    ]
+    notes = [(str(run.path), note) for run in runs for note in _no_evidence(run)]
+    doubles = "with the same trajectory as in another run folder; each is counted once."
+    notes += [(path, f"{_number(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
     notes += [
-        f"{path}: {_number(n, 'episode')} with the same trajectory as in another run folder; each is counted "
-        "once."
-        for path, n in grouping.n_doubles.items()
-    ]
-    notes += [
-        f"{path}: repeats episodes of another run folder (same run and seed) with other trajectories; they "
-        "count as further runs."
+        (
+            path,
+            "repeats episodes of another run folder (same run and seed) with other trajectories or weights; "
+            "they count as further runs.",
+        )
         for path in grouping.further
     ]
-    return notes + _environment_differences(runs) + _recipe_differences(runs)
+    own = [note for run in runs for note in (*_incomplete(run), *_continued_elsewhere(run))]
+    return _told_together(notes) + own + _environment_differences(runs) + _recipe_differences(runs)
+
+
+def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
+    """Say once what holds for many folders; a few are named one by one."""
+    paths_of: dict[str, list[str]] = {}
+    for path, note in notes:
+        paths_of.setdefault(note, []).append(path)
+    told = []
+    for note, paths in paths_of.items():
+        if len(paths) > MAX_NAMED:
+            told.append(f"{paths[0]} and {len(paths) - 1} more run folders: {note}")
+        else:
+            told += [f"{path}: {note}" for path in paths]
+    return told
 
 
 def _no_evidence(run: StoredRun) -> list[str]:
     """Name what makes the figures of a run worthless, or impossible to make again."""
     notes = []
     if run.description.config.get("simulator") == "fake":
-        notes.append(
-            f"{run.path}: made with the fake simulator, which has no physics; its rates mean nothing."
-        )
+        notes.append("made with the fake simulator, which has no physics; its rates mean nothing.")
     source = run.description.environment.get("vla_eval")
     if isinstance(source, Mapping) and source.get("changes") is not None:
-        notes.append(
-            f"{run.path}: made with uncommitted changes to the package; the commit does not tell them."
-        )
+        notes.append("made with uncommitted changes to the package; the commit does not tell them.")
     return notes
 
 
