@@ -16,6 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
+from torch.utils.data import DataLoader
 
 from vla_eval.cli.main import main
 from vla_eval.data import recording as recording_module
@@ -24,6 +26,7 @@ from vla_eval.data.dataset_folder import check_dataset, open_recorded
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
+from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.recording import RecordedDataset, record
 from vla_eval.data.recording_folder import LOCK_FILE, STATE_FOLDER
@@ -36,6 +39,7 @@ from vla_eval.decoding import decode
 from vla_eval.episode_worker import Failed, Heartbeat
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
 from vla_eval.results.durable import FolderLock
+from vla_eval.training.dataset import training_dataset
 
 TASK = "RememberColor3-v0"
 FIELDS: dict[str, Any] = {
@@ -185,7 +189,7 @@ class TestKill:
         process.send_signal(signal.SIGKILL)
         process.wait()
 
-    def test_killed_twice_and_by_two_workers_it_is_the_same_dataset(
+    def test_killed_twice_and_by_two_workers_it_is_the_same_dataset_which_replays_and_is_trained_on(
         self, recorded: RecordedDataset, tmp_path: Path
     ) -> None:
         out = tmp_path / "out"
@@ -204,6 +208,18 @@ class TestKill:
 
         # Tables, videos, statistics and manifest: each file byte for byte.
         assert check_dataset(out / TASK).files == recorded.facts.files
+
+        with pytest.raises(DatasetError, match="no replay has confirmed this dataset"):
+            training_dataset(out / TASK, allow_unreplayed=False)
+        assert main(["replay", str(out / TASK), "--workers", "1"]) == 0
+        assert training_dataset(out / TASK, allow_unreplayed=False).sha256
+        window = {"action": [0.0, 0.05]}
+        source = open_recorded(out / TASK, delta_timestamps=window)
+        served = MemoryDataset(source, cache=tmp_path / "cache")
+        batch = next(iter(DataLoader(served, batch_size=4)))
+        assert batch["action"].shape == (4, 2, 7)
+        # lerobot's own dataset decodes the same pictures.
+        assert torch.equal(batch["observation.images.wrist"][3], source[3]["observation.images.wrist"])
 
 
 class TestReplay:
