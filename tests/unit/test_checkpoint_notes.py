@@ -132,6 +132,15 @@ def test_a_statistic_that_is_used_and_not_there_is_an_error(checkpoint: Path) ->
         normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
 
 
+def test_a_kind_of_normalisation_that_is_not_known_is_an_error(checkpoint: Path) -> None:
+    file = checkpoint / "policy_postprocessor.json"
+    file.write_text(file.read_text().replace("q01_q99", "min_max"))
+    with pytest.raises(
+        CheckpointError, match=r"mikasa_decoder normalises 'action' by 'min_max', known are m"
+    ):
+        normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
+
+
 def test_a_run_of_a_version_that_did_not_note_them_can_be_read(tmp_path: Path) -> None:
     described = RunDescription(
         name="a",

@@ -34,6 +34,8 @@ NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
 https://github.com/huggingface/lerobot/blob/v0.6.1/src/lerobot/processor/normalize_processor.py"""
 LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
 OWN_STEPS = frozenset({"mikasa_encoder", "mikasa_decoder"})
+OWN_KINDS: Mapping[str, str] = {"mean_std": "MEAN_STD", "q01_q99": "QUANTILES"}
+"""What our own steps call the same."""
 
 
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
@@ -119,9 +121,13 @@ def _names(step: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield field, statistic and the name of its tensor for all that a step uses."""
     config = step.get("config", {})
     if step["registry_name"] in OWN_STEPS:
-        kinds = {"mean_std": "MEAN_STD", "q01_q99": "QUANTILES"}
         for field, spec in config.get("fields", {}).items():
-            for name in NEEDED_STATISTICS[kinds[spec["kind"]]]:
+            if spec["kind"] not in OWN_KINDS:
+                raise CheckpointError(
+                    f"{step['registry_name']} normalises '{field}' by '{spec['kind']}', known are "
+                    f"{', '.join(OWN_KINDS)}. Use the version of mikasa-vla-eval that made the checkpoint."
+                )
+            for name in NEEDED_STATISTICS[OWN_KINDS[spec["kind"]]]:
                 yield field, name, f"{field}/{name}"
         return
     for field, feature in config.get("features", {}).items():
