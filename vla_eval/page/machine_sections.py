@@ -13,6 +13,7 @@ from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.run_file import leaves
 from vla_eval.results.store import StoredRun
 from vla_eval.results.timings import measure_latency
+from vla_eval.tasks.item_names import item_names
 
 MAX_SHOWN_VIDEOS = 12
 MAX_VIDEO_BYTES = 16_000_000  # all of them together: a page is to be opened, and sent by mail
@@ -143,8 +144,9 @@ def _episode(one: _Recorded) -> Markup:
     )
     choice = ""
     if record.n_candidates:
-        chosen = "none" if record.first_choice is None else str(record.first_choice)
-        choice = f", target {UNKNOWN if record.target is None else record.target}, chosen {chosen}"
+        names = item_names(record.task, record.n_candidates)
+        chosen = "none" if record.first_choice is None else names[record.first_choice]
+        choice = f", target {UNKNOWN if record.target is None else names[record.target]}, chosen {chosen}"
     thumbnail = thumbnail_file(one.run.path, record)
     poster = _data_uri("image/jpeg", thumbnail) if thumbnail.is_file() else None
     video = element(

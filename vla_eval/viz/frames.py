@@ -8,6 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 from vla_eval.core import ImageArray, Phase
 from vla_eval.envs.settings import HUMAN_CAMERA
 from vla_eval.results.records import EpisodeRecord
+from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 VIEW_PX = 512  # the large view; the others are half of it, one below the other
@@ -75,8 +76,9 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Capt
     parts = [f"step {taped.step}/{start.horizon_steps}", status.phase, f"inference {n_inferences}"]
     parts += ["new chunk"] if is_new else []
     if status.n_candidates:
-        target = "several" if status.target is None else str(status.target)
-        chosen = "none yet" if status.first_choice is None else str(status.first_choice)
+        names = item_names(record.task, status.n_candidates)
+        target = "several" if status.target is None else names[status.target]
+        chosen = "none yet" if status.first_choice is None else names[status.first_choice]
         parts += [f"target {target}", f"chosen {chosen}"]
     outcome, color = "", INK
     if record.success_step is not None and taped.step >= record.success_step:

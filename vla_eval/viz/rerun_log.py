@@ -22,6 +22,7 @@ from vla_eval.core import FloatArray, Phase
 from vla_eval.errors import ViewingError
 from vla_eval.results.recording_files import recording_stem
 from vla_eval.results.records import EpisodeRecord
+from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
@@ -74,8 +75,9 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
     """Log what holds for the whole episode."""
     status = tape.steps[-1].result.status
-    target = "several, or none" if status.target is None else str(status.target)
-    chosen = "none" if status.first_choice is None else str(status.first_choice)
+    names = item_names(record.task, status.n_candidates)
+    target = "several, or none" if status.target is None else names[status.target]
+    chosen = "none" if status.first_choice is None else names[status.first_choice]
     lines = [
         f"# {tape.start.instruction}",
         f"{record.task}, {record.policy}, K={record.n_action_steps}, run {record.run}, seed {record.seed}",
