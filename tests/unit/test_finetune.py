@@ -347,6 +347,22 @@ class TestRefusals:
         with pytest.raises(RecipeError, match=r"oracle\.yaml has no section `finetune`"):
             finetune(FinetuneConfig(policy="oracle", dataset=str(recorded)))
 
+    @pytest.mark.parametrize(("policy", "kind"), [("act", "act"), ("octo_tiny", "mikasa_octo")])
+    def test_lora_has_to_know_its_layers(
+        self, recorded: Path, tmp_path: Path, policy: str, kind: str
+    ) -> None:
+        config = FinetuneConfig(
+            policy=policy,
+            dataset=str(recorded),
+            out=str(tmp_path / "o"),
+            finetune={"lora": {"rank": 2}, "base_checkpoint": str(tmp_path)},
+            device="cpu",
+            allow_unreplayed=True,
+        )
+        with pytest.raises(RecipeError, match=rf"target_modules is not set, and '{kind}' does not say"):
+            finetune(config)
+        assert not (tmp_path / "o").exists()
+
     def test_a_missing_base_says_where_it_was_expected(self, recorded: Path, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match=r"checkpoints/pi0_base: expected a LeRobot checkpoint"):
             finetune(

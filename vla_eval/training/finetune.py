@@ -10,6 +10,8 @@ from unittest.mock import patch
 
 from lerobot.configs.default import DatasetConfig, PeftConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
 
 from vla_eval.data.features import CAMERA_KEYS
 from vla_eval.decoding import decode
@@ -102,6 +104,7 @@ def finetune(
     device = choose_device(config.device)
     if device == "cpu":
         keep_freed_memory()
+    _check_lora_is_told(recipe.value)
     policy = policy_config(recipe.value, dataset, device=device)
     frames = used_frames(policy, dataset)
     out = Path(config.out) if config.out is not None else default_out(config)
@@ -197,6 +200,20 @@ def _lora_targets(lora: LoraRecipe, policy: Any) -> tuple[str | None, tuple[str,
         lora.target_modules or own.get("target_modules"),
         tuple(lora.full_modules or own.get("modules_to_save") or ()),
     )
+
+
+def _check_lora_is_told(recipe: FinetuneRecipe) -> None:
+    """Refuse LoRA where neither the recipe nor the policy says which layers get an adapter."""
+    if recipe.lora is None or recipe.lora.target_modules is not None:
+        return
+    if hasattr(config_class(recipe.type, where="finetune.type"), "lora_defaults"):
+        return
+    chosen = get_policy_class(recipe.type)._get_default_peft_targets
+    if chosen is PreTrainedPolicy._get_default_peft_targets:
+        raise RecipeError(
+            f"finetune.lora.target_modules is not set, and '{recipe.type}' does not say itself which layers "
+            f"get an adapter. Write a regular expression of whole module names, or leave `lora` out."
+        )
 
 
 def _held_out(
