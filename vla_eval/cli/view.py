@@ -47,18 +47,17 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: RUN is neither run folder nor dataset, holds no such episode, or there is no screen.
     """
     # Here and not above: `mikasa-vla --help` need not wait for them.
-    from vla_eval.errors import ViewingError
     from vla_eval.viz.picking import MOST_OPENED
 
-    found = _of_dataset(args) if (args.run / DATASET_FILE).is_file() else _of_run(args)
+    if (args.run / DATASET_FILE).is_file():
+        _check_screen(args)  # before episodes are decoded and written
+        found = _of_dataset(args)
+    else:
+        found = _of_run(args)
+        _check_screen(args)
     if args.print:
         print("\n".join(map(str, found)))
         return 0
-    if not args.web and not _has_screen():
-        raise ViewingError(
-            "There is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set). Use --web to look with a "
-            "browser, or --print and open the files on another machine."
-        )
     if len(found) > MOST_OPENED:
         print(f"{len(found)} recordings; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr)
     command = [sys.executable, "-m", "rerun", *map(str, found[:MOST_OPENED])]
@@ -91,6 +90,16 @@ def _of_dataset(args: argparse.Namespace) -> list[Path]:
     place = hashlib.sha256(str(args.run.resolve()).encode()).hexdigest()[:12]
     wish = EpisodeWish(episodes=tuple(args.episode or ()), seed=args.seed, most=MOST_OPENED)
     return write_dataset_rrds(args.run, wish, cache_dir() / "rrd" / f"{args.run.resolve().name}-{place}")
+
+
+def _check_screen(args: argparse.Namespace) -> None:
+    from vla_eval.errors import ViewingError
+
+    if not args.print and not args.web and not _has_screen():
+        raise ViewingError(
+            "There is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set). Use --web to look with a "
+            "browser, or --print and open the files on another machine."
+        )
 
 
 def _has_screen() -> bool:

@@ -22,8 +22,9 @@ from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, REWARD_KEY, STATE_K
 from vla_eval.data.manifest import MANIFEST_FILE, RecordedEpisode, read_manifest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import ViewingError
+from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step, time_columns
 from vla_eval.viz.rerun_layout import layout
-from vla_eval.viz.rerun_log import APPLICATION, COLORS, JPEG_QUALITY, PHASES
+from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, PHASES
 
 PLACE_NAMES = ("x", "y", "z")
 PATH_FIELDS = (PROPRIO_KEYS["eef"], STATE_KEY)
@@ -53,7 +54,6 @@ def write_dataset_rrds(root: Path, wish: EpisodeWish, folder: Path) -> list[Path
     dataset = open_local_dataset(root)
     recorded = read_manifest(root) if (root / MANIFEST_FILE).is_file() else ()
     numbers = _wished(root, wish, int(dataset.meta.total_episodes), recorded)
-    folder.mkdir(parents=True, exist_ok=True)
     return [
         _write(dataset, number, recorded[number] if recorded else None, folder / f"episode_{number:06d}.rrd")
         for number in numbers
@@ -66,10 +66,8 @@ def _wished(
     if wish.seed is not None:
         found = [one.episode_index for one in recorded if one.seed == wish.seed]
         if not found:
-            seeds = ", ".join(str(one.seed) for one in recorded[:5])
-            known = (
-                f"Its seeds: {seeds}{', …' if len(recorded) > 5 else ''}." if recorded else "It names none."
-            )
+            shown = [str(one.seed) for one in recorded[:5]] + ["…"] * (len(recorded) > 5)
+            known = f"Its seeds: {', '.join(shown)}." if shown else "It names none."
             raise ViewingError(f"{root}: no episode of seed {wish.seed}. {known}")
         return found
     for number in wish.episodes:
@@ -81,21 +79,18 @@ def _wished(
 def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Path) -> Path:
     row = dataset.meta.episodes[number]
     frames = [dataset[index] for index in range(row["dataset_from_index"], row["dataset_to_index"])]
-    unfinished = path.with_suffix(".part")
-    try:
-        unfinished.touch()  # rerun itself does not say so where it cannot write
-        with rr.RecordingStream(APPLICATION, recording_id=f"{dataset.root.name}_{number}") as stream:
-            stream.save(str(unfinished), default_blueprint=_layout(dataset))
-            _log_facts(stream, dataset, number, frames, recorded)
-            _log_numbers(stream, dataset, frames)
-            _log_pictures(stream, dataset, frames)
-            if recorded is not None:
-                _log_phases(stream, recorded, float(dataset.fps))
-            stream.flush()
-            stream.disconnect()
-        unfinished.replace(path)
-    except (OSError, RuntimeError, ValueError) as exc:
-        raise ViewingError(f"{path}: cannot be written ({exc}). Free some space.") from exc
+    with rrd_when_whole(
+        path,
+        recording_id=f"{dataset.root.name}_{number}",
+        blueprint=_layout(dataset),
+        failed="cannot be written",
+        advice="Free some space.",
+    ) as stream:
+        _log_facts(stream, dataset, number, frames, recorded)
+        _log_numbers(stream, dataset, frames)
+        _log_pictures(stream, dataset, frames)
+        if recorded is not None:
+            _log_phases(stream, recorded, float(dataset.fps))
     return path
 
 
@@ -151,27 +146,22 @@ def _log_numbers(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapp
     for key, entity in ((REWARD_KEY, "reward"), (SUCCESS_KEY, "success")):
         if key in dataset.features:
             columns[entity] = _column(frames, key)[:, 0]
-    indexes = _times(np.arange(len(frames)), float(dataset.fps))
+    steps, fps = np.arange(len(frames)), float(dataset.fps)
     for entity, values in columns.items():
-        stream.send_columns(entity, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
+        send_curve(stream, entity, steps, values, fps)
     for key in PATH_FIELDS:
         if _dims(dataset, key)[:3] == PLACE_NAMES:
             way = _column(frames, key)[:, :3]
             strip = rr.LineStrips3D([way], colors=[COLORS["tcp"]], radii=0.002)
             stream.log("world/tcp_path", strip, static=True)
             places = rr.Points3D.columns(positions=way, radii=np.full(len(way), 0.012))
-            stream.send_columns("world/tcp", indexes=indexes, columns=places)
+            stream.send_columns("world/tcp", indexes=time_columns(steps, fps), columns=places)
             return
-
-
-def _times(steps: NDArray[np.int64], fps: float) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / fps)]
 
 
 def _log_pictures(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[str, Any]]) -> None:
     for step, frame in enumerate(frames):
-        stream.set_time("step", sequence=step)
-        stream.set_time("time", duration=step / float(dataset.fps))
+        set_step(stream, step, float(dataset.fps))
         for key in dataset.meta.camera_keys:
             # lerobot gives (3, H, W) float32 in [0, 1].
             picture = np.rint(np.asarray(frame[key]) * 255).astype(np.uint8).transpose(1, 2, 0)
@@ -185,13 +175,10 @@ def _log_phases(stream: rr.RecordingStream, recorded: RecordedEpisode, fps: floa
     steps = np.arange(recorded.n_steps)
     for phase, begin, end in zip(PHASES, begins, ends, strict=True):
         values = ((steps >= begin) & (steps < end)).astype(np.float64)
-        stream.send_columns(
-            f"phase/{phase}", indexes=_times(steps, fps), columns=rr.Scalars.columns(scalars=values)
-        )
+        send_curve(stream, f"phase/{phase}", steps, values, fps)
     events = [(int(step), f"phase {phase}") for phase, step in zip(PHASES, begins, strict=True)]
     if recorded.success_step is not None:
         events.append((recorded.success_step, "success"))
     for step, text in events:
-        stream.set_time("step", sequence=step)
-        stream.set_time("time", duration=step / fps)
+        set_step(stream, step, fps)
         stream.log("events", rr.TextLog(text))

@@ -16,17 +16,15 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray, Phase
-from vla_eval.errors import ViewingError
 from vla_eval.results.recording_files import recording_stem
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.tasks.item_names import item_names
+from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
-APPLICATION = "mikasa-vla"
 ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
@@ -47,29 +45,22 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
     Raises:
         ViewingError: the file cannot be written.
     """
-    unfinished = path.with_suffix(".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()  # rerun itself does not say so where it cannot write
-        n_series = n_overlapping(tape)
-        with rr.RecordingStream(APPLICATION, recording_id=recording_stem(record)) as stream:
-            cameras = sorted({name for one in tape.steps for name in one.result.observation.images})
-            stream.save(str(unfinished), default_blueprint=layout(cameras, ACTION_DIMS))
-            _log_facts(stream, tape, record)
-            for taped in tape.steps:
-                stream.set_time("step", sequence=taped.step)
-                stream.set_time("time", duration=taped.step / control_hz)
-                _log_step(stream, taped)
-            _log_chunks(stream, tape, control_hz, n_series)
-            _log_events(stream, tape, record, control_hz)
-            stream.flush()
-            stream.disconnect()
-        unfinished.replace(path)
-    except (OSError, RuntimeError, ValueError) as exc:
-        raise ViewingError(
-            f"{path}: the rerun recording of {record.policy} on {record.task}, seed {record.seed}, could not "
-            f"be written ({exc}). Free some space, or record less; the same command runs it again."
-        ) from exc
+    n_series = n_overlapping(tape)
+    cameras = sorted({name for one in tape.steps for name in one.result.observation.images})
+    with rrd_when_whole(
+        path,
+        recording_id=recording_stem(record),
+        blueprint=layout(cameras, ACTION_DIMS),
+        failed=f"the rerun recording of {record.policy} on {record.task}, seed {record.seed}, could not be "
+        "written",
+        advice="Free some space, or record less; the same command runs it again.",
+    ) as stream:
+        _log_facts(stream, tape, record)
+        for taped in tape.steps:
+            set_step(stream, taped.step, control_hz)
+            _log_step(stream, taped)
+        _log_chunks(stream, tape, control_hz, n_series)
+        _log_events(stream, tape, record, control_hz)
 
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
@@ -156,29 +147,14 @@ def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, control_hz: float
         steps = np.concatenate([np.arange(len(one.chunk.actions)) + one.step for one in own])
         values = np.concatenate([one.chunk.actions for one in own])
         for dim, name in enumerate(ACTION_DIMS):
-            _send(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], control_hz)
-
-
-def _send(
-    stream: rr.RecordingStream,
-    entity: str,
-    steps: NDArray[np.int64],
-    values: NDArray[np.float32],
-    control_hz: float,
-) -> None:
-    stream.send_columns(
-        entity,
-        indexes=[rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps / control_hz)],
-        columns=rr.Scalars.columns(scalars=values.astype(np.float64)),
-    )
+            send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], control_hz)
 
 
 def _log_events(
     stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord, control_hz: float
 ) -> None:
     for step, text in sorted(events(tape, record)):
-        stream.set_time("step", sequence=step)
-        stream.set_time("time", duration=step / control_hz)
+        set_step(stream, step, control_hz)
         stream.log("events", rr.TextLog(text))
         if text.startswith("first choice"):
             stream.log("choice/first", rr.Scalars(1.0))
