@@ -183,6 +183,7 @@ def _train(
         begins_from_base=base is not None and resume_from is None,
         decode_ahead=recipe.decode_ahead,
         whole_episodes=whole_episodes,
+        micro_batch_size=recipe.micro_batch_size,
         tokenizer=recipe.tokenizer,
         on_model=describe,
         on_metrics=report,

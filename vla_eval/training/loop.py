@@ -8,7 +8,8 @@ a test notices if one is gone):
 - `make_optimizer_and_scheduler`: what is about to be trained is reported.
 - `make_train_eval_datasets`: optionally, frames are decoded once and not per sample.
 - `update_policy`: all noise of a step is drawn from (run seed, step, process), so that a run that was
-  killed goes on exactly as it would have; metrics are written.
+  killed goes on exactly as it would have; a batch may go through the network in parts; metrics are
+  written.
 - `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on; it is
   then shown to whoever evaluates it.
 """
@@ -48,6 +49,7 @@ from vla_eval.policies.lerobot_loading import (
     save_tokenizer,
 )
 from vla_eval.policies.steps.processor_steps import DECODER_STEP, ENCODER_STEP
+from vla_eval.training.micro_batches import InMicroBatches
 
 PARTIAL_PREFIX = ".partial-"
 REPLACED = (
@@ -74,6 +76,7 @@ class LoopHooks:
         begins_from_base: whether they are a base's, which need not have what fine-tuning begins anew.
         decode_ahead, tokenizer: see `FinetuneRecipe`.
         whole_episodes: see `MemoryDataset`.
+        micro_batch_size: see `FinetuneRecipe`.
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
@@ -88,6 +91,7 @@ class LoopHooks:
     begins_from_base: bool
     decode_ahead: bool
     whole_episodes: bool
+    micro_batch_size: int | None
     tokenizer: str | None
     on_model: Callable[[Any], None]
     on_metrics: Callable[[Mapping[str, float]], None]
@@ -162,10 +166,13 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
             return training, held_out
         return MemoryDataset(training, whole_episodes=hooks.whole_episodes), held_out
 
-    def update_policy(tracker: Any, *args: Any, **kwargs: Any) -> Any:
-        process = kwargs["accelerator"].process_index
+    def update_policy(tracker: Any, policy: Any, *args: Any, **kwargs: Any) -> Any:
+        accelerator = kwargs["accelerator"]
+        process = accelerator.process_index
         seed_step(hooks.run_seed, tracker.steps, process)
-        answer = originals["update_policy"](tracker, *args, **kwargs)
+        if hooks.micro_batch_size is not None:
+            policy = InMicroBatches(policy, accelerator, hooks.micro_batch_size)
+        answer = originals["update_policy"](tracker, policy, *args, **kwargs)
         step = tracker.steps + 1
         if step % hooks.log_every_steps == 0 and process == 0:
             _write_metrics(hooks, step, tracker, answer[1] or {})

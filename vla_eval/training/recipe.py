@@ -51,6 +51,8 @@ class FinetuneRecipe:
         lora: train adapters only.
         steps: gradient steps.
         batch_size: samples per step and process.
+        micro_batch_size: how many of them go through the network at once; None: all. Gradients are added up
+            (gradient accumulation), so that the step is the same with less of the device's memory.
         save_every_steps, log_every_steps: when checkpoints and metrics are written.
         num_workers: processes that load samples, at most; no more than there are cores.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
@@ -66,6 +68,7 @@ class FinetuneRecipe:
     lora: LoraRecipe | None = None
     steps: int = 50_000
     batch_size: int = 32
+    micro_batch_size: int | None = None
     save_every_steps: int = 5_000
     log_every_steps: int = 100
     num_workers: int = 4
@@ -79,6 +82,11 @@ class FinetuneRecipe:
         for name in ("steps", "batch_size", "save_every_steps", "log_every_steps"):
             if getattr(self, name) < 1:
                 raise RecipeError(f"finetune.{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        if self.micro_batch_size is not None and not 1 <= self.micro_batch_size <= self.batch_size:
+            raise RecipeError(
+                f"finetune.micro_batch_size is {self.micro_batch_size}, expected a number from 1 to "
+                f"batch_size ({self.batch_size}), or null."
+            )
         if self.num_workers < 0:
             raise RecipeError(f"finetune.num_workers is {self.num_workers}, expected a number ≥ 0.")
         if self.lora is not None and self.base_checkpoint is None:
