@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch.nn import functional
 
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
@@ -15,8 +15,15 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy
-from vla_eval.policies.memory.network import GOAL_SCALE_M, MemoryNetwork, NetworkSizes
+from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
+from vla_eval.policies.memory.network import (
+    GOAL_SCALE_M,
+    LEAST_COLOR_VARIANCE,
+    Answer,
+    MemoryNetwork,
+    NetworkSizes,
+    standing_out,
+)
 from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
@@ -84,7 +91,8 @@ class TestMemory:
             if remembers:
                 memory = policy.remember(between(seen, first, stop), memory)
             chunk = policy.predict_action_chunk(at(seen, stop - 1), memory=memory)
-            torch.testing.assert_close(chunk, whole.actions[:, stop - 1].clamp(-1, 1), atol=1e-5, rtol=1e-5)
+            expected = foreseen_alone(Answer(*(part[:, stop - 1] for part in whole))).clamp(-1, 1)
+            torch.testing.assert_close(chunk, expected, atol=1e-5, rtol=1e-5)
 
     def test_lerobots_own_loop_gets_the_same_actions_and_forgets_at_a_reset(self, recorded: Path) -> None:
         policy, seen = tiny_policy(recorded), frames(4)
@@ -98,6 +106,40 @@ class TestMemory:
     def test_asking_it_without_having_shown_the_frame_is_an_error(self, recorded: Path) -> None:
         with pytest.raises(ValueError, match="remember"):
             tiny_policy(recorded).predict_action_chunk(at(frames(1), 0))
+
+
+class TestStandingOut:
+    def test_a_hue_that_is_rare_stands_out_and_light_and_shade_do_not(self) -> None:
+        draws = torch.Generator().manual_seed(0)
+        brightness = 0.6 + 0.3 * torch.rand(1, 1, 16, 16, generator=draws)
+        picture = brightness * torch.tensor([1.0, 0.5, 0.2])[:, None, None]  # orange, bright and dark
+        picture[0, :, 3, 5] = torch.tensor([0.9, 0.05, 0.05])  # red, about as bright
+        apart = standing_out(2 * picture - 1)[0, 0]
+        assert divmod(int(apart.argmax()), 16) == (3, 5)
+        others = apart.flatten().sort().values[:-1]
+        assert apart[3, 5] > others[-1] + 0.5  # e^(4 · 0.5) times as important to begin with
+
+    def test_it_is_half_the_logarithm_of_the_mahalanobis_distance(self) -> None:
+        colors = torch.rand(2, 3, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        told = standing_out(colors)
+        for one, answer in zip(colors.flatten(2).numpy(), told.flatten(1).numpy(), strict=True):
+            variance = np.cov(one, bias=True) + LEAST_COLOR_VARIANCE * np.eye(3)
+            away = one - one.mean(axis=1, keepdims=True)
+            distances = [float(column @ np.linalg.inv(variance) @ column) for column in away.T]
+            np.testing.assert_allclose(answer, np.log1p(distances) / 2, rtol=1e-9)
+
+    def test_what_stood_out_is_kept_while_nothing_does(self, recorded: Path) -> None:
+        network = tiny_policy(recorded).network
+        seen = frames(10)
+        for key in (BASE, WRIST):
+            seen[key] = 0.5 + 0.1 * seen[key][:, :1].expand(-1, 10, -1, -1, -1).clone()  # a grey table
+            seen[key][:, :3, :, 40:48, 64:72] = torch.tensor([0.1, 0.9, 0.1])[:, None, None]  # the cue
+        pictures = torch.stack([seen[BASE], seen[WRIST]], dim=2)
+        sight = network.see(pictures.flatten(0, 1), seen["observation.state"].flatten(0, 1))
+        things = network.write(sight, (1, 10), network.begin(1)).things[0, :, :, -5:-2]
+        green = torch.tensor([-0.8, 0.8, -0.8])
+        torch.testing.assert_close(things[2], green.expand_as(things[2]), atol=0.1, rtol=0)
+        torch.testing.assert_close(things[9], things[2], atol=0.1, rtol=0)
 
 
 class TestTraining:
@@ -195,20 +237,16 @@ def test_the_twins_recipe_differs_in_nothing_but_the_memory() -> None:
 def test_it_learns_to_go_where_the_colour_of_the_first_frame_is(remembers: bool) -> None:
     """A square is shown, then nothing, then three squares: the goal is the one of the colour shown."""
     torch.manual_seed(0)
-    sizes = NetworkSizes(
-        cameras=1, image_px=48, channels=16, heads=4, key=8, memory=64, hidden=64, thumbnail_px=6, chunk=1
-    )
+    sizes = NetworkSizes(cameras=1, image_px=48, channels=16, heads=4, key=8, memory=64, hidden=64, chunk=1)
     network = MemoryNetwork(sizes, remembers=remembers)
     optimizer = torch.optim.AdamW(network.parameters(), 2e-3)
     draws = torch.Generator().manual_seed(1)
-    for _ in range(350):
+    for _ in range(200):
         pictures, goal = recall_episodes(16, draws)
         answer = network(pictures, torch.zeros(*pictures.shape[:2], 10))
-        firsts = functional.adaptive_avg_pool2d(pictures[:, 0].flatten(0, 1), 6)[:, None, None]
-        recall = (answer.first_pictures - firsts).square().mean() / firsts.var(dim=0).mean()
         reach = (answer.goal_m[:, -1, :2] - goal).square().mean() / goal.var(dim=0).mean()
         optimizer.zero_grad()
-        (recall + reach).backward()
+        reach.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
     pictures, goal = recall_episodes(100, torch.Generator().manual_seed(2))
@@ -233,3 +271,32 @@ def recall_episodes(n: int, draws: torch.Generator) -> tuple[torch.Tensor, torch
             if color == target:
                 goal[episode] = torch.tensor([x + 2.5, y + 2.5]) / 24 - 1
     return pictures, goal
+
+
+class TestForesight:
+    def answer(self, doubts: list[float]) -> Answer:
+        """Actions of 1, 2, 3 … in all dimensions, with these expected errors (roots of the squares)."""
+        n = len(doubts)
+        actions = torch.arange(1.0, n + 1)[None, :, None].expand(1, n, 7)
+        return Answer(actions=actions, doubts=torch.tensor([doubts]).square(), goal_m=torch.zeros(1, 3))
+
+    def test_a_chunk_is_held_from_its_first_guess_with_the_gripper_as_it_was(self) -> None:
+        held = foreseen_alone(self.answer([0.05, 0.06, 0.3, 0.06]))[0]
+        assert held[:2].tolist() == [[1.0] * 7, [2.0] * 7]
+        assert held[2:].tolist() == [[0.0] * 6 + [2.0]] * 2
+
+    def test_a_policy_that_never_knows_acts_all_the_same(self) -> None:
+        answer = self.answer([0.3, 0.34, 0.32, 0.31])
+        torch.testing.assert_close(foreseen_alone(answer), answer.actions)
+
+    def test_doubt_learns_the_mean_squared_error_and_teaches_nothing_else(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded)
+        seen = frames(3)
+        pictures = torch.stack([seen[BASE], seen[WRIST]], dim=2)
+        policy.network(pictures, seen["observation.state"]).doubts.sum().backward()
+        moved = {name for name, p in policy.named_parameters() if p.grad is not None and p.grad.any()}
+        assert moved == {"network.doubts.weight", "network.doubts.bias"}
+        # The surprise err / d + log d is least where d is the mean of the errors.
+        errors, tried = torch.tensor([0.1, 0.2, 0.6]), torch.linspace(0.05, 1, 96)
+        surprise = (errors[:, None] / tried + tried.log()).mean(dim=0)
+        assert float(tried[surprise.argmin()]) == pytest.approx(0.3, abs=0.011)

@@ -6,6 +6,8 @@ from typing import Any, ClassVar  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+from vla_eval.policies.memory.network import SPOTS
+
 TYPE = "mikasa_memory"
 
 
@@ -25,13 +27,13 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
             memory begins in its middle. None: our `finetune` takes the dataset's longest.
         chunk_size: actions of a chunk.
         n_action_steps: how many lerobot's own loop executes; ours sets its own number.
-        channels, patch_px, heads, key, memory, hidden, thumbnail_px, longest_span_steps: see `NetworkSizes`.
+        channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         first_action_weight: share of a chunk's first action in the loss; the others share the rest.
         change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
             which raises the moment of decision.
         waiting_share: a step whose action is that of the step before is used with this probability.
-        goal_weight, recall_weight: of the two auxiliary losses, each in units of its variance: where the
-            demonstration ends, and the episode's first pictures.
+        goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
+        doubt_weight: of the loss that teaches the policy how large its error will be.
         mix_colors: the three colours of an episode's pictures change places at random in training.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps, scheduler_decay_lr: AdamW, warm-up, cosine.
@@ -50,14 +52,13 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     key: int = 16
     memory: int = 128
     hidden: int = 256
-    thumbnail_px: int = 16
     longest_span_steps: float = 100.0
 
     first_action_weight: float = 0.5
     change_weight: float = 3.0
     waiting_share: float = 0.3
     goal_weight: float = 1.0
-    recall_weight: float = 1.0
+    doubt_weight: float = 0.1
     mix_colors: bool = False
 
     optimizer_lr: float = 2e-3
@@ -86,8 +87,10 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
             raise ValueError(
                 f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
             )
-        if self.patch_px % 2 or self.patch_px < 2:
-            raise ValueError(f"patch_px is {self.patch_px}, expected an even number: colours are of quarters")
+        if self.patch_px < 1 or self.patch_px % SPOTS:
+            raise ValueError(
+                f"patch_px is {self.patch_px}, expected a multiple of {SPOTS}: so many spots has an edge"
+            )
         for name in ("first_action_weight", "waiting_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
@@ -100,10 +103,10 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         if len(shapes) != 1:
             raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")
         _, height_px, width_px = next(iter(shapes))
-        if height_px != width_px or height_px % self.patch_px or height_px % self.thumbnail_px:
+        if height_px != width_px or height_px % self.patch_px:
             raise ValueError(
-                f"'{TYPE}' needs square pictures whose edge is a multiple of patch_px ({self.patch_px}) and "
-                f"thumbnail_px ({self.thumbnail_px}), found {height_px}×{width_px}"
+                f"'{TYPE}' needs square pictures whose edge is a multiple of patch_px ({self.patch_px}), "
+                f"found {height_px}×{width_px}"
             )
 
     @property

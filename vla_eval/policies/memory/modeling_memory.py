@@ -6,14 +6,14 @@ from typing import Any, NamedTuple  # lerobot is untyped
 import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
-from torch.nn import functional
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
-from vla_eval.policies.memory.network import GOAL, Memory, MemoryNetwork, NetworkSizes, by_episode
+from vla_eval.policies.memory.network import GOAL, Answer, Memory, MemoryNetwork, NetworkSizes
 
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 LEAST_VARIANCE = 1e-6
+UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
 
 
 class Episodes(NamedTuple):
@@ -71,22 +71,12 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         imitation = (errors * episodes.counts).sum() / episodes.counts.sum()
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal = _in_variances(answer.goal_m, episodes.goal_m, real)
-        recall = self._recall(episodes.pictures[:, 0], answer.first_pictures, real)
-        loss = imitation + config.goal_weight * goal + config.recall_weight * recall
-        parts = {"imitation": imitation, "goal": goal, "recall": recall}
+        # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
+        surprise = errors.detach() / answer.doubts + answer.doubts.log()
+        surprise = (surprise * episodes.counts).sum() / episodes.counts.sum()
+        loss = imitation + config.goal_weight * goal + config.doubt_weight * surprise
+        parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
-
-    def _recall(self, pictures: Tensor, told: Tensor, real: Tensor) -> Tensor:
-        """Return the loss of what is told of the first pictures (B, cameras, 3, H, W); cameras count alike.
-
-        What all episodes begin with need not be remembered, and is not asked for.
-        """
-        edge_px = pictures.shape[-1] // self.config.thumbnail_px
-        firsts = by_episode(functional.avg_pool2d(pictures.flatten(0, 1), edge_px), pictures.shape[:2])
-        differ = firsts - firsts.mean(dim=0)
-        spread = differ.square().mean(dim=(0, 2, 3, 4), keepdim=True).clamp(min=LEAST_VARIANCE).sqrt()
-        errors = (told - (differ / spread)[:, None]).square().flatten(2).mean(dim=-1)
-        return (errors * real).sum() / real.sum()
 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:
@@ -96,7 +86,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         sight = self.network.see(pictures.flatten(0, 1), state.flatten(0, 1))
         before = self.network.begin(shape[0]) if memory is None else memory
         after = self.network.write(sight, shape, before)
-        return Memory(after.things[:, -1], after.rest[:, -1])
+        return Memory(*(part[:, -1] for part in after))
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -113,8 +103,8 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         sight = self.network.see(pictures, state)
         if memory is None:
             after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
-            memory = Memory(after.things[:, 0], after.rest[:, 0])
-        return self.network.act(sight, memory, state)[0].clamp(-1, 1)
+            memory = Memory(*(part[:, 0] for part in after))
+        return foreseen_alone(self.network.act(sight, memory, state)).clamp(-1, 1)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -144,9 +134,10 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             kept = real & ~waits
         order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
 
+        rows = torch.arange(len(order), device=order.device)[:, None]
+
         def taken(values: Tensor) -> Tensor:
-            index = order.reshape(*order.shape, *[1] * (values.ndim - 2))
-            return values.take_along_dim(index, dim=1)
+            return values[rows, order]
 
         weights = torch.full((config.chunk_size,), 1.0, device=actions.device)
         if config.chunk_size > 1:
@@ -165,6 +156,21 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         )
 
 
+def foreseen_alone(answer: Answer) -> Tensor:
+    """Return the actions (B, chunk, action) of an answer, held from the first that is a guess.
+
+    An action is one if its error is expected to be larger by `UNFORESEEN` than that of the chunk's first
+    action. A chunk that reaches beyond the moment at which the choice is shown cannot know where to go; the
+    mean of all demonstrations would send the arm to the middle. Held: no motion, the gripper as it was.
+    """
+    doubts = answer.doubts.sqrt()
+    foreseen = (doubts <= doubts[:, :1] + UNFORESEEN).long().cumprod(dim=1)
+    last = (foreseen.sum(dim=1) - 1)[:, None, None]
+    held = answer.actions.take_along_dim(last, dim=1).clone()
+    held[..., :-1] = 0
+    return torch.where(foreseen.bool()[..., None], answer.actions, held)
+
+
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
     """Return the sizes that a configuration and its fields ask for."""
     images = list(config.image_features.values())
@@ -180,7 +186,6 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         key=config.key,
         memory=config.memory,
         hidden=config.hidden,
-        thumbnail_px=config.thumbnail_px,
         longest_span_steps=config.longest_span_steps,
     )
 
@@ -205,7 +210,7 @@ def _mixed(pictures: Tensor) -> Tensor:
 def _in_variances(told: Tensor, right: Tensor, real: Tensor) -> Tensor:
     """Return the mean squared error over the steps (B, T) that are real, in units of the batch's variance.
 
-    So 1 is what the mean would reach, however small a part of the picture the cue is.
+    So 1 is what the mean would reach.
 
     Args:
         told: (B, T, …).

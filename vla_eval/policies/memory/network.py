@@ -1,12 +1,13 @@
 """The network of the positive control: small eyes, a gated memory, and a look back through it.
 
-What is seen at a step is summed up by attention at fixed questions and written into a memory; what the
-memory asks for is looked up in the pictures of the same step; the answer gives the next actions. The
-twin without memory is the same network whose memory begins anew at each step.
+What stands out at a step is written into a memory; what the memory holds is looked up in the pictures of
+the same step; the answer gives the next actions. The twin without memory is the same network whose memory
+begins anew at each step.
 
-The memory is a minimal gated recurrence: gate and candidate depend on the input alone (Feng et al. 2024,
-"Were RNNs All We Needed?", minGRU). What was written stays as it was written until it is overwritten, so
-that it can be compared with the pictures that come later.
+Things are kept as they were seen, so that they can be compared with the pictures that come later: the
+memory of a thing is the mean of all that was seen, each weighted by the exponential of a learned
+importance (exponential gating: Beck et al. 2024, "xLSTM"). All else is kept in a minimal gated recurrence,
+whose gate and candidate depend on the input alone (Feng et al. 2024, "Were RNNs All We Needed?", minGRU).
 """
 
 import functools
@@ -23,7 +24,14 @@ STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
 GOAL_SCALE_M = (
     0.1  # numbers of about 1 to metres: else a step of the optimizer moves the goal across the table
 )
+IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
+LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
+NOTHING = -1e4  # logarithm of a weight of 0, finite
 RGB, PLACE, GOAL = 3, 2, 3  # numbers of a colour, of a place in a picture, of a position in space
+APART = 1  # one number: how much a place stands out
+KNOWN = APART + RGB + PLACE  # what is told of a place beside its learned features, in this order
+SPOTS = 4  # spots along a place's edge
+LEAST_COLOR_VARIANCE = 1e-3  # colours in [-1, 1]: less than this is noise of the picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +50,6 @@ class NetworkSizes:
         key: numbers of a question.
         memory: units of the memory.
         hidden: units of the layers between.
-        thumbnail_px: edge of the recalled picture of the first step.
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
     """
 
@@ -57,13 +64,12 @@ class NetworkSizes:
     key: int = 16
     memory: int = 256
     hidden: int = 256
-    thumbnail_px: int = 16
     longest_span_steps: float = 100.0
 
     @property
     def value(self) -> int:
-        """Numbers that attention returns of a place: features, mean colour, coordinates."""
-        return self.channels + RGB + PLACE
+        """Numbers that attention returns of a place: features, standing out, colour, coordinates."""
+        return self.channels + KNOWN
 
     @property
     def seen(self) -> int:
@@ -76,15 +82,15 @@ class Answer(NamedTuple):
 
     Attributes:
         actions: (B, T, chunk, action).
+        doubts: (B, T, chunk) > 0, the squared error that is expected of each action. No gradient flows from
+            it into anything but its own layer.
         goal_m: (B, T, 3) where the demonstration's tool centre point ends, told from what the memory looked
             up alone.
-        first_pictures: (B, T, cameras, 3, thumbnail, thumbnail) by how many standard deviations the
-            episode's first pictures differ from those of other episodes, told from the memory alone.
     """
 
     actions: Tensor
+    doubts: Tensor
     goal_m: Tensor
-    first_pictures: Tensor
 
 
 class Sight(NamedTuple):
@@ -92,7 +98,7 @@ class Sight(NamedTuple):
 
     Attributes:
         places: per camera (N, P, value).
-        keys: per camera (N, P, key + 5).
+        keys: per camera (N, P, key + KNOWN).
         things: (N, cameras · heads, value) what stood out.
         summary: (N, hidden).
     """
@@ -104,10 +110,10 @@ class Sight(NamedTuple):
 
 
 class Eye(nn.Module):
-    """One camera's picture to features of places; beside them colour and coordinates of a quarter of each.
+    """One camera's picture to features of places; beside them what is known of one spot of each.
 
-    It is the quarter whose hue differs most from the picture's: a cube of 4 pixels keeps its colour in a
-    place of 8.
+    It is the spot, a quarter of the place's edge wide, whose colour stands out most from the picture's: a
+    cube of 4 pixels keeps its colour in a place of 8.
     """
 
     coordinates: Tensor
@@ -116,55 +122,71 @@ class Eye(nn.Module):
         super().__init__()
         self.patch_px = sizes.patch_px
         width = sizes.channels
-        self.patches = nn.Conv2d(RGB * sizes.patch_px**2, width, 1)
+        self.patches = nn.Conv2d(RGB, width, sizes.patch_px, stride=sizes.patch_px)
         self.around = nn.Conv2d(width, width, 3, padding=1)
         self.mix = nn.Conv2d(width, width, 1)
-        line = torch.linspace(-1, 1, 2 * sizes.image_px // sizes.patch_px)
+        line = torch.linspace(-1, 1, SPOTS * sizes.image_px // sizes.patch_px)
         y, x = torch.meshgrid(line, line, indexing="ij")
         self.register_buffer("coordinates", torch.stack([x, y]), persistent=False)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """(N, 3, H, W) in [0, 1] to (N, places, value)."""
         centred = 2 * pictures - 1
-        features = self.patches(functional.pixel_unshuffle(centred, self.patch_px))
+        features = self.patches(centred)
         features = features + self.mix(functional.gelu(self.around(functional.gelu(features))))
-        colors = functional.avg_pool2d(centred, self.patch_px // 2)
-        hues = colors - colors.mean(dim=1, keepdim=True)
-        apart = (hues - hues.mean(dim=(2, 3), keepdim=True)).square().sum(dim=1, keepdim=True)
-        quarters = functional.max_pool2d(apart, 2, return_indices=True)[1].flatten(2)
-        placed = torch.cat([colors, self.coordinates.expand(len(pictures), -1, -1, -1)], dim=1).flatten(2)
-        chosen = placed.gather(2, quarters.expand(-1, RGB + PLACE, -1))
-        return torch.cat([features.float().flatten(2), chosen], dim=1).transpose(1, 2)
+        return torch.cat([features.float().flatten(2), self._known(centred)], dim=1).transpose(1, 2)
+
+    @torch.no_grad()
+    def _known(self, pictures: Tensor) -> Tensor:
+        """(N, 3, H, W) in [-1, 1] to (N, KNOWN, places)."""
+        with torch.autocast(pictures.device.type, enabled=False):
+            colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
+            apart = standing_out(colors)
+            spots = functional.max_pool2d(apart, SPOTS, return_indices=True)[1].flatten(2)
+            placed = self.coordinates.expand(len(pictures), -1, -1, -1)
+            known = torch.cat([apart, colors, placed], dim=1).flatten(2)
+            return known.gather(2, spots.expand(-1, KNOWN, -1))
+
+
+def standing_out(colors: Tensor) -> Tensor:
+    """Return (N, 1, H, W): how unlike a picture's other colours each colour (N, 3, H, W) is.
+
+    Half the logarithm of 1 + its squared Mahalanobis distance from the picture's mean, as in the anomaly
+    detector of Reed and Yu (1990). A red cube on an orange table is about as bright and nearly as red as its
+    surroundings; in units of how colours vary there it is far away.
+    """
+    apart = colors.flatten(2) - colors.flatten(2).mean(dim=2, keepdim=True)
+    variance = apart @ apart.transpose(1, 2) / apart.shape[2]
+    variance = variance + LEAST_COLOR_VARIANCE * torch.eye(RGB, dtype=colors.dtype, device=colors.device)
+    squared: Tensor = (apart * torch.linalg.solve(variance, apart)).sum(dim=1)
+    return squared.log1p().div(2).reshape(len(colors), 1, *colors.shape[2:])
 
 
 class Keys(nn.Module):
-    """What of a place counts when it is looked for: learned numbers, its colour, its coordinates."""
+    """What of a place counts when it is looked for: learned numbers, and what is known of it."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
         self.learned = nn.Linear(sizes.value, sizes.key)
 
     def forward(self, values: Tensor) -> Tensor:
-        """(…, value) to (…, key + 5)."""
-        return torch.cat([self.learned(values), values[..., -(RGB + PLACE) :]], dim=-1)
+        """(…, value) to (…, key + KNOWN)."""
+        return torch.cat([self.learned(values), values[..., -KNOWN:]], dim=-1)
 
 
 class StandingOut(nn.Module):
-    """Looks at what differs from the rest of the picture, in a way of its own per head."""
+    """Looks at what stands out of the picture, in a way of its own per head."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
-        n = sizes.key + RGB + PLACE
+        n = sizes.key + KNOWN
         self.towards = nn.Parameter(torch.randn(sizes.heads, n) / math.sqrt(n))
-        self.apart = nn.Parameter(torch.zeros(sizes.heads, n))
-        with torch.no_grad():  # to begin with, colours that stand out
-            self.apart[:, sizes.key : sizes.key + RGB] = 4.0
+        with torch.no_grad():
+            self.towards[:, sizes.key] += 8.0
 
     def forward(self, places: Tensor, keys: Tensor) -> Tensor:
-        """(N, P, value) and (N, P, key + 5) to what each head saw, (N, heads, value)."""
-        apart = (keys - keys.mean(dim=1, keepdim=True)).square()
-        scores = keys @ self.towards.T + apart @ self.apart.T
-        return scores.transpose(1, 2).softmax(dim=-1) @ places
+        """(N, P, value) and (N, P, key + KNOWN) to what each head saw, (N, heads, value)."""
+        return (keys @ self.towards.T).transpose(1, 2).softmax(dim=-1) @ places
 
 
 class Likeness(nn.Module):
@@ -172,13 +194,15 @@ class Likeness(nn.Module):
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
-        self.counts = nn.Parameter(torch.full((sizes.heads, sizes.key + RGB + PLACE), -3.0))
+        self.counts = nn.Parameter(torch.full((sizes.heads, sizes.key + KNOWN), -3.0))
+        color = sizes.key + APART
         with torch.no_grad():  # to begin with, half of the heads ask for a colour, half for a place
-            self.counts[: sizes.heads // 2, sizes.key : sizes.key + RGB] = 3.0
-            self.counts[sizes.heads // 2 :, sizes.key + RGB :] = 3.0
+            self.counts[:, sizes.key] = 3.0
+            self.counts[: sizes.heads // 2, color : color + RGB] = 3.0
+            self.counts[sizes.heads // 2 :, color + RGB :] = 3.0
 
     def forward(self, places: Tensor, keys: Tensor, asked: Tensor) -> Tensor:
-        """(N, P, value), (N, P, key + 5), (N, heads, key + 5) to (N, heads, value)."""
+        """(N, P, value), (N, P, key + KNOWN), (N, heads, key + KNOWN) to (N, heads, value)."""
         counts = functional.softplus(self.counts)
         # Minus the squared distance, without what all places have in common.
         scores = 2 * keys @ (asked * counts).transpose(1, 2) - keys.square() @ counts.T
@@ -198,9 +222,16 @@ def _in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
 
 
 class Memory(NamedTuple):
-    """What is kept from step to step: (B, cameras · heads, value) things seen, and (B, memory) the rest."""
+    """What is kept from step to step.
+
+    Attributes:
+        things: (B, cameras · heads, value) the weighted mean of what was seen.
+        importance: (B, cameras · heads) logarithm of the sum of its weights.
+        rest: (B, memory) everything else.
+    """
 
     things: Tensor
+    importance: Tensor
     rest: Tensor
 
 
@@ -216,7 +247,7 @@ class MemoryNetwork(nn.Module):
         super().__init__()
         self.sizes, self.remembers = sizes, remembers
         n, hidden = sizes.cameras, sizes.hidden
-        n_things, n_key = n * sizes.heads, sizes.key + RGB + PLACE
+        n_things, n_key = n * sizes.heads, sizes.key + KNOWN
         self.eyes = nn.ModuleList(Eye(sizes) for _ in range(n))
         self.keys = nn.ModuleList(Keys(sizes) for _ in range(n))
         self.standing_out = nn.ModuleList(StandingOut(sizes) for _ in range(n))
@@ -224,35 +255,36 @@ class MemoryNetwork(nn.Module):
         self.summary = nn.Sequential(
             nn.Linear(sizes.seen + n * sizes.value + sizes.state, hidden), nn.LayerNorm(hidden), nn.GELU()
         )
-        self.gates = nn.Linear(hidden, n_things + sizes.memory)
+        self.importance = nn.Linear(hidden, n_things)
+        self.gates = nn.Linear(hidden, sizes.memory)
         self.candidate = nn.Linear(hidden, sizes.memory)
-        self.first_things = nn.Parameter(torch.zeros(n_things, sizes.value))
         self.first_rest = nn.Parameter(torch.zeros(sizes.memory))
         self.asks = nn.Linear(sizes.memory, n_things * n_key)
         self.goal = nn.Sequential(nn.Linear(sizes.seen, hidden), nn.GELU(), nn.Linear(hidden, GOAL))
         kept = sizes.seen + sizes.memory
-        self.acts = nn.Sequential(
+        self.decides = nn.Sequential(
             nn.Linear(sizes.seen + kept + hidden + sizes.state + GOAL, hidden),
             nn.LayerNorm(hidden),
             nn.GELU(),
             nn.Linear(hidden, hidden),
             nn.GELU(),
-            nn.Linear(hidden, sizes.chunk * sizes.action),
         )
-        self.recalls = nn.Sequential(
-            nn.Linear(kept, hidden), nn.GELU(), nn.Linear(hidden, n * RGB * sizes.thumbnail_px**2)
-        )
+        self.acts = nn.Linear(hidden, sizes.chunk * sizes.action)
+        self.doubts = nn.Linear(hidden, sizes.chunk)
         with torch.no_grad():
             nn.init.zeros_(self.asks.weight)
             nn.init.zeros_(self.asks.bias)
+            self.doubts.bias.fill_(-3.0)  # about the error of actions at the beginning
             # Time scales from 1 step to the longest (chrono initialisation, Tallec & Ollivier 2018).
             longest = math.log(sizes.longest_span_steps)
-            self.gates.bias[:n_things] = -2.0
-            self.gates.bias[n_things:] = -torch.linspace(0, longest, sizes.memory)
+            self.gates.bias.copy_(-torch.linspace(0, longest, sizes.memory))
 
     def begin(self, n_episodes: int) -> Memory:
-        """Return the memory before the first step."""
-        return Memory(self.first_things.expand(n_episodes, -1, -1), self.first_rest.expand(n_episodes, -1))
+        """Return the memory before the first step: of things there is none, so that they weigh nothing."""
+        sizes, like = self.sizes, self.first_rest
+        things = like.new_zeros(n_episodes, sizes.cameras * sizes.heads, sizes.value)
+        nothing = like.new_full(things.shape[:2], NOTHING)
+        return Memory(things, nothing, like.expand(n_episodes, -1))
 
     def see(self, pictures: Tensor, state: Tensor) -> Sight:
         """Return what is seen at each step.
@@ -282,25 +314,31 @@ class MemoryNetwork(nn.Module):
             memory: before the first of these steps.
         """
         things, summaries = by_episode(sight.things, shape), by_episode(sight.summary, shape)
+        apart = things[..., self.sizes.channels]
+        importance = self.importance(summaries) + IMPORTANCE_OF_STANDING_OUT * apart
         gates, candidates = self.gates(summaries).sigmoid(), self.candidate(summaries)
-        n_things = things.shape[2]
         memories = []
         for step in range(summaries.shape[1]):
             before = memory if self.remembers else self.begin(len(summaries))
-            gate = gates[:, step]
+            total = torch.logaddexp(before.importance, importance[:, step])
+            share = (importance[:, step] - total).exp()
             memory = Memory(
-                torch.lerp(before.things, things[:, step], gate[:, :n_things, None]),
-                torch.lerp(before.rest, candidates[:, step], gate[:, n_things:]),
+                torch.lerp(before.things, things[:, step], share[..., None]),
+                total,
+                torch.lerp(before.rest, candidates[:, step], gates[:, step]),
             )
             memories.append(memory)
-        return Memory(
-            torch.stack([one.things for one in memories], dim=1),
-            torch.stack([one.rest for one in memories], dim=1),
-        )
+        return Memory(*(torch.stack(parts, dim=1) for parts in zip(*memories, strict=True)))
 
     @_in_float32
-    def act(self, sight: Sight, memory: Memory, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions (N, chunk, action) and goal (N, 3) for N steps whose memory is written."""
+    def act(self, sight: Sight, memory: Memory, state: Tensor) -> Answer:
+        """Return actions (N, chunk, action), doubts (N, chunk) and goal (N, 3) for N steps.
+
+        Args:
+            sight: of these steps.
+            memory: with these steps written into it.
+            state: (N, state) in SI units.
+        """
         sizes = self.sizes
         asked = self.asks(memory.rest).reshape(len(state), sizes.cameras, sizes.heads, -1)
         things = memory.things.reshape(len(state), sizes.cameras, sizes.heads, -1)
@@ -311,8 +349,12 @@ class MemoryNetwork(nn.Module):
         looked_up = torch.cat(found, dim=1).flatten(1)
         goal = GOAL_SCALE_M * self.goal(looked_up)
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * STATE_SCALE]
-        actions = self.acts(torch.cat([*known, goal.detach()], dim=-1))
-        return actions.reshape(-1, sizes.chunk, sizes.action), goal
+        decided = self.decides(torch.cat([*known, goal.detach()], dim=-1))
+        return Answer(
+            actions=self.acts(decided).reshape(-1, sizes.chunk, sizes.action),
+            doubts=functional.softplus(self.doubts(decided.detach())) + LEAST_DOUBT,
+            goal_m=goal,
+        )
 
     def forward(self, pictures: Tensor, state: Tensor) -> Answer:
         """Answer for each step of episodes from their beginning.
@@ -321,19 +363,12 @@ class MemoryNetwork(nn.Module):
             pictures: (B, T, cameras, 3, H, W) in [0, 1].
             state: (B, T, state) in SI units.
         """
-        shape, sizes = state.shape[:2], self.sizes
+        shape = state.shape[:2]
         flat_state = state.flatten(0, 1)
         sight = self.see(pictures.flatten(0, 1), flat_state)
         memories = self.write(sight, shape, self.begin(shape[0]))
-        flat = Memory(memories.things.flatten(0, 1), memories.rest.flatten(0, 1))
-        actions, goal = self.act(sight, flat, flat_state)
-        thumbnails = self.recalls(torch.cat([flat.things.flatten(1), flat.rest], dim=-1))
-        size = (sizes.cameras, RGB, sizes.thumbnail_px, sizes.thumbnail_px)
-        return Answer(
-            actions=by_episode(actions, shape),
-            goal_m=by_episode(goal, shape),
-            first_pictures=thumbnails.reshape(*shape, *size),
-        )
+        flat = Memory(*(part.flatten(0, 1) for part in memories))
+        return Answer(*(by_episode(part, shape) for part in self.act(sight, flat, flat_state)))
 
 
 def by_episode(steps: Tensor, shape: Sequence[int]) -> Tensor:
