@@ -45,7 +45,7 @@ def test_the_wheel_says_that_it_is_typed(wheel: zipfile.ZipFile) -> None:
     assert "vla_eval/py.typed" in wheel.namelist()
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", (*FOLDERS, "checkpoints"))
 def test_every_file_of_a_recipe_folder_is_in_the_wheel_unchanged(wheel: zipfile.ZipFile, folder: str) -> None:
     for path in (ROOT / folder).rglob("*"):
         if path.is_file():
