@@ -207,7 +207,7 @@ class TestTraining:
         )
         summary = finetune(config)
         again = replace(
-            config, out=str(tmp_path / "again"), finetune={**short, "policy": {**TINY, "use_amp": False}}
+            config, out=str(tmp_path / "again"), finetune={**short, "policy": {**TINY, "use_amp": True}}
         )
         finetune(again)  # in the same process, in another precision
         made: Any = make_env(EnvSettings(task=TASK, simulator="fake"))

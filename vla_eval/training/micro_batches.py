@@ -39,21 +39,19 @@ class InMicroBatches:
             the whole batch's loss, whose gradient is the last part's; and what the policy tells, numbers
             averaged over samples.
         """
-        parts = list(_parts(batch, self._size))
-        n_samples, whole, told = sum(n for n, _ in parts), 0.0, _Told()
-        for n, part in parts[:-1]:
+        *parts, (last_share, last) = _parts(batch, self._size)
+        whole, told = 0.0, _Told()
+        for share, part in parts:
             with self._accelerator.no_sync(self._policy):
                 loss, output = self._policy.forward(part)
-                share = loss * (n / n_samples)
                 # The whole of lerobot's forward is under autocast; a backward need not be.
                 with torch.autocast(self._accelerator.device.type, enabled=False):
-                    self._accelerator.backward(share)
-            whole = whole + share.detach()
-            told.add(output, n / n_samples)
-        n, part = parts[-1]
-        loss, output = self._policy.forward(part)
-        told.add(output, n / n_samples)
-        return whole + loss * (n / n_samples), told.values
+                    self._accelerator.backward(share * loss)
+            whole = whole + share * loss.detach()
+            told.add(output, share)
+        loss, output = self._policy.forward(last)
+        told.add(output, last_share)
+        return whole + last_share * loss, told.values
 
 
 class _Told:
@@ -70,15 +68,13 @@ class _Told:
             self.values[name] = value
 
 
-def _parts(batch: Mapping[str, Any], size: int) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield (samples, part); a batch's tensors and lists have one entry per sample."""
+def _parts(batch: Mapping[str, Any], size: int) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield (share of the samples, part); a batch's tensors and lists have one entry per sample."""
     n_samples = len(batch["action"])
     for first in range(0, n_samples, size):
-        stop = min(first + size, n_samples)
-        yield (
-            stop - first,
-            {name: _rows(name, value, (first, stop), n_samples) for name, value in batch.items()},
-        )
+        rows = (first, min(first + size, n_samples))
+        part = {name: _rows(name, value, rows, n_samples) for name, value in batch.items()}
+        yield (rows[1] - first) / n_samples, part
 
 
 def _rows(name: str, value: Any, rows: tuple[int, int], n_samples: int) -> Any:

@@ -68,12 +68,12 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         config, episodes = self.config, self._episodes(batch)
         answer = self.network(episodes.pictures, episodes.state)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
-        imitation = (errors * episodes.counts).sum() / episodes.counts.sum()
+        imitation = _weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal = _in_variances(answer.goal_m, episodes.goal_m, real)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
-        surprise = errors.detach() / answer.doubts + answer.doubts.log()
-        surprise = (surprise * episodes.counts).sum() / episodes.counts.sum()
+        surprises = errors.detach() / answer.doubts + answer.doubts.log()
+        surprise = _weighted_mean(surprises, episodes.counts)
         loss = imitation + config.goal_weight * goal + config.doubt_weight * surprise
         parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
@@ -207,6 +207,10 @@ def _mixed(pictures: Tensor) -> Tensor:
     return pictures.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
 
 
+def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    return (values * weights).sum() / weights.sum()
+
+
 def _in_variances(told: Tensor, right: Tensor, real: Tensor) -> Tensor:
     """Return the mean squared error over the steps (B, T) that are real, in units of the batch's variance.
 
@@ -219,4 +223,4 @@ def _in_variances(told: Tensor, right: Tensor, real: Tensor) -> Tensor:
     """
     errors = (told - right[:, None]).square().flatten(2).mean(dim=-1)
     variance = (right - right.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE)
-    return (errors * real).sum() / real.sum() / variance
+    return _weighted_mean(errors, real) / variance

@@ -45,7 +45,7 @@ class NetworkSizes:
         action: dimensions of an action.
         chunk: actions of a chunk.
         channels: learned features of a place in a picture.
-        patch_px: edge of such a place, an even number.
+        patch_px: edge of such a place, a multiple of `SPOTS`.
         heads: questions per camera: so many fixed ones, and so many of the memory.
         key: numbers of a question.
         memory: units of the memory.
@@ -109,6 +109,18 @@ class Sight(NamedTuple):
     summary: Tensor
 
 
+def _in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+    """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
+
+    @functools.wraps(method)
+    def kept(*args: P.args, **kwargs: P.kwargs) -> R:
+        module: Any = args[0]
+        with torch.autocast(next(module.parameters()).device.type, enabled=False):
+            return method(*args, **kwargs)
+
+    return kept
+
+
 class Eye(nn.Module):
     """One camera's picture to features of places; beside them what is known of one spot of each.
 
@@ -137,15 +149,15 @@ class Eye(nn.Module):
         return torch.cat([features.float().flatten(2), self._known(centred)], dim=1).transpose(1, 2)
 
     @torch.no_grad()
+    @_in_float32
     def _known(self, pictures: Tensor) -> Tensor:
         """(N, 3, H, W) in [-1, 1] to (N, KNOWN, places)."""
-        with torch.autocast(pictures.device.type, enabled=False):
-            colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
-            apart = standing_out(colors)
-            spots = functional.max_pool2d(apart, SPOTS, return_indices=True)[1].flatten(2)
-            placed = self.coordinates.expand(len(pictures), -1, -1, -1)
-            known = torch.cat([apart, colors, placed], dim=1).flatten(2)
-            return known.gather(2, spots.expand(-1, KNOWN, -1))
+        colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
+        apart = standing_out(colors)
+        spots = functional.max_pool2d(apart, SPOTS, return_indices=True)[1].flatten(2)
+        placed = self.coordinates.expand(len(pictures), -1, -1, -1)
+        known = torch.cat([apart, colors, placed], dim=1).flatten(2)
+        return known.gather(2, spots.expand(-1, KNOWN, -1))
 
 
 def standing_out(colors: Tensor) -> Tensor:
@@ -181,7 +193,7 @@ class StandingOut(nn.Module):
         super().__init__()
         n = sizes.key + KNOWN
         self.towards = nn.Parameter(torch.randn(sizes.heads, n) / math.sqrt(n))
-        with torch.no_grad():
+        with torch.no_grad():  # to begin with: what stands out e^1 more gets e^8 of the attention
             self.towards[:, sizes.key] += 8.0
 
     def forward(self, places: Tensor, keys: Tensor) -> Tensor:
@@ -207,18 +219,6 @@ class Likeness(nn.Module):
         # Minus the squared distance, without what all places have in common.
         scores = 2 * keys @ (asked * counts).transpose(1, 2) - keys.square() @ counts.T
         return scores.transpose(1, 2).softmax(dim=-1) @ places
-
-
-def _in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
-    """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
-
-    @functools.wraps(method)
-    def kept(*args: P.args, **kwargs: P.kwargs) -> R:
-        network: Any = args[0]
-        with torch.autocast(network.first_rest.device.type, enabled=False):
-            return method(*args, **kwargs)
-
-    return kept
 
 
 class Memory(NamedTuple):
