@@ -15,6 +15,7 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.memory.action_head import ActionHead
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
 from vla_eval.policies.memory.network import (
     GOAL_SCALE_M,
@@ -273,6 +274,24 @@ def recall_episodes(n: int, draws: torch.Generator) -> tuple[torch.Tensor, torch
     return pictures, goal
 
 
+class TestActionHead:
+    def chunks(self, ways_m: list[list[float]]) -> torch.Tensor:
+        torch.manual_seed(0)
+        head = ActionHead(hidden=8, chunk=4, action=7)
+        decided = torch.rand(1, 8).expand(len(ways_m), -1)
+        actions, _ = head(decided, torch.tensor(ways_m))
+        return actions
+
+    def test_what_is_learned_of_one_level_axis_holds_for_the_other(self) -> None:
+        first, second = self.chunks([[0.1, -0.03, 0.2], [-0.03, 0.1, 0.2]])
+        torch.testing.assert_close(first[:, [1, 0, 2, 3, 4, 5, 6]], second)
+
+    def test_the_way_moves_the_arm_and_nothing_else(self) -> None:
+        near, far = self.chunks([[0.01, 0.0, 0.0], [0.2, 0.1, 0.1]])
+        assert not torch.isclose(near[:, :3], far[:, :3]).any()
+        assert torch.equal(near[:, 3:], far[:, 3:])
+
+
 class TestForesight:
     def answer(self, doubts: list[float]) -> Answer:
         """Actions of 1, 2, 3 … in all dimensions, with these expected errors (roots of the squares)."""
@@ -295,7 +314,7 @@ class TestForesight:
         pictures = torch.stack([seen[BASE], seen[WRIST]], dim=2)
         policy.network(pictures, seen["observation.state"]).doubts.sum().backward()
         moved = {name for name, p in policy.named_parameters() if p.grad is not None and p.grad.any()}
-        assert moved == {"network.doubts.weight", "network.doubts.bias"}
+        assert moved == {"network.acts.doubts.weight", "network.acts.doubts.bias"}
         # The surprise err / d + log d is least where d is the mean of the errors.
         errors, tried = torch.tensor([0.1, 0.2, 0.6]), torch.linspace(0.05, 1, 96)
         surprise = (errors[:, None] / tried + tried.log()).mean(dim=0)

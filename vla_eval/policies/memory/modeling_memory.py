@@ -8,8 +8,9 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
+from vla_eval.policies.memory.action_head import SPACE
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
-from vla_eval.policies.memory.network import GOAL, Answer, Memory, MemoryNetwork, NetworkSizes
+from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork, NetworkSizes
 
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 LEAST_VARIANCE = 1e-6
@@ -152,7 +153,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             state=taken(batch[STATE_KEY][:, :n_steps]),
             actions=taken(actions),
             counts=taken(counts),
-            goal_m=batch[STATE_KEY][:, n_steps, :GOAL],
+            goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         )
 
 

@@ -20,14 +20,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.memory.action_head import SPACE, WAY_SCALE_M, ActionHead
+
 STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
 GOAL_SCALE_M = (
     0.1  # numbers of about 1 to metres: else a step of the optimizer moves the goal across the table
 )
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
-LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
 NOTHING = -1e4  # logarithm of a weight of 0, finite
-RGB, PLACE, GOAL = 3, 2, 3  # numbers of a colour, of a place in a picture, of a position in space
+RGB, PLACE = 3, 2  # numbers of a colour, of a place in a picture
 APART = 1  # one number: how much a place stands out
 KNOWN = APART + RGB + PLACE  # what is told of a place beside its learned features, in this order
 SPOTS = 4  # spots along a place's edge
@@ -260,21 +261,19 @@ class MemoryNetwork(nn.Module):
         self.candidate = nn.Linear(hidden, sizes.memory)
         self.first_rest = nn.Parameter(torch.zeros(sizes.memory))
         self.asks = nn.Linear(sizes.memory, n_things * n_key)
-        self.goal = nn.Sequential(nn.Linear(sizes.seen, hidden), nn.GELU(), nn.Linear(hidden, GOAL))
+        self.goal = nn.Sequential(nn.Linear(sizes.seen, hidden), nn.GELU(), nn.Linear(hidden, SPACE))
         kept = sizes.seen + sizes.memory
         self.decides = nn.Sequential(
-            nn.Linear(sizes.seen + kept + hidden + sizes.state + GOAL, hidden),
+            nn.Linear(sizes.seen + kept + hidden + sizes.state + SPACE, hidden),
             nn.LayerNorm(hidden),
             nn.GELU(),
             nn.Linear(hidden, hidden),
             nn.GELU(),
         )
-        self.acts = nn.Linear(hidden, sizes.chunk * sizes.action)
-        self.doubts = nn.Linear(hidden, sizes.chunk)
+        self.acts = ActionHead(hidden=hidden, chunk=sizes.chunk, action=sizes.action)
         with torch.no_grad():
             nn.init.zeros_(self.asks.weight)
             nn.init.zeros_(self.asks.bias)
-            self.doubts.bias.fill_(-3.0)  # about the error of actions at the beginning
             # Time scales from 1 step to the longest (chrono initialisation, Tallec & Ollivier 2018).
             longest = math.log(sizes.longest_span_steps)
             self.gates.bias.copy_(-torch.linspace(0, longest, sizes.memory))
@@ -337,7 +336,7 @@ class MemoryNetwork(nn.Module):
         Args:
             sight: of these steps.
             memory: with these steps written into it.
-            state: (N, state) in SI units.
+            state: (N, state) in SI units, the tool centre point's position first.
         """
         sizes = self.sizes
         asked = self.asks(memory.rest).reshape(len(state), sizes.cameras, sizes.heads, -1)
@@ -348,13 +347,11 @@ class MemoryNetwork(nn.Module):
         ]
         looked_up = torch.cat(found, dim=1).flatten(1)
         goal = GOAL_SCALE_M * self.goal(looked_up)
+        way_m = goal.detach() - state[:, :SPACE]
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * STATE_SCALE]
-        decided = self.decides(torch.cat([*known, goal.detach()], dim=-1))
-        return Answer(
-            actions=self.acts(decided).reshape(-1, sizes.chunk, sizes.action),
-            doubts=functional.softplus(self.doubts(decided.detach())) + LEAST_DOUBT,
-            goal_m=goal,
-        )
+        decided = self.decides(torch.cat([*known, way_m / WAY_SCALE_M], dim=-1))
+        actions, doubts = self.acts(decided, way_m)
+        return Answer(actions=actions, doubts=doubts, goal_m=goal)
 
     def forward(self, pictures: Tensor, state: Tensor) -> Answer:
         """Answer for each step of episodes from their beginning.

@@ -1,0 +1,69 @@
+"""The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
+
+Where the arm goes is told by how far away the goal is, axis by axis, in a layer that knows nothing else:
+so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
+paths still finds the way. When to go is decided with all that is known.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+SPACE = 3  # numbers of a position, and of the translation with which an action begins
+WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
+WAY_HIDDEN = 64
+WAY_SEEN = 4  # numbers that tell the way along one axis
+LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
+
+
+class ActionHead(nn.Module):
+    """Decides when to go, the rest of the action, and how large the error of each action will be.
+
+    Args:
+        hidden: numbers that tell what was decided.
+        chunk: actions.
+        action: dimensions of an action, the first three of them a translation.
+    """
+
+    upright: Tensor
+
+    def __init__(self, *, hidden: int, chunk: int, action: int) -> None:
+        super().__init__()
+        self.chunk = chunk
+        self.goes = nn.Linear(hidden, chunk)
+        self.way = nn.Sequential(
+            nn.Linear(WAY_SEEN, WAY_HIDDEN),
+            nn.GELU(),
+            nn.Linear(WAY_HIDDEN, WAY_HIDDEN),
+            nn.GELU(),
+            nn.Linear(WAY_HIDDEN, chunk),
+        )
+        self.others = nn.Linear(hidden, chunk * (action - SPACE))
+        self.doubts = nn.Linear(hidden, chunk)
+        self.register_buffer("upright", torch.eye(SPACE)[-1], persistent=False)
+        with torch.no_grad():
+            self.doubts.bias.fill_(-3.0)  # about the error of actions at the beginning
+
+    def forward(self, decided: Tensor, way_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions (N, chunk, action), and the squared error expected of each (N, chunk) > 0.
+
+        Args:
+            decided: (N, hidden).
+            way_m: (N, 3) from the tool centre point to the goal.
+        """
+        goes = self.goes(decided).sigmoid()[..., None]  # (N, chunk, 1)
+        ways = self.way(self._along_each_axis(way_m)).transpose(1, 2)  # (N, chunk, 3)
+        others = self.others(decided).reshape(len(decided), self.chunk, -1)
+        doubts = functional.softplus(self.doubts(decided.detach())) + LEAST_DOUBT
+        return torch.cat([goes * ways, others], dim=-1), doubts
+
+    def _along_each_axis(self, way_m: Tensor) -> Tensor:
+        """(N, 3) to (N, 3, WAY_SEEN): the way along the axis, up and aside, and which kind of axis it is.
+
+        The two level axes share one law: what is learned of one holds for the other.
+        """
+        way = way_m / WAY_SCALE_M
+        up, aside = way[:, 2:], way[:, :2].norm(dim=1, keepdim=True)
+        shared = torch.cat([up, aside], dim=1)[:, None].expand(-1, SPACE, -1)
+        kind = self.upright.expand(len(way), -1)
+        return torch.cat([way[..., None], shared, kind[..., None]], dim=-1)
