@@ -92,9 +92,10 @@ def test_all_nine_cue_colours_survive_the_video(tmp_path: Path) -> None:
 
 def test_names_of_dimensions_are_those_of_the_environment() -> None:
     from vla_eval.envs import fake, maniskill
+    from vla_eval.tasks.arms import PANDA
 
-    for module in (fake, maniskill):
+    for module, states in ((fake, fake.STATES), (maniskill, maniskill.states(PANDA))):
         assert module.ACTION.dims == ACTION_NAMES
-        n_numbers = sum(len(spec.dims) for spec in module.STATES)
+        n_numbers = sum(len(spec.dims) for spec in states)
         assert n_numbers == len(STATE_NAMES["joints"]) == 25
         assert {camera.name for camera in module.CAMERAS} == set(CAMERA_KEYS)

@@ -18,7 +18,7 @@ from vla_eval.tasks.spec import TaskSpec
 WIDTH = 100
 INDENT = 14
 OWN_PACKAGE = "vla_eval."
-NOT_FOR_USERS = ("robot_uids", "instruction", "reconfiguration_freq")  # chosen by other options or not at all
+NOT_FOR_USERS = ("instruction", "reconfiguration_freq")  # chosen by other options or not at all
 
 
 class TaskArgument(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vla_eval.core import FloatArray, StepResult
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, SpecMismatchError
 
 FPS = 20  # control steps per second; every frame is one control step
 
@@ -27,6 +27,7 @@ StateKind = Literal["eef", "joints"]
 PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.joints"}
 """Both kinds are always stored. lerobot takes as inputs only what begins with `observation`."""
 
+PANDA_JOINTS = 9  # fingers included
 ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
     # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
@@ -98,8 +99,16 @@ def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArra
 
     Returns:
         `eef` (10,) and `joints` (25,), float32; see `STATE_NAMES`.
+
+    Raises:
+        SpecMismatchError: the joints are another arm's than the Panda's.
     """
     pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
+    if len(qpos) != PANDA_JOINTS:
+        raise SpecMismatchError(
+            f"proprioception: expected the {PANDA_JOINTS} joints of the Panda, found {len(qpos)}. Datasets "
+            "and learned policies are the Panda's alone: leave env.robot_uids out."
+        )
     columns = rotation_columns(pose[3:])
     width_m = qpos[-2:].sum(keepdims=True)
     return {

@@ -26,26 +26,19 @@ from vla_eval.core import (
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.tasks.arms import CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_arguments
-from vla_eval.tasks.memory_env import CAMERA_FOV_RAD, CAMERA_SIZE_PX, PHASES, MemoryTableEnv
+from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.spec import TaskSpec
 
 CONTROL_MODE = "pd_ee_delta_pose"
-ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
-FINGERS = ("finger1", "finger2")
-STATES = (
-    StateSpec(
-        name="tcp_pose",
-        dims=("x", "y", "z", "qw", "qx", "qy", "qz"),
-        unit="m, wxyz quaternion",
-        frame="world",
-    ),
-    StateSpec(name="qpos", dims=ARM_JOINTS + FINGERS, unit="rad, m", frame="joint"),
-    StateSpec(name="qvel", dims=ARM_JOINTS + FINGERS, unit="rad/s, m/s", frame="joint"),
+ROBOT = "robot_uids"
+TCP_POSE = StateSpec(
+    name="tcp_pose", dims=("x", "y", "z", "qw", "qx", "qy", "qz"), unit="m, wxyz quaternion", frame="world"
 )
 CAMERAS = tuple(
     CameraSpec(name=name, height_px=CAMERA_SIZE_PX, width_px=CAMERA_SIZE_PX, fov_rad=CAMERA_FOV_RAD)
@@ -104,7 +97,7 @@ class ManiSkillEnv:
         self.spec = EnvSpec(
             task=row.id,
             cameras=CAMERAS,
-            states=_states(env_class(row)),
+            states=states(self._envs[0].arm, env_class(row).PROMPT_DIMS),
             action=ACTION,
             horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
@@ -217,10 +210,10 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
             obs_mode="none",
             reward_mode="normalized_dense",
             control_mode=CONTROL_MODE,
-            robot_uids=WRIST_MESH_ROBOTS[settings.render.wrist_mesh],
+            robot_uids=_robot(settings, kwargs),
             sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
             render_backend=backend,
-            **kwargs,
+            **{name: value for name, value in kwargs.items() if name != ROBOT},
         )
     except RuntimeError as exc:
         if backend == "none" or settings.sim_backend == "gpu":
@@ -228,6 +221,19 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
         raise RenderingError(
             f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
         ) from exc
+
+
+def _robot(settings: EnvSettings, kwargs: Mapping[str, Any]) -> str:
+    """Return the arm that was asked for, or the Panda with the mesh that was."""
+    mesh = settings.render.wrist_mesh
+    if ROBOT not in kwargs:
+        return WRIST_MESH_ROBOTS[mesh]
+    if mesh != "shipped" or kwargs[ROBOT] in WRIST_MESH_ROBOTS.values():
+        raise TaskArgumentError(
+            f"{ROBOT}={kwargs[ROBOT]!r} with render.wrist_mesh={mesh!r}: the mesh is the Panda's, which is "
+            "the arm where no other is asked for. Set one of the two."
+        )
+    return str(kwargs[ROBOT])
 
 
 def _render_backend(settings: EnvSettings) -> str:
@@ -239,11 +245,16 @@ def _render_backend(settings: EnvSettings) -> str:
     return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
 
 
-def _states(cls: Any) -> tuple[StateSpec, ...]:
-    """Return what every task offers, and the numbers of the prompt where the task has one."""
-    if not cls.PROMPT_DIMS:
-        return STATES
-    return (*STATES, StateSpec(name="task_cue", dims=cls.PROMPT_DIMS, unit="rad", frame="world"))
+def states(arm: Arm, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]:
+    """Return what every task offers with an arm, and the numbers of the prompt where the task has one."""
+    offered = (
+        TCP_POSE,
+        StateSpec(name="qpos", dims=arm.joints, unit="rad, m", frame="joint"),
+        StateSpec(name="qvel", dims=arm.joints, unit="rad/s, m/s", frame="joint"),
+    )
+    if not prompt_dims:
+        return offered
+    return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
 def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
@@ -253,9 +264,9 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
         if issubclass(ancestor, MemoryTableEnv):
             parameters = inspect.signature(ancestor.__init__).parameters.values()
             known |= {p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
-    # The arm is chosen by the render option `wrist_mesh`, the sentence by the prompt set; and an episode
-    # that depends on those before it is nothing to ask for.
-    known -= {"robot_uids", "instruction", "reconfiguration_freq"}
+    # The sentence is chosen by the prompt set; and an episode that depends on those before it is nothing
+    # to ask for.
+    known -= {"instruction", "reconfiguration_freq"}
     for name in kwargs:
         if name not in known:
             raise unknown_name("argument", name, known, where=task)

@@ -24,25 +24,20 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.core import Phase
-from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks import robots as _robots  # registers the arm with the simplified camera mesh
+from vla_eval.errors import TaskArgumentError, unknown_name
+from vla_eval.tasks.arms import ARMS, CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.bodies import Body, yaw_rad
+from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.streams import Stream, generator
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 """Index of a phase in tensors -> its name."""
 
-ROBOT_BASE_X_M = -0.615
-# Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
-REST_QPOS_RAD = (0.0, 0.0, 0.0, -2 * np.pi / 3, 0.0, 2 * np.pi / 3, np.pi / 4, 0.04, 0.04)
 QPOS_NOISE_RAD = 0.02
-N_ARM_JOINTS = 7
 FLOOR_Z_M = -0.9196429  # ManiSkill's table is as high as this
 PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
-CAMERA_SIZE_PX = 128
-CAMERA_FOV_RAD = np.pi / 2
 
 StepRange = int | Sequence[int]
 
@@ -75,10 +70,11 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             simulator (20 ms), never on the GPU simulator. In a scene that is used again PhysX keeps
             contact caches, by which states differ from those of a fresh scene (measured: from 1e-7 to
             15 rad/s after contact).
-        robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh.
+        robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh; or another
+            arm that the task knows (`SUPPORTED_ROBOTS`).
     """
 
-    SUPPORTED_ROBOTS = _robots.ROBOT_UIDS
+    SUPPORTED_ROBOTS: tuple[str, ...] = tuple(WRIST_MESH_ROBOTS.values())
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     MAX_REWARD: float
     FAMILY: int
@@ -108,6 +104,9 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         self.phase_gate_success = phase_gate_success
         self.static_threshold_rad_s = static_threshold_rad_s
         self.instruction = instruction
+        if robot_uids not in self.SUPPORTED_ROBOTS:
+            raise unknown_name("robot_uids", robot_uids, self.SUPPORTED_ROBOTS, where=type(self).__name__)
+        self.arm: Arm = ARMS[robot_uids]
         if static_threshold_rad_s <= 0:
             raise TaskArgumentError(f"static_threshold_rad_s={static_threshold_rad_s}: expected > 0.")
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
@@ -138,7 +137,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         del kept
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        super()._load_agent(options, sapien.Pose(p=[ROBOT_BASE_X_M, 0, 0]))
+        super()._load_agent(options, sapien.Pose(p=self.arm.base_m))
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self.table_scene = TableSceneBuilder(env=self, robot_init_qpos_noise=QPOS_NOISE_RAD)
@@ -160,18 +159,18 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     # ---------------------------------------------------------------- episode
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
-        qpos = np.empty((len(env_idx), len(REST_QPOS_RAD)))
+        arm = self.arm
+        qpos = np.tile(np.array(arm.rest_qpos), (len(env_idx), 1))
         for row, env in enumerate(env_idx.tolist()):
-            qpos[row] = REST_QPOS_RAD
-            noise = self.episode_generator(env, Stream.ROBOT).normal(0, QPOS_NOISE_RAD, N_ARM_JOINTS)
-            qpos[row, :N_ARM_JOINTS] += noise
+            noise = self.episode_generator(env, Stream.ROBOT).normal(0, QPOS_NOISE_RAD, len(arm.arm_joints))
+            qpos[row, arm.arm_joints] += noise
             phases = self.episode_generator(env, Stream.PHASES)
             cue_steps = int(phases.integers(*self.cue_steps_range, endpoint=True))
             self._cue_end_step[env] = self.total_cue_steps(cue_steps)
             delay = int(phases.integers(*self.delay_steps_range, endpoint=True))
             self._response_step[env] = self._cue_end_step[env] + delay
         self.agent.reset(qpos.astype(np.float32))
-        self.agent.robot.set_pose(sapien.Pose([ROBOT_BASE_X_M, 0, 0]))
+        self.agent.robot.set_pose(sapien.Pose(self.arm.base_m))
         for env in env_idx.tolist():
             self._sample_episode(env)
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -301,8 +300,9 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return static
 
     def arm_speed(self) -> torch.Tensor:
-        """Return the (B,) Euclidean norm of the seven arm joint velocities, rad/s."""
-        speed: torch.Tensor = torch.linalg.norm(self.agent.robot.get_qvel()[:, :N_ARM_JOINTS], dim=1)
+        """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
+        qvel = self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)]
+        speed: torch.Tensor = torch.linalg.norm(qvel, dim=1)
         return speed
 
     def response_begun(self) -> torch.Tensor:

@@ -11,6 +11,7 @@ import sapien
 import torch
 
 from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
 from vla_eval.tasks.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
 from vla_eval.tasks.layout import Plane, jittered_apart, slot_centres_m
@@ -46,6 +47,7 @@ class RememberEnv(ItemChoiceEnv):
     Version history: 1, first version.
     """
 
+    SUPPORTED_ROBOTS = (*ItemChoiceEnv.SUPPORTED_ROBOTS, FETCH_UID)
     MAX_REWARD = 3.0
     REACH_SCALE_PER_M = 10.0
     SLOWING_WEIGHT = 0.5

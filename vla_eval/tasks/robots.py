@@ -114,6 +114,5 @@ class PandaWristCamLight(PandaWristCam):  # type: ignore[misc]  # ManiSkill is u
         return str(light_urdf())
 
 
-ROBOT_UIDS = ("panda_wristcam", "panda_wristcam_light")
 WRIST_MESH_ROBOTS = {"shipped": "panda_wristcam", "simplified": "panda_wristcam_light"}
 """Value of the render option `wrist_mesh` -> robot uid."""
