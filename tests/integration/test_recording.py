@@ -25,6 +25,7 @@ from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.store import read_run
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
+from vla_eval.viz.arm_figure import arm_points_m
 from vla_eval.viz.rerun_log import events, n_overlapping, write_rrd
 from vla_eval.viz.settings import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.viz.tape import Tapes
@@ -142,8 +143,26 @@ def test_a_rerun_recording_holds_what_was_seen_done_and_chosen(tmp_path: Path) -
     assert {f"/cameras/{name}" for name in (*CAMERAS, HUMAN_CAMERA)} <= entities
     assert {f"/actions/dx/{kind}" for kind in ("asked", "executed", "predicted_0")} <= entities
     assert {"/world/tcp", "/world/tcp_path", "/world/candidates", "/gripper/width", "/reward"} <= entities
+    assert "/world/arm" not in entities  # the fake's joints are none
     assert {"/phase/cue", "/phase/delay", "/phase/response", "/events", "/instruction"} <= entities
     assert {"Index(timeline:step)", "Index(timeline:time)"} <= {str(one) for one in schema.index_columns()}
+
+
+def test_the_arm_ends_where_the_simulator_has_the_tool_centre_point() -> None:
+    env, draws = make_env(EnvSettings(task=TASK)), np.random.default_rng(0)
+    result = env.reset({0: 1}, render=False)[0]
+    for _ in range(10):
+        state = result.observation.state
+        points = arm_points_m(state["qpos"], state["tcp_pose"][:3])
+        assert points is not None
+        np.testing.assert_allclose(points[-1], state["tcp_pose"][:3], atol=1e-5)  # of a chain of a metre
+        action = draws.uniform(-1, 1, 7).astype(np.float32)
+        result = env.step({0: action}, render=frozenset())[0]
+
+
+def test_another_arm_is_not_drawn_as_a_panda() -> None:
+    assert arm_points_m(np.zeros(15), np.array([-0.12, 0.0, 0.30])) is None
+    assert arm_points_m(np.zeros(6), np.zeros(3)) is None
 
 
 def test_chunks_that_overlap_lie_in_series_of_their_own(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
     cameras/NAME                 pictures as they are decoded from the dataset's video
     actions/DIM/stored, state/DIM, reward, success
+    world/arm                    where `proprio.joints` are those of the Panda
     world/tcp, tcp_path          where the numbers of `observation.state` or `proprio.eef` begin with x, y, z
     phase/cue|delay|response     of recordings of ours, whose manifest knows the phases
     events, instruction          in words
@@ -18,15 +19,16 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, REWARD_KEY, STATE_KEY, SUCCESS_KEY
+from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, REWARD_KEY, STATE_KEY, STATE_NAMES, SUCCESS_KEY
 from vla_eval.data.manifest import MANIFEST_FILE, RecordedEpisode, read_manifest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import ViewingError
 from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step, time_columns
 from vla_eval.viz.rerun_layout import layout
-from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, PHASES
+from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, PHASES, log_arm
 
 PLACE_NAMES = ("x", "y", "z")
+N_POSE = 7  # before the joints: position and quaternion of the tool centre point
 PATH_FIELDS = (PROPRIO_KEYS["eef"], STATE_KEY)
 
 
@@ -88,6 +90,7 @@ def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Pa
     ) as stream:
         _log_facts(stream, dataset, number, frames, recorded)
         _log_numbers(stream, dataset, frames)
+        _log_arm(stream, dataset, frames)
         _log_pictures(stream, dataset, frames)
         if recorded is not None:
             _log_phases(stream, recorded, float(dataset.fps))
@@ -157,6 +160,15 @@ def _log_numbers(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapp
             places = rr.Points3D.columns(positions=way, radii=np.full(len(way), 0.012))
             stream.send_columns("world/tcp", indexes=time_columns(steps, fps), columns=places)
             return
+
+
+def _log_arm(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[str, Any]]) -> None:
+    key = PROPRIO_KEYS["joints"]
+    if _dims(dataset, key) != STATE_NAMES["joints"]:
+        return
+    for step, numbers in enumerate(_column(frames, key)):
+        set_step(stream, step, float(dataset.fps))
+        log_arm(stream, numbers[N_POSE:], numbers[:3])
 
 
 def _log_pictures(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[str, Any]]) -> None:

@@ -2,12 +2,13 @@
 
     cameras/NAME          pictures, at the steps where they were rendered
     world/tcp, tcp_path   the tool centre point now, and all of its way
+    world/arm             a line through the joints of the arm, if it is the Panda's
     world/candidates, bodies/NAME   where things are; `robot_base`
     actions/DIM/executed, asked, predicted_I   I: chunks that overlap lie in different series
     gripper/width, reward, phase/cue|delay|response (0 or 1), choice/first
     events, instruction   in words
 
-Timelines: `step` (control steps) and `time` (seconds). The arm itself is not drawn: only its hand moves.
+Timelines: `step` (control steps) and `time` (seconds).
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,6 +22,7 @@ from vla_eval.core import FloatArray, Phase
 from vla_eval.results.recording_files import recording_stem
 from vla_eval.results.records import EpisodeRecord
 from vla_eval.tasks.item_names import item_names
+from vla_eval.viz.arm_figure import ROBOT_BASE_M, arm_points_m
 from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.tape import EpisodeTape, TapedStep
@@ -28,9 +30,14 @@ from vla_eval.viz.tape import EpisodeTape, TapedStep
 ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
-ROBOT_BASE_M = (-0.615, 0.0, 0.0)  # where ManiSkill's table scene puts the Panda
 JPEG_QUALITY = 90
-COLORS = {"right": (0, 158, 115), "other": (163, 169, 181), "tcp": (0, 114, 178), "body": (230, 159, 0)}
+COLORS = {
+    "right": (0, 158, 115),
+    "other": (163, 169, 181),
+    "tcp": (0, 114, 178),
+    "body": (230, 159, 0),
+    "arm": (86, 97, 112),
+}
 
 
 def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_hz: float) -> None:
@@ -96,6 +103,8 @@ def _log_step(stream: rr.RecordingStream, taped: TapedStep) -> None:
         stream.log("world/tcp", point)
     if JOINTS in state:
         stream.log("gripper/width", rr.Scalars(float(state[JOINTS][-N_FINGERS:].sum())))
+    if JOINTS in state and TCP_POSE in state:
+        log_arm(stream, state[JOINTS], state[TCP_POSE][:3])
     _log_world(stream, taped)
     for phase in PHASES:
         stream.log(f"phase/{phase}", rr.Scalars(float(result.status.phase == phase)))
@@ -104,6 +113,13 @@ def _log_step(stream: rr.RecordingStream, taped: TapedStep) -> None:
         _log_action(stream, "asked", taped.action)
         if result.executed_action is not None:
             _log_action(stream, "executed", result.executed_action)
+
+
+def log_arm(stream: rr.RecordingStream, qpos: FloatArray, tcp_position_m: FloatArray) -> None:
+    """Log the arm as a line through its joints; nothing if it is not the Panda's."""
+    points = arm_points_m(qpos, tcp_position_m)
+    if points is not None:
+        stream.log("world/arm", rr.LineStrips3D([points], colors=[COLORS["arm"]], radii=0.02))
 
 
 def _log_world(stream: rr.RecordingStream, taped: TapedStep) -> None:
