@@ -16,8 +16,9 @@ help:  ## list these verbs
 setup:  ## make .venv and, where there is none, a Vulkan driver
 	@bash scripts/setup.sh
 
-demo: setup  ## evaluate scripted policies on two tasks, print the table, write the report page
+demo: setup  ## evaluate scripted policies and two learned ones, print the tables, write the report pages
 	$(BIN)/mikasa-vla eval configs/demo.yaml --html runs/demo-report
+	$(BIN)/mikasa-vla eval configs/demo_memory.yaml --html runs/demo-memory-report
 
 test: setup  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)

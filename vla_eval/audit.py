@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from vla_eval.audited import PROTOCOLS, Protocol
 from vla_eval.errors import RecipeError
 from vla_eval.recipes import EvalConfig
 from vla_eval.results.estimates import p_above, p_more
@@ -18,15 +19,8 @@ from vla_eval.results.store import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
-Protocol = Literal["paper", "strict"]
 Kind = Literal["choice", "several", "no_choice"]
 
-STRICT: Mapping[str, bool] = {
-    "freeze_until_choice": True,
-    "strict_choice": True,
-    "phase_gate_success": True,
-}
-PROTOCOLS: Mapping[Protocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT}
 CONTROLS: Mapping[Kind, tuple[str, ...]] = {
     "choice": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch", "body_memory"),
     # One width of the gripper stands for one candidate; nobody has written a body that keeps several.
@@ -68,9 +62,10 @@ class Counts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskAudit:
-    """What the controls reached on one task under one protocol, and what follows from it."""
+    """What the controls reached on one task of this version under one protocol, and what follows from it."""
 
     task: str
+    version: int
     protocol: Protocol
     chance: float | None
     counts: Mapping[str, Counts]
@@ -162,6 +157,7 @@ def audit_task(task: str, protocol: Protocol, records: Sequence[EpisodeRecord]) 
     chance = next((c.chance for c in counts.values() if c.chance is not None), None)
     return TaskAudit(
         task=task,
+        version=task_spec(task).version,
         protocol=protocol,
         chance=chance,
         counts=counts,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from vla_eval.audit import STRICT
+from vla_eval.audited import STRICT
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,

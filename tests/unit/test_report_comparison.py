@@ -141,7 +141,7 @@ def test_a_tour_that_succeeds_takes_away_the_meaning_of_success() -> None:
 
 def test_a_tour_at_chance_is_no_reason_for_a_warning() -> None:
     # 4 of 10: the interval is [0.17, 0.69] and contains 1/3.
-    assert not has_note(build_table([stored(episodes("tour", "++++------"))]), "tour")
+    assert not has_note(build_table([stored(episodes("tour", "++++------"))]), "`tour` reaches")
 
 
 # ------------------------------------------------------------------------------- order, completeness

@@ -79,7 +79,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
-    from vla_eval.audit import PROTOCOLS, audit_configs
+    from vla_eval.audit import audit_configs
+    from vla_eval.audited import PROTOCOLS
     from vla_eval.tasks.catalog import TASKS
 
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results import notes
+from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.comparison import (
     Chance,
     Comparison,
@@ -58,6 +59,7 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     table_notes = (
         *notes.row_notes(rows, chances),
         *notes.comparison_notes(rows, comparisons, name),
+        *audit_notes(runs),
         *notes.run_notes(runs, grouping),
     )
     return Table(

@@ -1,0 +1,61 @@
+"""What the shortcut audit said of the tasks as they ship: `audited.json`, made by a command.
+
+    mikasa-vla audit --format json > vla_eval/audited.json
+
+Knows neither statistics nor simulators, so that a report can quote it.
+"""
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+Protocol = Literal["paper", "strict"]
+STRICT: Mapping[str, bool] = {
+    "freeze_until_choice": True,
+    "strict_choice": True,
+    "phase_gate_success": True,
+}
+PROTOCOLS: Mapping[Protocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT}
+"""Name of a set of rules -> arguments of the tasks."""
+
+FILE = Path(__file__).with_suffix(".json")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What an audit said of a task.
+
+    Attributes:
+        version: of the task, when it was audited.
+        words: the roads to success that need no memory; or that none was found.
+        n_episodes: of each control.
+    """
+
+    version: int
+    words: tuple[str, ...]
+    n_episodes: int
+
+
+@functools.cache
+def shipped_verdicts() -> Mapping[tuple[str, Protocol], Verdict]:
+    """Return (task, protocol) -> what the shipped audit said."""
+    rows = json.loads(FILE.read_text(encoding="utf-8"))
+    return {
+        (row["task"], row["protocol"]): Verdict(
+            version=row["version"],
+            words=tuple(row["verdict"]),
+            n_episodes=min(counts["n_episodes"] for counts in row["counts"].values()),
+        )
+        for row in rows
+    }
+
+
+def protocol_of(env: Mapping[str, Any]) -> Protocol | None:  # Any: arguments of tasks
+    """Return the rules that a run's task arguments stand for; None for others than the audited ones."""
+    if not env:
+        return "paper"
+    # The gate of the phases is closed by default, so that leaving it out is strict, too.
+    return "strict" if {"phase_gate_success": True, **env} == STRICT else None
