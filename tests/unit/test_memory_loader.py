@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vla_eval.data import frame_cache
 from vla_eval.data.loader_bench import run_loader_bench
 from vla_eval.data.memory_loader import MemoryDataset
+from vla_eval.data.opening import open_local_dataset, video_decoder
 from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import DatasetError, StorageFullError, UnknownNameError
 
@@ -241,3 +243,18 @@ def test_the_bench_says_what_is_missing(tmp_path: Path, root: Path) -> None:
     # lerobot itself would ask the Hub for it.
     with pytest.raises(DatasetError, match=rf"videos/{WRIST}/chunk-000/file-000.mp4 is missing"):
         run_loader_bench(copy, n_samples=1, repeats=1)
+
+
+def test_where_torchcodec_cannot_be_loaded_pyav_decodes_and_nobody_is_shown_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = write_synthetic_dataset(tmp_path / "data", n_episodes=1, n_frames=3)
+    video_decoder.cache_clear()
+    caplog.clear()
+    monkeypatch.setitem(sys.modules, "torchcodec", None)  # importing it is an ImportError then
+    try:
+        dataset = open_local_dataset(root)
+    finally:
+        video_decoder.cache_clear()
+    assert dataset._video_backend == "pyav"
+    assert "torchcodec" not in caplog.text

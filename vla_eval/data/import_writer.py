@@ -27,6 +27,7 @@ from vla_eval.data.features import (
 )
 from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
 from vla_eval.data.layouts import CONTROL_MODES, EE_DELTA, Source, SourceEpisode
+from vla_eval.data.opening import video_decoder
 from vla_eval.data.shard_writer import MIN_FRAMES, ROBOT_TYPE, write_exact_statistics
 from vla_eval.errors import DatasetError
 from vla_eval.prompts import DEFAULT_PROMPT_SET, instruction_for
@@ -204,4 +205,5 @@ def _create(root: Path, features: dict[str, Any]) -> Any:
         rgb_encoder=RGBEncoderConfig(
             vcodec=encoder.vcodec, pix_fmt=encoder.pix_fmt, crf=encoder.crf, g=encoder.g
         ),
+        video_backend=video_decoder(),
     )

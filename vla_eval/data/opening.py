@@ -1,12 +1,12 @@
 """Open a dataset on this machine, never the network: lerobot looks on the Hub for whatever is missing."""
 
 import functools
+import importlib
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.import_utils import get_safe_default_video_backend
 
 from vla_eval.errors import DatasetError
 
@@ -39,7 +39,7 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
             raise DatasetError(
                 f"{root}: {path} is missing. Fetch the dataset again, or rebuild it from its manifest."
             )
-    options.setdefault("video_backend", _decoder())
+    options.setdefault("video_backend", video_decoder())
     try:
         return LeRobotDataset(repo_id, root=root, **options)
     except (OSError, ValueError, KeyError, RuntimeError) as exc:
@@ -47,9 +47,17 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
 
 
 @functools.cache
-def _decoder() -> str:
-    """Return lerobot's choice of decoder; asked once, since torchcodec without FFmpeg fails slowly."""
-    return str(get_safe_default_video_backend())
+def video_decoder() -> str:
+    """Return lerobot's name of the decoder: `torchcodec`, or `pyav` where that cannot be loaded.
+
+    The same choice as lerobot's `get_safe_default_video_backend`, which says in ninety lines why torchcodec
+    cannot be loaded (it wants FFmpeg's libraries; PyAV brings its own), each time that it is asked.
+    """
+    try:
+        importlib.import_module("torchcodec")
+    except (ImportError, OSError, RuntimeError):
+        return "pyav"
+    return "torchcodec"
 
 
 def _files(meta: LeRobotDatasetMetadata) -> list[Path]:

@@ -24,6 +24,7 @@ from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_stat
 from vla_eval.data.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, from_json, write_lines
+from vla_eval.data.opening import video_decoder
 from vla_eval.errors import DatasetError
 from vla_eval.results.durable import sync_folder
 
@@ -127,6 +128,7 @@ def create_dataset(root: Path, format: Format) -> Any:  # Any: lerobot is untype
         rgb_encoder=RGBEncoderConfig(
             vcodec=encoder.vcodec, pix_fmt=encoder.pix_fmt, crf=encoder.crf, g=encoder.g
         ),
+        video_backend=video_decoder(),
     )
 
 

@@ -14,6 +14,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 
 from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.data.opening import video_decoder
 from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint import (
@@ -251,6 +252,7 @@ def _loop_config(
             repo_id=f"local/{dataset.name}",
             root=str(dataset.root),
             use_imagenet_stats=recipe.imagenet_statistics,
+            video_backend=video_decoder(),
         ),
         policy=policy,
         output_dir=out / TRAIN_FOLDER,
