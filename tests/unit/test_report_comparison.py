@@ -128,6 +128,14 @@ def test_chance_is_not_guessed_where_there_is_nothing_to_choose_from() -> None:
     assert has_note(table, "chance is unknown for InterceptMedium-v0 K=1", "run `cue_blind`")
 
 
+def test_a_chance_of_few_episodes_is_called_vague() -> None:
+    # One failure: the interval of the blind arm is [0, 0.79]; 7 of 20: [0.18, 0.57].
+    policy = episodes("p", "+" * 20)
+    assert has_note(build_table([stored(policy, episodes("cue_blind", "-"))]), "says little", "[0.00, 0.79]")
+    settled = build_table([stored(policy, episodes("cue_blind", "+" * 7 + "-" * 13))])
+    assert not has_note(settled, "says little")
+
+
 def test_a_ceiling_at_chance_leaves_no_room_for_a_score() -> None:
     groups = (episodes("p", "+-"), episodes("cue_blind", "+-"), episodes("oracle", "+-"))
     assert only_row(build_table([stored(*groups)]), "p").chance_corrected is None

@@ -13,6 +13,7 @@ from vla_eval.results.table import Row
 from vla_eval.tasks.catalog import find_task
 
 MAX_NAMED = 6
+VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
 
 class Group(NamedTuple):
@@ -30,7 +31,13 @@ class Group(NamedTuple):
 
 def row_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
     """Say what the rows' own figures are, and where they mislead."""
-    return [*_interval_notes(rows), *_chance_notes(rows), *_tour_notes(rows, chances), *_error_notes(rows)]
+    return [
+        *_interval_notes(rows),
+        *_chance_notes(rows),
+        *_vague_chances(rows, chances),
+        *_tour_notes(rows, chances),
+        *_error_notes(rows),
+    ]
 
 
 def _interval_notes(rows: Sequence[Row]) -> list[str]:
@@ -97,6 +104,22 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
             "same n_action_steps."
         )
     return notes
+
+
+def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
+    """Warn where chance was measured on so few episodes that it says little, as in a run that goes on."""
+    vague = []
+    for row in rows:
+        chance = chances[RowKey(row.task, row.policy, row.n_action_steps, row.variant)]
+        interval = chance.interval if chance is not None else None
+        if interval is not None and interval.high - interval.low > VAGUE:
+            vague.append(f"{_place(row)} [{interval.low:.2f}, {interval.high:.2f}]")
+    if not vague:
+        return []
+    return [
+        f"chance says little for {_names(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
+        "interval in brackets). The corrected score is computed from it."
+    ]
 
 
 def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
