@@ -2,6 +2,7 @@
 
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 from vla_eval.results.records import EpisodeError, EpisodeRecord
@@ -52,15 +53,8 @@ def result(seed: int, *, success: bool = True) -> EpisodeRecord:
 
 
 def error(seed: int, message: str = "the GPU was lost") -> EpisodeRecord:
-    return EpisodeRecord(
-        task="A",
-        policy="oracle",
-        n_action_steps=1,
-        run=0,
-        seed=seed,
-        outcome="error",
-        error=EpisodeError(kind="WorkerCrashed", stage="step", message=message),
-    )
+    failed = EpisodeError(kind="WorkerCrashed", stage="step", message=message)
+    return replace(result(seed), outcome="error", success_once=None, error=failed)
 
 
 def writer(out: Path, n_keys: int) -> list[str]:

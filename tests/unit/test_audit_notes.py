@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.unit.stored_runs import episodes, stored
 from vla_eval import audited
 from vla_eval.audit import Counts, TaskAudit, verdict
 from vla_eval.audit_table import render_audit
 from vla_eval.audited import STRICT, protocol_of, shipped_verdicts
 from vla_eval.results.audit_notes import audit_notes
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.store import RunDescription, StoredRun
+from vla_eval.results.store import StoredRun
 from vla_eval.tasks.catalog import TASKS
 
 COLOR, SHELL = "RememberColor3-v0", "ShellGameTouch-v0"
@@ -47,18 +47,7 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def run_of(task: str, **config: object) -> StoredRun:
-    record = EpisodeRecord(
-        task=task, policy="oracle", n_action_steps=1, run=0, seed=1, outcome="success", success_once=True
-    )
-    description = RunDescription(
-        name="demo",
-        config=config,  # type: ignore[arg-type]
-        recipes={},
-        environment={},
-        options={},
-        command="",
-    )
-    return StoredRun(path=Path("runs/a"), description=description, records=(record,))
+    return stored(episodes("oracle", "+", task=task), **config)
 
 
 def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -> None:

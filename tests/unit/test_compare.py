@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.unit.stored_runs import stored
 from vla_eval.cli.main import main
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.evaluate import evaluate
@@ -14,7 +15,6 @@ from vla_eval.recipes import EvalConfig, load_recipe
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.power import discordance_of_independent, episodes_to_settle
 from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.store import RunDescription, StoredRun
 from vla_eval.results.sweep import Sweep, SweepRow, compare_runs
 from vla_eval.results.sweep_format import render_sweep
 
@@ -42,20 +42,6 @@ def episodes(
         )
         for seed, letter in enumerate(outcomes, start=1)
     ]
-
-
-def stored(*groups: list[EpisodeRecord], **config: object) -> StoredRun:
-    description = RunDescription(
-        name="demo",
-        config=config,  # type: ignore[arg-type]
-        recipes={},
-        environment={},
-        options={},
-        command="",
-    )
-    return StoredRun(
-        path=Path("runs/a"), description=description, records=tuple(r for g in groups for r in g)
-    )
 
 
 def row(sweep: Sweep, policy: str, k: int) -> SweepRow:
