@@ -27,20 +27,15 @@ StateKind = Literal["eef", "joints"]
 PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.joints"}
 """Both kinds are always stored. lerobot takes as inputs only what begins with `observation`."""
 
-PANDA_JOINTS = 9  # fingers included
+POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
+JOINT_NAMES = (*(f"joint{i}" for i in range(1, 8)), "finger1", "finger2")  # of the Panda
 ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
     # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
     # ±π for a gripper that points down, and unlike a quaternion, which may flip its sign.
     "eef": ("x", "y", "z", "r11", "r21", "r31", "r12", "r22", "r32", "gripper_width"),
     # The paper's 25 numbers: pose of the tool centre point, joint positions, joint velocities.
-    "joints": (
-        *("x", "y", "z", "qw", "qx", "qy", "qz"),
-        *(f"joint{i}" for i in range(1, 8)),
-        *("finger1", "finger2"),
-        *(f"joint{i}_velocity" for i in range(1, 8)),
-        *("finger1_velocity", "finger2_velocity"),
-    ),
+    "joints": (*POSE_NAMES, *JOINT_NAMES, *(f"{name}_velocity" for name in JOINT_NAMES)),
 }
 
 
@@ -104,10 +99,10 @@ def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArra
         SpecMismatchError: the joints are another arm's than the Panda's.
     """
     pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
-    if len(qpos) != PANDA_JOINTS:
+    if len(qpos) != len(JOINT_NAMES):
         raise SpecMismatchError(
-            f"proprioception: expected the {PANDA_JOINTS} joints of the Panda, found {len(qpos)}. Datasets "
-            "and learned policies are the Panda's alone: leave env.robot_uids out."
+            f"proprioception: expected the {len(JOINT_NAMES)} joints of the Panda, found {len(qpos)}. "
+            "Datasets and learned policies are the Panda's alone: leave env.robot_uids out."
         )
     columns = rotation_columns(pose[3:])
     width_m = qpos[-2:].sum(keepdims=True)

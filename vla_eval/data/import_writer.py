@@ -4,8 +4,6 @@ from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import numpy as np
-from lerobot.configs import RGBEncoderConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval import __version__
 from vla_eval.core import FloatArray
@@ -15,7 +13,6 @@ from vla_eval.data.features import (
     ACTION_KEY,
     CAMERA_KEYS,
     DONE_KEY,
-    FPS,
     PROPRIO_KEYS,
     REWARD_KEY,
     STATE_KEY,
@@ -27,8 +24,7 @@ from vla_eval.data.features import (
 )
 from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
 from vla_eval.data.layouts import CONTROL_MODES, EE_DELTA, Source, SourceEpisode
-from vla_eval.data.opening import video_decoder
-from vla_eval.data.shard_writer import MIN_FRAMES, ROBOT_TYPE, write_exact_statistics
+from vla_eval.data.shard_writer import MIN_FRAMES, new_dataset, write_exact_statistics
 from vla_eval.errors import DatasetError
 from vla_eval.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.tasks.catalog import task_spec
@@ -64,7 +60,9 @@ class ImportWriter:
         features = _features(columns, self._state)
         if self._dataset is None:
             self._features = features
-            self._dataset = _create(self._draft, features)
+            self._dataset = new_dataset(
+                self._draft, features, encoder=EncoderSettings(), max_frames=MAX_FRAMES
+            )
         elif features != self._features:
             differing = sorted(set(features) ^ set(self._features)) or [ACTION_KEY]
             raise DatasetError(
@@ -189,21 +187,3 @@ def _features(columns: dict[str, Any], state: StateKind) -> dict[str, Any]:
         names = list(SOURCE_PROPRIO_NAMES)
         features[SOURCE_PROPRIO_KEY] = {"dtype": "float32", "shape": (len(names),), "names": names}
     return features
-
-
-def _create(root: Path, features: dict[str, Any]) -> Any:
-    encoder = EncoderSettings()
-    return LeRobotDataset.create(
-        f"local/{root.name}",
-        fps=FPS,
-        features=features,
-        root=root,
-        robot_type=ROBOT_TYPE,
-        streaming_encoding=True,
-        encoder_queue_maxsize=MAX_FRAMES + 1,
-        encoder_threads=1,  # the bytes of a video must not depend on the machine's cores
-        rgb_encoder=RGBEncoderConfig(
-            vcodec=encoder.vcodec, pix_fmt=encoder.pix_fmt, crf=encoder.crf, g=encoder.g
-        ),
-        video_backend=video_decoder(),
-    )

@@ -111,19 +111,26 @@ class ShardWriter:
 
 
 def create_dataset(root: Path, format: Format) -> Any:  # Any: lerobot is untyped
-    """Return a new LeRobotDataset to write into."""
-    encoder = format.encoder
+    """Return a new LeRobotDataset for recordings of a format."""
+    features = dataset_features(format.state)
+    return new_dataset(root, features, encoder=format.encoder, max_frames=format.max_frames)
+
+
+def new_dataset(
+    root: Path, features: dict[str, Any], *, encoder: EncoderSettings, max_frames: int
+) -> Any:  # Any: lerobot's plain data, and lerobot
+    """Return a new LeRobotDataset of these fields to write episodes of up to `max_frames` into."""
     av.logging.set_libav_level(av.logging.ERROR)  # else twenty lines for each video
     return LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=FPS,
-        features=dataset_features(format.state),
+        features=features,
         root=root,
         robot_type=ROBOT_TYPE,
         # Never batch_encoding_size > 1: it fails on a new dataset.
         streaming_encoding=True,
         # A full queue drops frames without an error: give a whole episode room.
-        encoder_queue_maxsize=format.max_frames + 1,
+        encoder_queue_maxsize=max_frames + 1,
         encoder_threads=ENCODER_THREADS,
         rgb_encoder=RGBEncoderConfig(
             vcodec=encoder.vcodec, pix_fmt=encoder.pix_fmt, crf=encoder.crf, g=encoder.g

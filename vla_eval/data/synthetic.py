@@ -24,6 +24,7 @@ from vla_eval.data.features import (
     StateKind,
     dataset_features,
 )
+from vla_eval.data.opening import video_decoder
 
 INSTRUCTIONS = ("look, wait, choose", "follow the ball")
 
@@ -49,6 +50,7 @@ def write_synthetic_dataset(
         streaming_encoding=True,
         encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames where its queue is full
         rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
+        video_backend=video_decoder(),
     )
     for episode in range(n_episodes):
         rng = np.random.default_rng([seed, episode])

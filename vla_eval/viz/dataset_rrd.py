@@ -19,7 +19,15 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, REWARD_KEY, STATE_KEY, STATE_NAMES, SUCCESS_KEY
+from vla_eval.data.features import (
+    ACTION_KEY,
+    POSE_NAMES,
+    PROPRIO_KEYS,
+    REWARD_KEY,
+    STATE_KEY,
+    STATE_NAMES,
+    SUCCESS_KEY,
+)
 from vla_eval.data.manifest import MANIFEST_FILE, RecordedEpisode, read_manifest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import ViewingError
@@ -28,7 +36,6 @@ from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, PHASES, log_arm
 
 PLACE_NAMES = ("x", "y", "z")
-N_POSE = 7  # before the joints: position and quaternion of the tool centre point
 PATH_FIELDS = (PROPRIO_KEYS["eef"], STATE_KEY)
 
 
@@ -168,7 +175,7 @@ def _log_arm(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[
         return
     for step, numbers in enumerate(_column(frames, key)):
         set_step(stream, step, float(dataset.fps))
-        log_arm(stream, numbers[N_POSE:], numbers[:3])
+        log_arm(stream, numbers[len(POSE_NAMES) :], numbers[:3])
 
 
 def _log_pictures(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[str, Any]]) -> None:
