@@ -210,10 +210,9 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
             obs_mode="none",
             reward_mode="normalized_dense",
             control_mode=CONTROL_MODE,
-            robot_uids=_robot(settings, kwargs),
             sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
             render_backend=backend,
-            **{name: value for name, value in kwargs.items() if name != ROBOT},
+            **{**kwargs, ROBOT: _robot(settings, kwargs)},
         )
     except RuntimeError as exc:
         if backend == "none" or settings.sim_backend == "gpu":

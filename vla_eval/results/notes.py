@@ -110,7 +110,7 @@ def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None])
     """Warn where chance was measured on so few episodes that it says little, as in a run that goes on."""
     vague = []
     for row in rows:
-        chance = chances[RowKey(row.task, row.policy, row.n_action_steps, row.variant)]
+        chance = chances[_key(row)]
         interval = chance.interval if chance is not None else None
         if interval is not None and interval.high - interval.low > VAGUE:
             vague.append(f"{_place(row)} [{interval.low:.2f}, {interval.high:.2f}]")
@@ -126,7 +126,7 @@ def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) ->
     """Warn where success can be reached by searching instead of remembering."""
     notes = []
     for row in rows:
-        chance = chances[RowKey(row.task, row.policy, row.n_action_steps, row.variant)]
+        chance = chances[_key(row)]
         if row.policy != TOUR_POLICY or row.ci_low is None or chance is None:
             continue
         highest = chance.interval.high if chance.interval is not None else chance.rate
@@ -266,6 +266,10 @@ def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
 
 def _number(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _key(row: Row) -> RowKey:
+    return RowKey(row.task, row.policy, row.n_action_steps, row.variant)
 
 
 def _shown(row: Row) -> str:

@@ -170,7 +170,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             delay = int(phases.integers(*self.delay_steps_range, endpoint=True))
             self._response_step[env] = self._cue_end_step[env] + delay
         self.agent.reset(qpos.astype(np.float32))
-        self.agent.robot.set_pose(sapien.Pose(self.arm.base_m))
+        self.agent.robot.set_pose(sapien.Pose(arm.base_m))
         for env in env_idx.tolist():
             self._sample_episode(env)
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
