@@ -186,6 +186,8 @@ class ChoiceEnv(MemoryTableEnv):
 
     def reveal(self, mask: torch.Tensor, orientation_wxyz: torch.Tensor) -> None:
         """Put all candidates to their slots where the mask holds; orientation is (4,)."""
+        if not bool(mask.any()):
+            return
         for index, actor in enumerate(self.candidates):
             positions = self._slots[:, index]
             quaternions = orientation_wxyz.expand(self.num_envs, 4)

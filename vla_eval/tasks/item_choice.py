@@ -60,6 +60,8 @@ class ItemChoiceEnv(ChoiceEnv):
         self._park_all(mask)
 
     def _park_all(self, mask: torch.Tensor) -> None:
+        if not bool(mask.any()):  # most steps: one question for all items, not one for each
+            return
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
 

@@ -153,6 +153,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         return bool((moved | cue_ends | choice_begins).any())
 
     def _show_together(self, mask: torch.Tensor) -> None:
+        if not bool(mask.any()):
+            return
         for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
             x, y = bunch_place_m(index, self.n_items)
             place = sapien.Pose(p=[x, y, item.shape.rest_height_m])
@@ -167,6 +169,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         begins = mask & (since == 0)
         ends = mask & (since == turn_steps - self.gap_steps)
         self._park_all((begins & (step > 0)) | ends)
+        if not bool(begins.any()):
+            return ends
         shown = self._of_sequence(turn.long())
         for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
             self.move(actor, begins & (shown == index), sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
