@@ -233,6 +233,23 @@ def test_neither_luck_nor_search_finds_several_cubes(policy: str) -> None:
     assert all(touched_all) if policy == "tour" else not any(touched_all)
 
 
+def test_the_papers_long_horizon_is_played_to_its_end() -> None:
+    """Customisation guide: 50 steps of cue, 900 of delay; the choice begins at step 950."""
+    kwargs = {
+        "n_items": 3,
+        "cue_steps": 50,
+        "delay_steps": 900,
+        "goal_threshold_m": 0.045,
+        "horizon_steps": 1000,
+    }
+    env = make_env(EnvSettings(task="RememberColor", privileged=True, kwargs=kwargs))
+    (record,) = run("RememberColor", "oracle", [1], env=env)
+    assert record.first_choice_success
+    assert record.n_wrong_choices == 0
+    assert record.success_step is not None
+    assert 950 < record.success_step <= 1000
+
+
 def test_the_gripper_can_remember_the_colour_and_a_frozen_one_cannot() -> None:
     free = run("RememberColor3-v0", "body_memory", range(1, 7))
     assert n_successes(free) == 6
