@@ -17,8 +17,10 @@ from vla_eval.policies.checkpoint import (
     read_facts,
     read_json,
 )
+from vla_eval.policies.recipe import LEROBOT_ADAPTER
+from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 
-LEROBOT_CHECKPOINTS = frozenset({"lerobot", "openvla"})
+LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
 PPO_EXPERT = "ppo_expert"
 PPO_FILES = ("config.json", "expert.safetensors")
@@ -33,9 +35,7 @@ NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
 """What each of lerobot's kinds of normalisation takes; its other kind, IDENTITY, takes none. Source:
 https://github.com/huggingface/lerobot/blob/v0.6.1/src/lerobot/processor/normalize_processor.py"""
 LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
-OWN_STEPS = frozenset({"mikasa_encoder", "mikasa_decoder"})
-OWN_KINDS: Mapping[str, str] = {"mean_std": "MEAN_STD", "q01_q99": "QUANTILES"}
-"""What our own steps call the same."""
+OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
 
 
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
@@ -122,12 +122,12 @@ def _names(step: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     config = step.get("config", {})
     if step["registry_name"] in OWN_STEPS:
         for field, spec in config.get("fields", {}).items():
-            if spec["kind"] not in OWN_KINDS:
+            if spec["kind"] not in STATISTICS:
                 raise CheckpointError(
                     f"{step['registry_name']} normalises '{field}' by '{spec['kind']}', known are "
-                    f"{', '.join(OWN_KINDS)}. Use the version of mikasa-vla-eval that made the checkpoint."
+                    f"{', '.join(STATISTICS)}. Use the version of mikasa-vla-eval that made the checkpoint."
                 )
-            for name in NEEDED_STATISTICS[OWN_KINDS[spec["kind"]]]:
+            for name in STATISTICS[spec["kind"]]:
                 yield field, name, f"{field}/{name}"
         return
     for field, feature in config.get("features", {}).items():

@@ -48,7 +48,7 @@ from vla_eval.policies.lerobot_loading import (
     fill_policy,
     save_tokenizer,
 )
-from vla_eval.policies.steps.processor_steps import DECODER_STEP, ENCODER_STEP
+from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.micro_batches import InMicroBatches
 
 PARTIAL_PREFIX = ".partial-"

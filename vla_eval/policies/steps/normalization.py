@@ -7,18 +7,14 @@ no rounding error is blown up.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.policies.steps.step_names import STATISTICS, NormalizationKind
 
-NormalizationKind = Literal["mean_std", "q01_q99"]
-STATISTICS: Mapping[NormalizationKind, tuple[str, str]] = {
-    "mean_std": ("mean", "std"),
-    "q01_q99": ("q01", "q99"),
-}
 EPSILON = 1e-8
 """Added to what is divided by. Source: octo, octo/data/utils/data_utils.py:243 at
 https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/data/utils/data_utils.py#L243

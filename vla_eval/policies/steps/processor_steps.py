@@ -19,9 +19,8 @@ from vla_eval.data.features import ACTION_KEY
 from vla_eval.decoding import decode
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.steps.gripper import Gripper
-from vla_eval.policies.steps.normalization import STATISTICS, Normalization, Normalizer
-
-ENCODER_STEP, DECODER_STEP = "mikasa_encoder", "mikasa_decoder"
+from vla_eval.policies.steps.normalization import Normalization, Normalizer
+from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 
 
 @dataclass

@@ -1,0 +1,16 @@
+"""Names in which the files of a checkpoint speak of our processor steps. Knows nothing, not even torch.
+
+A loader, a training loop and the notes of an evaluation read them there.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+ENCODER_STEP, DECODER_STEP = "mikasa_encoder", "mikasa_decoder"
+
+NormalizationKind = Literal["mean_std", "q01_q99"]
+STATISTICS: Mapping[NormalizationKind, tuple[str, str]] = {
+    "mean_std": ("mean", "std"),
+    "q01_q99": ("q01", "q99"),
+}
+"""Kind of normalisation -> the statistics that it takes."""
