@@ -153,7 +153,12 @@ def audit_task(task: str, protocol: Protocol, records: Sequence[EpisodeRecord]) 
     for record in records:
         if record.outcome != "error":
             by_policy.setdefault(record.policy, []).append(record)
-    counts = {policy: _count(found) for policy, found in by_policy.items()}
+    # In the order of the controls: that of the records is the one in which workers came to an end.
+    counts = {
+        policy: _count(by_policy[policy])
+        for policy in CONTROLS[kind_of(task_spec(task))]
+        if policy in by_policy
+    }
     chance = next((c.chance for c in counts.values() if c.chance is not None), None)
     return TaskAudit(
         task=task,

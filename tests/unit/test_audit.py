@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.audit import CONTROLS, Counts, audit_configs, kind_of, verdict
+from vla_eval.audit import CONTROLS, Counts, audit_configs, audit_task, kind_of, verdict
+from vla_eval.audit_table import render_audit
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, UnknownNameError
+from vla_eval.results.records import EpisodeRecord
 from vla_eval.tasks.catalog import TASKS, task_spec
 
 FAKE = ["--set", "simulator=fake", "--workers", "1"]
@@ -69,6 +71,25 @@ def test_mistakes_are_said_before_anything_is_played() -> None:
         audit_configs(["TakeItBack-v0"], ("strict",), episodes=1, workers=1)
     with pytest.raises(RecipeError, match="--set env: an audit sets this field itself"):
         audit_configs(["TakeItBack-v0"], ("paper",), episodes=1, workers=1, settings={"env": {}})
+
+
+def test_an_audit_does_not_depend_on_the_order_in_which_episodes_came_to_an_end() -> None:
+    task = "RememberColor3-v0"
+    records = [
+        EpisodeRecord(
+            task=task,
+            policy=policy,
+            n_action_steps=1,
+            run=0,
+            seed=seed,
+            outcome="failure",
+            success_once=False,
+        )
+        for policy in CONTROLS["choice"]
+        for seed in (1, 2)
+    ]
+    one, other = (render_audit([audit_task(task, "paper", r)], "json") for r in (records, records[::-1]))
+    assert one == other
 
 
 def test_the_command_plays_prints_and_goes_on_where_it_stopped(
