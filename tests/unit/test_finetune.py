@@ -51,6 +51,19 @@ def run_an_episode(policy: Any) -> int:
 
 
 class TestRuns:
+    def test_a_person_is_told_how_it_goes_and_a_file_all_that_lerobot_says(
+        self, recorded: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        lines: list[str] = []
+        finetune(act(recorded, tmp_path / "run"), say=lines.append)
+        assert any(line.startswith("step 4/") and line.endswith(" min left") for line in lines)
+        screen = "".join(capfd.readouterr())
+        assert "optimizer" not in screen  # lerobot's whole configuration
+        assert "Training:" not in screen  # a bar, which only a terminal can draw
+        log = (tmp_path / "run" / "train.log").read_text()
+        assert "'optimizer'" in log
+        assert "End of training" in log
+
     def test_a_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
         self, recorded: Path, tmp_path: Path, killed_at: KilledAt
     ) -> None:

@@ -64,11 +64,13 @@ def run(args: argparse.Namespace) -> int:
 
         return finetune_table(args)
     # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from tqdm import tqdm
+
     from vla_eval.training.finetune import finetune
 
     command = typed_command()
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
-        summary = finetune(_config(args), command=command, say=lambda line: print(line, file=sys.stderr))
+        summary = finetune(_config(args), command=command, say=lambda line: tqdm.write(line, file=sys.stderr))
     print(summary.checkpoint)
     return 0
 

@@ -36,7 +36,13 @@ from vla_eval.training.held_out import HeldOut, check_held_out
 from vla_eval.training.loop import LoopHooks, append_metrics, run_loop
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, LoraRecipe
-from vla_eval.training.run_folder import METRICS_FILE, TRAIN_FOLDER, open_folder, read_metrics
+from vla_eval.training.run_folder import (
+    LOG_FILE,
+    METRICS_FILE,
+    TRAIN_FOLDER,
+    open_folder,
+    read_metrics,
+)
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 
 LOCK_FILE = "finetune.lock"
@@ -157,9 +163,10 @@ def _train(
             listeners.say(line)
 
     def report(line: Mapping[str, float]) -> None:
+        seconds = line["update_s"] + line["dataloading_s"]
         listeners.say(
             f"step {int(line['step'])}/{recipe.steps}  loss {line['loss']:.4f}  lr {line['lr']:.2e}  "
-            f"{line['update_s'] + line['dataloading_s']:.3f} s/step"
+            f"{seconds:.3f} s/step, {(recipe.steps - line['step']) * seconds / 60:.0f} min left"
         )
         listeners.track(line)
 
@@ -177,6 +184,7 @@ def _train(
     hooks = LoopHooks(
         facts=_facts(dataset, policy, config, out),
         metrics_file=out / METRICS_FILE,
+        log_file=out / LOG_FILE,
         log_every_steps=recipe.log_every_steps,
         run_seed=config.run_seed,
         weights=weights,

@@ -59,6 +59,8 @@ REPLACED = (
     "make_train_eval_datasets",
     "update_policy",
     "save_checkpoint",
+    "init_logging",
+    "inside_slurm",
 )
 
 
@@ -69,6 +71,7 @@ class LoopHooks:
     Attributes:
         facts: written beside each checkpoint's weights.
         metrics_file: one line of JSON per logged step.
+        log_file: what lerobot says of itself, warnings apart, which go to standard error, too.
         log_every_steps: how often.
         run_seed: of all noise.
         weights: folder of the weights to start from; None: from scratch.
@@ -84,6 +87,7 @@ class LoopHooks:
 
     facts: TrainingFacts
     metrics_file: Path
+    log_file: Path
     log_every_steps: int
     run_seed: int
     weights: Path | None
@@ -187,6 +191,19 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         os.replace(partial, checkpoint_dir)
         hooks.on_checkpoint(checkpoint_dir)
 
+    def init_logging(accelerator: Any = None) -> None:
+        is_first = accelerator is None or accelerator.is_main_process
+        originals["init_logging"](
+            log_file=hooks.log_file if is_first else None,
+            console_level="WARNING",
+            file_level="INFO",
+            accelerator=accelerator,
+        )
+
+    def inside_slurm() -> bool:
+        """Where lerobot draws no bar: here, too, if nobody would see it move."""
+        return originals["inside_slurm"]() or not sys.stderr.isatty()
+
     replaced = (
         make_policy,
         make_pre_post_processors,
@@ -194,6 +211,8 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         make_train_eval_datasets,
         update_policy,
         save_checkpoint,
+        init_logging,
+        inside_slurm,
     )
     return {function.__name__: function for function in replaced}
 
@@ -269,5 +288,8 @@ def _logging_as_it_was() -> Iterator[None]:
     try:
         yield
     finally:
+        for handler in root.handlers:
+            if handler not in handlers:
+                handler.close()
         root.handlers[:] = handlers
         root.setLevel(level)

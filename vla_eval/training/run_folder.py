@@ -20,7 +20,7 @@ from vla_eval.results.durable import replace_file
 from vla_eval.results.run_file import JsonValue, find_changes
 
 FORMAT_VERSION = 1
-RUN_FILE, METRICS_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train"
+RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"
 CHECKPOINTS_FOLDER, LAST = "checkpoints", "last"
 STATE_FOLDER = "training_state"
 COMPARED = "settings"  # what results depend on; the rest is for the record
