@@ -38,6 +38,12 @@ class TestPaddedActions:
         assert masks_padding(config)
         assert used_frames(config, dataset) == (55, 55)  # 13 + 14 + 15 + 13
 
+    @pytest.mark.parametrize("name", ["memory", "memoryless", "octo_tiny", "spatialvla_tiny"])
+    def test_so_do_our_own_but_for_openvla(self, name: str, recorded: Path, tmp_path: Path) -> None:
+        config = FinetuneConfig(policy=name, dataset=str(recorded), out=str(tmp_path / "o"))
+        dataset = training_dataset(recorded, allow_unreplayed=True)
+        assert used_frames(self.configuration(config, recorded), dataset) == (55, 55)
+
     def test_pi0_gets_no_chunk_with_a_padded_action(
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:

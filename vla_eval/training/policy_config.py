@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import RecipeError, SpecMismatchError, did_you_mean, unknown_name
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
@@ -19,7 +19,7 @@ from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.recipe import FinetuneRecipe
 
-PADDING_KEY = "action_is_pad"
+PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
 
 
 class UsedFrames(NamedTuple):
@@ -88,7 +88,8 @@ def masks_padding(config: Any) -> bool:
     Told by its code: one that never reads `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
     """
     name = type(config).__module__.replace("configuration_", "modeling_")
-    if PADDING_KEY not in inspect.getsource(importlib.import_module(name)):
+    code = inspect.getsource(importlib.import_module(name))
+    if not any(key in code for key in PADDING_KEYS):
         return False
     return bool(getattr(config, "do_mask_loss_for_padding", True))
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, STATE_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.memory.action_head import SPACE
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork, NetworkSizes
@@ -126,7 +126,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         config, n_steps = self.config, self.config.n_window_steps
         real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
         actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
-        counts = (~batch[f"{ACTION_KEY}_is_pad"]).float().unfold(1, config.chunk_size, 1)
+        counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
         change = _change(actions[:, :, 0], real)
         kept = real
         if self.training:

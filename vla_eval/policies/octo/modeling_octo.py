@@ -12,7 +12,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.octo.configuration_octo import TRAINED, TYPE, MikasaOctoConfig
 from vla_eval.policies.octo.diffusion_head import Targets, draw
@@ -170,7 +170,7 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
         octo/data/traj_transforms.py:84 at 241fb3514b7c40957a86d869fecb7c7fc353f540.
         """
         chunk = self.config.chunk_size
-        is_pad = _needed(batch, f"{ACTION_KEY}_is_pad")
+        is_pad = _needed(batch, ACTION_PADDING_KEY)
         counts = ~is_pad
         counts[:, 1:] |= is_pad[:, 1:] & ~is_pad[:, :-1]
         actions = _needed(batch, ACTION_KEY).unfold(1, chunk, 1).transpose(-1, -2)

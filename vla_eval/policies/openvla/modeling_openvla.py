@@ -6,7 +6,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, STATE_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
 from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
@@ -16,8 +16,6 @@ from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
 from vla_eval.policies.steps.precision import default_dtype
-
-PADDING_KEY = "action_is_pad"
 
 
 class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -46,7 +44,7 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         actions = batch[ACTION_KEY].float()
-        counts = self._counts(batch.get(PADDING_KEY), actions)
+        counts = self._counts(batch.get(ACTION_PADDING_KEY), actions)
         inputs = self._inputs(batch, changed=self.training)
         if self.config.head != "l1":
             loss = token_loss(self.network, inputs, actions, counts)

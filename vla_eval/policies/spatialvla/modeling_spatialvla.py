@@ -6,7 +6,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY
+from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.policies.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
@@ -17,8 +17,6 @@ from vla_eval.policies.spatialvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, resize_bicubic
 from vla_eval.policies.steps.precision import default_dtype
-
-PADDING_KEY = "action_is_pad"
 
 
 class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -64,7 +62,7 @@ class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[
         """Return the loss of a batch of training samples, and its parts."""
         actions = batch[ACTION_KEY].float()
         attention = self.config.attention(training=True)
-        counts = self._counts(batch.get(PADDING_KEY), actions)
+        counts = self._counts(batch.get(ACTION_PADDING_KEY), actions)
         loss = token_loss(self.network, self.grid, self._inputs(batch), actions, counts, attention)
         return loss, {"cross_entropy": loss.item()}
 
