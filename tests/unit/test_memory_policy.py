@@ -16,15 +16,11 @@ from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.action_head import ActionHead
+from vla_eval.policies.memory.eyes import LEAST_COLOR_VARIANCE, standing_out
+from vla_eval.policies.memory.goal_layer import GoalLayer, Goals
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
-from vla_eval.policies.memory.network import (
-    GOAL_SCALE_M,
-    LEAST_COLOR_VARIANCE,
-    Answer,
-    MemoryNetwork,
-    NetworkSizes,
-    standing_out,
-)
+from vla_eval.policies.memory.network import STATE_SCALE, Answer, MemoryNetwork
+from vla_eval.policies.memory.sizes import NetworkSizes
 from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
@@ -155,6 +151,11 @@ class TestTraining:
         batch["observation.state_is_pad"] = torch.cat([is_pad[:, :n_steps], torch.ones(2, 1).bool()], dim=1)
         return batch
 
+    def loss(self, policy: Any) -> torch.Tensor:
+        loss, _ = policy.forward(self.batch(policy, n_real=4))
+        assert isinstance(loss, torch.Tensor)
+        return loss
+
     def test_what_is_padded_changes_nothing(self, recorded: Path) -> None:
         policy = tiny_policy(recorded)
         batch = self.batch(policy, n_real=4)
@@ -171,10 +172,12 @@ class TestTraining:
         policy = tiny_policy(recorded)
         batch = self.batch(policy, n_real=4)
         goals = batch["observation.state"][:, -1, :3]
-        for parameter in policy.network.goal[-1].parameters():
-            torch.nn.init.zeros_(parameter)
+        layer = policy.network.goal
         with torch.no_grad():
-            policy.network.goal[-1].bias.copy_(goals.mean(dim=0) / GOAL_SCALE_M)
+            layer.rides.zero_()
+            for each in layer.maps:
+                each[-1].weight.zero_()
+                each[-1].bias.copy_(goals.mean(dim=0) * STATE_SCALE)
         _, parts = policy.forward(batch)
         assert parts["goal"] == pytest.approx(1.0, rel=1e-4)
 
@@ -274,6 +277,42 @@ def recall_episodes(n: int, draws: torch.Generator) -> tuple[torch.Tensor, torch
     return pictures, goal
 
 
+class TestGoalLayer:
+    def goals(self, *, unlike: tuple[float, float], tool: float = 0.0) -> Goals:
+        """Two cameras, two look-ups each, one at the left and one at the right, as unlike as given."""
+        torch.manual_seed(0)
+        layer = GoalLayer(cameras=2, heads=2, state=4)
+        places = torch.tensor([[-0.5, 0.2], [0.7, 0.1]]).expand(1, 2, 2, 2)
+        evidence = torch.tensor([[0.0, 0.0, -unlike[0]], [0.0, 0.0, -unlike[1]]]).expand(1, 2, 2, 3)
+        return layer(places, evidence, torch.tensor([[tool, 0.0, 0.0, 0.5]]))
+
+    def test_a_look_up_that_found_something_unlike_is_not_believed(self) -> None:
+        left, right = self.goals(unlike=(0.0, 100.0)), self.goals(unlike=(100.0, 0.0))
+        both = self.goals(unlike=(1.0, 1.0))
+        assert not torch.isclose(left.together, right.together).any()
+        torch.testing.assert_close(both.alone, (left.alone + right.alone) / 2)
+
+    def test_goals_ride_with_the_tool_as_far_as_the_camera_does(self) -> None:
+        torch.manual_seed(0)
+        layer = GoalLayer(cameras=1, heads=1, state=3)
+        for parameter in layer.maps.parameters():
+            torch.nn.init.zeros_(parameter)
+        with torch.no_grad():
+            layer.rides.copy_(torch.tensor([[0.0, 1.0, 0.5]]))
+        goals = layer(torch.zeros(1, 1, 1, 2), torch.zeros(1, 1, 1, 3), torch.tensor([[2.0, 3.0, 4.0]]))
+        assert goals.together.tolist() == [[0.0, 3.0, 2.0]]
+
+    def test_each_camera_is_taught_to_tell_by_itself(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded)
+        with torch.no_grad():
+            policy.network.goal.camera_trust.copy_(torch.tensor([1e4, 0.0]))  # the second is not listened to
+        TestTraining().loss(policy).backward()
+        taught = [
+            sum(float(p.grad.abs().sum()) for p in each.parameters()) for each in policy.network.goal.maps
+        ]
+        assert min(taught) > 0
+
+
 class TestActionHead:
     def chunks(self, ways_m: list[list[float]]) -> torch.Tensor:
         torch.manual_seed(0)
@@ -297,7 +336,13 @@ class TestForesight:
         """Actions of 1, 2, 3 … in all dimensions, with these expected errors (roots of the squares)."""
         n = len(doubts)
         actions = torch.arange(1.0, n + 1)[None, :, None].expand(1, n, 7)
-        return Answer(actions=actions, doubts=torch.tensor([doubts]).square(), goal_m=torch.zeros(1, 3))
+        nowhere = torch.zeros(1, 3)
+        return Answer(
+            actions=actions,
+            doubts=torch.tensor([doubts]).square(),
+            goal_m=nowhere,
+            camera_goals_m=nowhere[:, None],
+        )
 
     def test_a_chunk_is_held_from_its_first_guess_with_the_gripper_as_it_was(self) -> None:
         held = foreseen_alone(self.answer([0.05, 0.06, 0.3, 0.06]))[0]

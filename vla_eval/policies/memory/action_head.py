@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-SPACE = 3  # numbers of a position, and of the translation with which an action begins
+from vla_eval.policies.memory.sizes import SPACE
+
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
 WAY_HIDDEN = 64
 WAY_SEEN = 4  # numbers that tell the way along one axis

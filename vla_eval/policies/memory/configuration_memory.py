@@ -6,7 +6,7 @@ from typing import Any, ClassVar  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from vla_eval.policies.memory.network import SPOTS
+from vla_eval.policies.memory.sizes import SPOTS
 
 TYPE = "mikasa_memory"
 

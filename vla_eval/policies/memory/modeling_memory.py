@@ -8,9 +8,9 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.policies.memory.action_head import SPACE
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
-from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork, NetworkSizes
+from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
+from vla_eval.policies.memory.sizes import SPACE, NetworkSizes
 
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 LEAST_VARIANCE = 1e-6
@@ -72,10 +72,13 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         imitation = _weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal = _in_variances(answer.goal_m, episodes.goal_m, real)
+        # Each camera learns to tell by itself: else the first to be any good is the only one that learns.
+        by_camera = [_in_variances(told, episodes.goal_m, real) for told in answer.camera_goals_m.unbind(2)]
+        goals = (goal + torch.stack(by_camera).mean()) / 2
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
         surprise = _weighted_mean(surprises, episodes.counts)
-        loss = imitation + config.goal_weight * goal + config.doubt_weight * surprise
+        loss = imitation + config.goal_weight * goals + config.doubt_weight * surprise
         parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
 

@@ -1,0 +1,146 @@
+"""How the positive control looks: places in a picture, what stands out among them, what is like another."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vla_eval.policies.memory.sizes import APART, KNOWN, PLACE, RGB, SPOTS, NetworkSizes
+
+# How much differences count when something is looked for, to begin with. Colours in [-1, 1]: a maroon cube
+# beside the red one that is asked for differs by about 1 in one of three, and gets e^-20 of the attention.
+COUNT_APART, COUNT_LOOKS, COUNT_OTHERS = 4.0, 20.0, -3.0  # before softplus
+LEAST_COLOR_VARIANCE = 1e-3  # colours in [-1, 1]: less than this is noise of the picture
+
+
+def in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+    """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
+
+    @functools.wraps(method)
+    def kept(*args: P.args, **kwargs: P.kwargs) -> R:
+        module: Any = args[0]
+        with torch.autocast(next(module.parameters()).device.type, enabled=False):
+            return method(*args, **kwargs)
+
+    return kept
+
+
+class Eye(nn.Module):
+    """One camera's picture to features of places; beside them what is known of one spot of each.
+
+    It is the spot, a quarter of the place's edge wide, whose colour stands out most from the picture's: a
+    cube of 4 pixels keeps its colour in a place of 8.
+    """
+
+    coordinates: Tensor
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        super().__init__()
+        self.patch_px = sizes.patch_px
+        width = sizes.channels
+        self.patches = nn.Conv2d(RGB, width, sizes.patch_px, stride=sizes.patch_px)
+        self.around = nn.Conv2d(width, width, 3, padding=1)
+        self.mix = nn.Conv2d(width, width, 1)
+        line = torch.linspace(-1, 1, SPOTS * sizes.image_px // sizes.patch_px)
+        y, x = torch.meshgrid(line, line, indexing="ij")
+        self.register_buffer("coordinates", torch.stack([x, y]), persistent=False)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """(N, 3, H, W) in [0, 1] to (N, places, value)."""
+        centred = 2 * pictures - 1
+        features = self.patches(centred)
+        features = features + self.mix(functional.gelu(self.around(functional.gelu(features))))
+        return torch.cat([features.float().flatten(2), self._known(centred)], dim=1).transpose(1, 2)
+
+    @torch.no_grad()
+    @in_float32
+    def _known(self, pictures: Tensor) -> Tensor:
+        """(N, 3, H, W) in [-1, 1] to (N, KNOWN, places)."""
+        colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
+        apart = standing_out(colors)
+        spots = functional.max_pool2d(apart, SPOTS, return_indices=True)[1].flatten(2)
+        placed = self.coordinates.expand(len(pictures), -1, -1, -1)
+        known = torch.cat([apart, colors, placed], dim=1).flatten(2)
+        return known.gather(2, spots.expand(-1, KNOWN, -1))
+
+
+def standing_out(colors: Tensor) -> Tensor:
+    """Return (N, 1, H, W): how unlike a picture's other colours each colour (N, 3, H, W) is.
+
+    Half the logarithm of 1 + its squared Mahalanobis distance from the picture's mean, as in the anomaly
+    detector of Reed and Yu (1990). A red cube on an orange table is about as bright and nearly as red as its
+    surroundings; in units of how colours vary there it is far away.
+    """
+    apart = colors.flatten(2) - colors.flatten(2).mean(dim=2, keepdim=True)
+    variance = apart @ apart.transpose(1, 2) / apart.shape[2]
+    variance = variance + LEAST_COLOR_VARIANCE * torch.eye(RGB, dtype=colors.dtype, device=colors.device)
+    squared: Tensor = (apart * torch.linalg.solve(variance, apart)).sum(dim=1)
+    return squared.log1p().div(2).reshape(len(colors), 1, *colors.shape[2:])
+
+
+class Keys(nn.Module):
+    """What of a place counts when it is looked for: learned numbers, and what is known of it."""
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        super().__init__()
+        self.learned = nn.Linear(sizes.value, sizes.key)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(…, value) to (…, key + KNOWN)."""
+        return torch.cat([self.learned(values), values[..., -KNOWN:]], dim=-1)
+
+
+class StandingOut(nn.Module):
+    """Looks at what stands out of the picture, in a way of its own per head."""
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        super().__init__()
+        n = sizes.key + KNOWN
+        self.towards = nn.Parameter(torch.randn(sizes.heads, n) / math.sqrt(n))
+        with torch.no_grad():  # to begin with: what stands out e^1 more gets e^8 of the attention
+            self.towards[:, sizes.key] += 8.0
+
+    def forward(self, places: Tensor, keys: Tensor) -> Tensor:
+        """(N, P, value) and (N, P, key + KNOWN) to what each head saw, (N, heads, value)."""
+        return (keys @ self.towards.T).transpose(1, 2).softmax(dim=-1) @ places
+
+
+class Found(NamedTuple):
+    """What look-ups found, (N, heads, value), and what tells how far to believe each, (N, heads, 3)."""
+
+    values: Tensor
+    evidence: Tensor
+
+
+class Likeness(nn.Module):
+    """Looks at what is like that which was asked for; each head has its own notion of likeness."""
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        super().__init__()
+        self.counts = nn.Parameter(torch.full((sizes.heads, sizes.key + KNOWN), COUNT_OTHERS))
+        color = sizes.key + APART
+        with torch.no_grad():  # to begin with, half of the heads ask for a colour, half for a place
+            self.counts[:, sizes.key] = COUNT_APART
+            self.counts[: sizes.heads // 2, color : color + RGB] = COUNT_LOOKS
+            self.counts[sizes.heads // 2 :, color + RGB :] = COUNT_LOOKS
+
+    def forward(self, places: Tensor, keys: Tensor, asked: Tensor) -> Found:
+        """Look for what is asked for.
+
+        Args:
+            places: (N, P, value).
+            keys: (N, P, key + KNOWN).
+            asked: (N, heads, key + KNOWN).
+        """
+        counts = functional.softplus(self.counts)
+        # Minus the squared distance, without what all places have in common.
+        scores = 2 * keys @ (asked * counts).transpose(1, 2) - keys.square() @ counts.T
+        shares = scores.transpose(1, 2).softmax(dim=-1)
+        values = shares @ places
+        color = slice(-RGB - PLACE, -PLACE)  # of values and of keys
+        unlike = (values[..., color] - asked[..., color]).square().sum(dim=-1)
+        return Found(values, torch.stack([shares.amax(dim=-1), values[..., -KNOWN], -unlike], dim=-1))

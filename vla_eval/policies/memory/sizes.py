@@ -1,0 +1,52 @@
+"""Sizes of the positive control's network, and what is known of a place in a picture. Without torch."""
+
+from dataclasses import dataclass
+
+SPACE = 3  # numbers of a position, and of the translation with which an action begins
+RGB, PLACE = 3, 2  # numbers of a colour, of a place in a picture
+APART = 1  # one number: how much a place stands out
+KNOWN = APART + RGB + PLACE  # what is told of a place beside its learned features, in this order
+SPOTS = 4  # spots along a place's edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkSizes:
+    """Sizes of the network.
+
+    Attributes:
+        cameras: pictures of a step.
+        image_px: height and width of a picture, a multiple of `patch_px`.
+        state: numbers of proprioception.
+        action: dimensions of an action.
+        chunk: actions of a chunk.
+        channels: learned features of a place in a picture.
+        patch_px: edge of such a place, a multiple of `SPOTS`.
+        heads: questions per camera: so many fixed ones, and so many of the memory.
+        key: numbers of a question.
+        memory: units of the memory.
+        hidden: units of the layers between.
+        longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
+    """
+
+    cameras: int = 2
+    image_px: int = 128
+    state: int = 10
+    action: int = 7
+    chunk: int = 8
+    channels: int = 32
+    patch_px: int = 4
+    heads: int = 8
+    key: int = 16
+    memory: int = 256
+    hidden: int = 256
+    longest_span_steps: float = 100.0
+
+    @property
+    def value(self) -> int:
+        """Numbers that attention returns of a place: features, standing out, colour, coordinates."""
+        return self.channels + KNOWN
+
+    @property
+    def seen(self) -> int:
+        """Numbers that one look at all pictures returns."""
+        return self.cameras * self.heads * self.value
