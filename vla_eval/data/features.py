@@ -21,9 +21,7 @@ IMAGE_SHAPE = (128, 128, 3)  # height, width, channels
 
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
-ACTION_PADDING_KEY = (
-    f"{ACTION_KEY}_is_pad"  # in training samples: which lie beyond the end
-)
+ACTION_PADDING_KEY = f"{ACTION_KEY}_is_pad"  # in training samples: which lie beyond the end
 REWARD_KEY, SUCCESS_KEY, DONE_KEY = "next.reward", "next.success", "next.done"
 
 StateKind = Literal["eef", "joints"]
