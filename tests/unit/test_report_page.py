@@ -14,7 +14,7 @@ from vla_eval.cli.main import main
 from vla_eval.errors import ReportError
 from vla_eval.page.build import build_page, write_page
 from vla_eval.page.charts import Bar, Point, Series, curves, forest
-from vla_eval.page.markup import element
+from vla_eval.page.markup import element, with_code
 from vla_eval.results.recording_files import video_file
 from vla_eval.results.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
@@ -219,6 +219,13 @@ def test_a_higher_rate_is_drawn_higher() -> None:
 
 def test_elements_escape_text_and_attributes() -> None:
     assert element("p", "a<b", title='"&') == '<p title="&quot;&amp;">a&lt;b</p>'
+
+
+def test_names_between_backticks_are_set_as_code_and_still_escaped() -> None:
+    assert with_code("chance: `cue_blind` < `a<b`") == (
+        "chance: <code>cue_blind</code> &lt; <code>a&lt;b</code>"
+    )
+    assert with_code("a ` alone") == "a ` alone"
 
 
 def test_the_verb_prints_the_path_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

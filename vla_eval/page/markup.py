@@ -39,6 +39,14 @@ def joined(parts: Iterable[str], separator: str = "") -> Markup:
     return Markup(separator.join(part if isinstance(part, Markup) else escape(part) for part in parts))
 
 
+def with_code(text: str) -> Markup:
+    """Return text in which names stand between backticks, as in Markdown, with these set as code."""
+    parts = text.split("`")
+    if len(parts) % 2 == 0:  # one of them stands alone: it is no mark
+        return joined([text])
+    return joined(element("code", part) if index % 2 else part for index, part in enumerate(parts))
+
+
 def table(
     titles: Sequence[str],
     rows: Sequence[Sequence[str]],

@@ -5,7 +5,17 @@ from collections.abc import Sequence
 
 from vla_eval.errors import ReportError
 from vla_eval.page.charts import Bar, LineKind, Point, Series, curves, forest, legend
-from vla_eval.page.markup import UNKNOWN, Markup, details, element, joined, paragraph, section, table
+from vla_eval.page.markup import (
+    UNKNOWN,
+    Markup,
+    details,
+    element,
+    joined,
+    paragraph,
+    section,
+    table,
+    with_code,
+)
 from vla_eval.page.material import Material, key_of
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
@@ -225,7 +235,11 @@ def _sweep(material: Material) -> Markup:
 
 
 def _notes(notes: Sequence[str]) -> Markup:
-    return element("ul", *(element("li", note) for note in notes), class_="notes") if notes else joined(())
+    return (
+        element("ul", *(element("li", with_code(note)) for note in notes), class_="notes")
+        if notes
+        else joined(())
+    )
 
 
 def _values(material: Material, rows: Sequence[Row]) -> str:
