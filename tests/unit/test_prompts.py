@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 
 from vla_eval.errors import MissingInstructionError, RecipeError
-from vla_eval.prompts import instruction_for, instructions_for
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.prompts import instruction_for, instructions_for, load_prompts
+from vla_eval.tasks.catalog import TASKS, task_spec
 
+OFFICIAL = load_prompts("official_vla").value.instructions
 REMEMBER_COLOR = "Remember the color of the cube and then pick the matching one"
 
 
@@ -27,6 +28,27 @@ REMEMBER_COLOR = "Remember the color of the cube and then pick the matching one"
 )
 def test_the_paper_s_sentences(task: str, sentence: str) -> None:
     assert instruction_for(task_spec(task)) == sentence
+
+
+@pytest.mark.parametrize("prompts", ["paper", "paraphrased"])
+def test_every_task_has_a_sentence_in_both_of_the_sets_for_all(prompts: str) -> None:
+    assert all(instruction_for(spec, prompts) for spec in TASKS.values())
+
+
+def test_a_paraphrase_says_it_in_other_words() -> None:
+    for spec in TASKS.values():
+        assert instruction_for(spec, "paraphrased") != instruction_for(spec)
+
+
+def test_the_later_official_wording_is_a_set_of_its_own() -> None:
+    spoken = {task for task, spec in TASKS.items() if spec.instruction_key in OFFICIAL}
+    assert instruction_for(task_spec("RememberColor9-v0"), "official_vla") == (
+        "Observe the cube's color, wait, then touch the cube of the same color."
+    )
+    other = {task.split("-")[0].rstrip("357") for task in TASKS if task not in spoken}
+    assert other == {"BunchOfColors", "SeqOfColors", "ChainOfColors"} | {
+        f"Rotate{mode}{sign}" for mode in ("Lenient", "Strict") for sign in ("Pos", "PosNeg")
+    }
 
 
 def write(folder: Path, instructions: str) -> str:

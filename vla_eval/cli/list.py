@@ -7,7 +7,7 @@ from typing import Any
 from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.model_table import ModelTable, is_model_table
-from vla_eval.prompts import load_prompts
+from vla_eval.prompts import instruction_for, load_prompts
 from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
 from vla_eval.registry import policy_adapters
 from vla_eval.tasks.catalog import FAMILIES, TASKS
@@ -50,6 +50,7 @@ def _tasks() -> list[Row]:
             f"{spec.horizon_steps} steps",
             f"{spec.memory} memory",
             f"chance {_chance(spec.chance_success)}",
+            f"“{instruction_for(spec)}”",
         )
         for spec in TASKS.values()
     ]
