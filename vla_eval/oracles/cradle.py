@@ -30,13 +30,11 @@ from vla_eval.oracles.arm_model import (
 
 HEIGHT_M = 0.022  # of the tool centre point while waiting and pushing: the ball's centre is at 0.02
 BASE_X_M = -0.615
-MIN_REACH_M = 0.30  # nearer to the base the inverse kinematics finds no pose at this height
 LANE_OFFSET_M = 0.065  # distance to the lane while waiting
 FOLLOW_GAP_M = 0.05
 CONTACT_GAP_M = 0.03
 MEET_Y_EXTRA_M = 0.03
 PUSH_SPEED_RANGE_M_S = (0.2, 0.6)
-ALIGNED_M = 0.006
 TRACK_GAIN_PER_S = 6.0
 SIDE_SPEED_CHANGE_M_S = 0.04  # per control step; a faster change lets the ball slip past a finger
 FOLLOW_LEAD_S = 0.10
@@ -56,21 +54,28 @@ class CradleTactics:
         nominal_velocity_m_s: the rolling ball's (x, y) velocity that is assumed while it is out of view.
         push_speed_m_s: speed along x at which the gap is closed, and by which the meeting place is chosen.
         meet_y_min_m: farther back than this the arm does not wait.
+        min_reach_m: nor nearer to the base than this, where the inverse kinematics finds few poses so low.
+        aligned_m: the gap is closed once ball and cradle are so near along y. An arm hardly faster than the ball
+            comes nearer so slowly that both have passed the goal by then.
     """
 
     imagined_velocity_y_m_s: tuple[float, float]
     nominal_velocity_m_s: tuple[float, float]
     push_speed_m_s: float = 0.47
     meet_y_min_m: float = -0.5
+    min_reach_m: float = 0.30
+    aligned_m: float = 0.006
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> "CradleExpert":
         """Make an expert; `imagined` makes it play a ball of its own invention, not the real one."""
         return CradleExpert(self, rng=rng, imagined=imagined)
 
 
-SLOW = CradleTactics(imagined_velocity_y_m_s=(0.25, 0.5), nominal_velocity_m_s=(0.018, 0.268))
+SLOW = CradleTactics(
+    imagined_velocity_y_m_s=(0.25, 0.5), nominal_velocity_m_s=(0.018, 0.268), min_reach_m=0.27
+)
 MEDIUM = CradleTactics(imagined_velocity_y_m_s=(0.5, 0.75), nominal_velocity_m_s=(0.018, 0.446))
-FAST = CradleTactics(imagined_velocity_y_m_s=(0.75, 1.0), nominal_velocity_m_s=(0.018, 0.625))
+FAST = CradleTactics(imagined_velocity_y_m_s=(0.75, 1.0), nominal_velocity_m_s=(0.018, 0.625), aligned_m=0.01)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +166,7 @@ def _decide(play: _Play) -> _Play:
     stage = play.stage
     if stage == "wait" and behind_m > -FOLLOW_LEAD_S * play.ball_velocity_m_s[1]:
         stage = "follow"
-    if stage == "follow" and abs(behind_m) < ALIGNED_M:
+    if stage == "follow" and abs(behind_m) < play.tactics.aligned_m:
         stage = "close"
     if stage in ("follow", "close") and play.gap_m < CONTACT_GAP_M:
         return replace(play, stage="push", side_speed_m_s=float(play.ball_velocity_m_s[1]))
@@ -195,8 +200,9 @@ def _waiting_place_m(play: _Play) -> Vector:
     meet_y = max(float(play.goal_m[1]) - run_up_y, play.tactics.meet_y_min_m)
     x = lane_x + v_x * (meet_y - float(play.ball_m[1])) / v_y - LANE_OFFSET_M
     from_base_x = x - BASE_X_M
-    if np.hypot(from_base_x, meet_y) < MIN_REACH_M:
-        meet_y = -np.sqrt(max(MIN_REACH_M**2 - from_base_x**2, 0.0))
+    min_reach_m = play.tactics.min_reach_m
+    if np.hypot(from_base_x, meet_y) < min_reach_m:
+        meet_y = -np.sqrt(max(min_reach_m**2 - from_base_x**2, 0.0))
     return np.array([x, meet_y])
 
 
