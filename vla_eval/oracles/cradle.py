@@ -55,7 +55,7 @@ class CradleTactics:
         push_speed_m_s: speed along x at which the gap is closed, and by which the meeting place is chosen.
         meet_y_min_m: farther back than this the arm does not wait.
         min_reach_m: nor nearer to the base than this, where the inverse kinematics finds few poses so low.
-        aligned_m: the gap is closed once ball and cradle are so near along y. An arm hardly faster than the ball
+        aligned_m: the gap is closed once ball and cradle are so near along y. An arm that is hardly faster
             comes nearer so slowly that both have passed the goal by then.
     """
 
