@@ -14,7 +14,6 @@ from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.recipes import PolicyRecipe, list_recipes, load_recipe
-from vla_eval.training import finetune as finetune_module
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.finetune import finetune, load_finetune_recipe
@@ -170,13 +169,7 @@ def test_memory_is_weights_gradients_and_two_moments() -> None:
 def test_the_command_line_sets_fields_of_the_recipe(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen: list[FinetuneConfig] = []
-
-    def fake(config: FinetuneConfig, **_: Any) -> Any:
-        seen.append(config)
-        return finetune_module.FinetuneSummary(out=Path("o"), checkpoint=Path("o/c"))
-
-    monkeypatch.setattr(finetune_module, "finetune", fake)
+    seen = tiny_trainings.asked_for(monkeypatch)
     arguments = ["--policy", "act", "--dataset", str(recorded), "--steps", "7", "--run-seed", "2"]
     assert main(["finetune", *arguments, "--set", "policy.chunk_size=8"]) == 0
     assert capsys.readouterr().out == "o/c\n"

@@ -12,13 +12,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.unit import tiny_trainings
 from vla_eval.cli.main import main
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
 from vla_eval.evaluate import evaluate
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.recipes import EvalConfig
 from vla_eval.results.store import read_run
-from vla_eval.training import finetune as finetune_module
 from vla_eval.training import held_out as held_out_module
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
@@ -237,13 +237,7 @@ class TestTrackers:
 def test_the_command_line_asks_for_evaluations(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen: list[FinetuneConfig] = []
-
-    def fake(config: FinetuneConfig, **_: Any) -> Any:
-        seen.append(config)
-        return finetune_module.FinetuneSummary(out=Path("o"), checkpoint=Path("o/c"))
-
-    monkeypatch.setattr(finetune_module, "finetune", fake)
+    seen = tiny_trainings.asked_for(monkeypatch)
     arguments = ["finetune", "--policy", "act", "--dataset", str(recorded)]
     assert main(arguments) == 0
     assert main([*arguments, "--eval-every", "5000", "--eval-episodes", "7"]) == 0

@@ -9,6 +9,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
+from vla_eval.training import finetune as finetune_module
 from vla_eval.training.recipe import FinetuneConfig
 from vla_eval.training.tiny_models import TINY_POLICY, write_tiny_tokenizer
 
@@ -78,3 +79,15 @@ def tokenizer(tmp_path: Path, recorded: Path) -> Path:
 def context() -> PolicyContext:
     env: Any = make_env(EnvSettings(task=TASK, simulator="fake"))
     return PolicyContext(name="p", env=env.spec, chunking=ChunkingSpec(n_action_steps=2), n_candidates=3)
+
+
+def asked_for(monkeypatch: pytest.MonkeyPatch) -> list[FinetuneConfig]:
+    """Let `mikasa-vla finetune` train nothing, and return the list of what it is asked for."""
+    seen: list[FinetuneConfig] = []
+
+    def fake(config: FinetuneConfig, **_: Any) -> Any:
+        seen.append(config)
+        return finetune_module.FinetuneSummary(out=Path("o"), checkpoint=Path("o/c"))
+
+    monkeypatch.setattr(finetune_module, "finetune", fake)
+    return seen

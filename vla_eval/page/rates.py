@@ -235,11 +235,9 @@ def _sweep(material: Material) -> Markup:
 
 
 def _notes(notes: Sequence[str]) -> Markup:
-    return (
-        element("ul", *(element("li", with_code(note)) for note in notes), class_="notes")
-        if notes
-        else joined(())
-    )
+    if not notes:
+        return joined(())
+    return element("ul", *(element("li", with_code(note)) for note in notes), class_="notes")
 
 
 def _values(material: Material, rows: Sequence[Row]) -> str:

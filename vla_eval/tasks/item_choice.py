@@ -65,6 +65,13 @@ class ItemChoiceEnv(ChoiceEnv):
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
 
+    def _show_in_middle(self, mask: torch.Tensor, shown: torch.Tensor) -> None:
+        """Put the items of these indices, (B,), to the middle of the table where the mask holds."""
+        if not bool(mask.any()):
+            return
+        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
+            self.move(actor, mask & (shown == index), sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
+
     def _reveal_all(self, mask: torch.Tensor) -> None:
         self.reveal(mask, torch.tensor(UPRIGHT_WXYZ, device=self.device))
 

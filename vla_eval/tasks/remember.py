@@ -7,7 +7,6 @@ items are; the phases are the same.
 from typing import Any
 
 import numpy as np
-import sapien
 import torch
 
 from vla_eval.errors import TaskArgumentError
@@ -65,16 +64,10 @@ class RememberEnv(ItemChoiceEnv):
         cue_begins = mask & (step == 0) & (self._cue_end_step > 0) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
-        if bool(cue_begins.any()):
-            self._show_target(cue_begins)
+        self._show_in_middle(cue_begins, self._target)
         self._park_all(cue_ends)
         self._reveal_all(choice_begins)
         return bool((cue_begins | cue_ends | choice_begins).any())
-
-    def _show_target(self, mask: torch.Tensor) -> None:
-        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
-            shown = mask & (self._target == index)
-            self.move(actor, shown, sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """As in `ChoiceEnv`, but slowing down is rewarded everywhere (official code)."""

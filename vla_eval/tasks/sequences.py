@@ -169,11 +169,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         begins = mask & (since == 0)
         ends = mask & (since == turn_steps - self.gap_steps)
         self._park_all((begins & (step > 0)) | ends)
-        if not bool(begins.any()):
-            return ends
-        shown = self._of_sequence(turn.long())
-        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
-            self.move(actor, begins & (shown == index), sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
+        self._show_in_middle(begins, self._of_sequence(turn.long()))
         return begins | ends
 
     def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:
