@@ -1,5 +1,6 @@
 """From a recipe and a dataset to lerobot's configuration of a policy. Knows nothing of the loop."""
 
+import copy
 import dataclasses
 import importlib
 import inspect
@@ -35,7 +36,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     Raises:
         RecipeError: a field that the policy does not have, or a value that it refuses.
         CheckpointError: the base checkpoint cannot be read, or there is no such type of policy.
-        SpecMismatchError: the recipe renames cameras that are not there.
+        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the dataset's
+            fields.
     """
     cls = config_class(recipe.type, where="finetune.type")
     known = [field.name for field in dataclasses.fields(cls)]
@@ -53,6 +55,7 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     _set_features(config, recipe, dataset)
     if hasattr(config, "window_steps"):
         _set_window(config, dataset)
+    _check_features(config, dataset)
     if hasattr(config, "fit_to_actions"):
         actions = torch.from_numpy(read_columns(dataset.root)[ACTION_KEY].astype(np.float32))
         config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
@@ -60,6 +63,14 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)
     return config
+
+
+def _check_features(config: Any, dataset: TrainingDataset) -> None:
+    """Ask the policy whether it takes the dataset's fields, before anything is built."""
+    try:
+        copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
+    except Exception as exc:  # the policies raise what they like
+        raise SpecMismatchError(f"{dataset.root} does not fit the policy: {exc}") from exc
 
 
 def _set_window(config: Any, dataset: TrainingDataset) -> None:

@@ -6,7 +6,8 @@ from typing import Any, ClassVar  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from vla_eval.policies.memory.sizes import SPOTS
+from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.policies.memory.sizes import SPOTS, STATE
 
 TYPE = "mikasa_memory"
 
@@ -27,6 +28,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
             memory begins in its middle. None: our `finetune` takes the dataset's longest.
         chunk_size: actions of a chunk.
         n_action_steps: how many lerobot's own loop executes; ours sets its own number.
+        arm_cameras: the pictures whose camera is on the arm and moves with it.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         first_action_weight: share of a chunk's first action in the loss; the others share the rest.
         change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
@@ -45,6 +47,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     window_steps: int | None = None
     chunk_size: int = 8
     n_action_steps: int = 8
+    arm_cameras: list[str] = field(default_factory=lambda: [CAMERA_KEYS["hand_camera"]])
 
     channels: int = 32
     patch_px: int = 4
@@ -99,6 +102,17 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         """Check the fields of the dataset."""
         if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
             raise ValueError(f"'{TYPE}' needs pictures, observation.state and action")
+        if self.robot_state_feature.shape != (STATE,):
+            raise ValueError(
+                f"'{TYPE}' needs the state 'eef' of {STATE} numbers, found {self.robot_state_feature.shape}: "
+                "record with state: eef"
+            )
+        unknown = sorted(set(self.arm_cameras) - set(self.image_features))
+        if unknown:
+            raise ValueError(
+                f"'{TYPE}': arm_cameras names {unknown}, the pictures are {sorted(self.image_features)}: set "
+                "policy.arm_cameras to those whose camera is on the arm ([] if none is)"
+            )
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
             raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")

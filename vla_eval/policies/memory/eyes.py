@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.policies.memory.sizes import APART, KNOWN, PLACE, RGB, SPOTS, NetworkSizes
+from vla_eval.policies.memory.sizes import APART, HALVES, KNOWN, PLACE, QUARTERS, RGB, SPOTS, NetworkSizes
 
 # How much differences count when something is looked for, to begin with. Colours in [-1, 1]: a maroon cube
-# beside the red one that is asked for differs by about 1 in one of three, and gets e^-20 of the attention.
-COUNT_APART, COUNT_LOOKS, COUNT_OTHERS = 4.0, 20.0, -3.0  # before softplus
+# beside the red one that is asked for differs by about 1 in one of three, and gets e^-40 of the attention.
+COUNT_APART, COUNT_LOOKS, COUNT_OTHERS = 4.0, 40.0, -3.0  # before softplus
 LEAST_COLOR_VARIANCE = 1e-3  # colours in [-1, 1]: less than this is noise of the picture
 
 
@@ -29,11 +29,32 @@ def in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     return kept
 
 
-class Eye(nn.Module):
-    """One camera's picture to features of places; beside them what is known of one spot of each.
+class Places(NamedTuple):
+    """What an eye tells of P places, or what was looked at there.
 
-    It is the spot, a quarter of the place's edge wide, whose colour stands out most from the picture's: a
-    cube of 4 pixels keeps its colour in a place of 8.
+    Attributes:
+        features: (N, P, channels) learned ones of each place.
+        spots: (N, P · QUARTERS, KNOWN) what is known of one spot of each quarter, place by place.
+    """
+
+    features: Tensor
+    spots: Tensor
+
+    def look(self, shares: Tensor) -> Tensor:
+        """Return what is seen, (N, heads, value), if attention (N, heads, P · QUARTERS) goes to the spots."""
+        of_places = shares.reshape(*shares.shape[:2], -1, QUARTERS).sum(dim=-1)
+        return torch.cat([of_places @ self.features, shares @ self.spots], dim=-1)
+
+    def strongest(self) -> Tensor:
+        """Return (N, value): the largest of each number in the picture."""
+        return torch.cat([self.features.amax(dim=1), self.spots.amax(dim=1)], dim=-1)
+
+
+class Eye(nn.Module):
+    """One camera's picture to features of places; beside them what is known of one spot of each quarter.
+
+    It is the spot, half of the quarter's edge wide, whose colour stands out most from the picture's: a cube
+    of 4 pixels keeps its colour in a place of 8, and so does the one beside it.
     """
 
     coordinates: Tensor
@@ -49,23 +70,25 @@ class Eye(nn.Module):
         y, x = torch.meshgrid(line, line, indexing="ij")
         self.register_buffer("coordinates", torch.stack([x, y]), persistent=False)
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        """(N, 3, H, W) in [0, 1] to (N, places, value)."""
+    def forward(self, pictures: Tensor) -> Places:
+        """Look at pictures (N, 3, H, W) in [0, 1]."""
         centred = 2 * pictures - 1
         features = self.patches(centred)
         features = features + self.mix(functional.gelu(self.around(functional.gelu(features))))
-        return torch.cat([features.float().flatten(2), self._known(centred)], dim=1).transpose(1, 2)
+        return Places(features.float().flatten(2).transpose(1, 2), self._known(centred))
 
     @torch.no_grad()
     @in_float32
     def _known(self, pictures: Tensor) -> Tensor:
-        """(N, 3, H, W) in [-1, 1] to (N, KNOWN, places)."""
+        """(N, 3, H, W) in [-1, 1] to (N, P · QUARTERS, KNOWN), place by place."""
         colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
         apart = standing_out(colors)
-        spots = functional.max_pool2d(apart, SPOTS, return_indices=True)[1].flatten(2)
+        quarters = functional.max_pool2d(apart, SPOTS // HALVES, return_indices=True)[1]
+        edge = quarters.shape[-1] // HALVES
+        chosen = quarters.reshape(-1, edge, HALVES, edge, HALVES).transpose(2, 3).flatten(1)
         placed = self.coordinates.expand(len(pictures), -1, -1, -1)
         known = torch.cat([apart, colors, placed], dim=1).flatten(2)
-        return known.gather(2, spots.expand(-1, KNOWN, -1))
+        return known.gather(2, chosen[:, None].expand(-1, KNOWN, -1)).transpose(1, 2)
 
 
 def standing_out(colors: Tensor) -> Tensor:
@@ -89,8 +112,16 @@ class Keys(nn.Module):
         super().__init__()
         self.learned = nn.Linear(sizes.value, sizes.key)
 
-    def forward(self, values: Tensor) -> Tensor:
-        """(…, value) to (…, key + KNOWN)."""
+    def forward(self, places: Places) -> Tensor:
+        """Return the keys of the spots, (N, P · QUARTERS, key + KNOWN)."""
+        features, spots = places
+        weight = self.learned.weight
+        of_place = functional.linear(features, weight[:, :-KNOWN], self.learned.bias)
+        learned = of_place.repeat_interleave(QUARTERS, dim=1) + functional.linear(spots, weight[:, -KNOWN:])
+        return torch.cat([learned, spots], dim=-1)
+
+    def of(self, values: Tensor) -> Tensor:
+        """Return the keys of what was seen (…, value), (…, key + KNOWN)."""
         return torch.cat([self.learned(values), values[..., -KNOWN:]], dim=-1)
 
 
@@ -101,12 +132,12 @@ class StandingOut(nn.Module):
         super().__init__()
         n = sizes.key + KNOWN
         self.towards = nn.Parameter(torch.randn(sizes.heads, n) / math.sqrt(n))
-        with torch.no_grad():  # to begin with: what stands out e^1 more gets e^8 of the attention
-            self.towards[:, sizes.key] += 8.0
+        with torch.no_grad():  # to begin with: what stands out e^1 more gets e^20 of the attention
+            self.towards[:, sizes.key] += 20.0
 
-    def forward(self, places: Tensor, keys: Tensor) -> Tensor:
-        """(N, P, value) and (N, P, key + KNOWN) to what each head saw, (N, heads, value)."""
-        return (keys @ self.towards.T).transpose(1, 2).softmax(dim=-1) @ places
+    def forward(self, places: Places, keys: Tensor) -> Tensor:
+        """Places and the keys of their spots to what each head saw, (N, heads, value)."""
+        return places.look((keys @ self.towards.T).transpose(1, 2).softmax(dim=-1))
 
 
 class Found(NamedTuple):
@@ -128,19 +159,19 @@ class Likeness(nn.Module):
             self.counts[: sizes.heads // 2, color : color + RGB] = COUNT_LOOKS
             self.counts[sizes.heads // 2 :, color + RGB :] = COUNT_LOOKS
 
-    def forward(self, places: Tensor, keys: Tensor, asked: Tensor) -> Found:
+    def forward(self, places: Places, keys: Tensor, asked: Tensor) -> Found:
         """Look for what is asked for.
 
         Args:
-            places: (N, P, value).
-            keys: (N, P, key + KNOWN).
+            places: P places of each of N pictures.
+            keys: (N, P · QUARTERS, key + KNOWN) of their spots.
             asked: (N, heads, key + KNOWN).
         """
         counts = functional.softplus(self.counts)
         # Minus the squared distance, without what all places have in common.
         scores = 2 * keys @ (asked * counts).transpose(1, 2) - keys.square() @ counts.T
         shares = scores.transpose(1, 2).softmax(dim=-1)
-        values = shares @ places
+        values = places.look(shares)
         color = slice(-RGB - PLACE, -PLACE)  # of values and of keys
         unlike = (values[..., color] - asked[..., color]).square().sum(dim=-1)
         return Found(values, torch.stack([shares.amax(dim=-1), values[..., -KNOWN], -unlike], dim=-1))

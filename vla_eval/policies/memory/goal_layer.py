@@ -6,72 +6,116 @@ up, colours included, learns 250 goals by heart instead: with nine candidates it
 episodes and by 1.7 in those that it had seen.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from vla_eval.policies.memory.sizes import PLACE, SPACE
+from vla_eval.policies.memory.sizes import PLACE, POSITION_SCALE, SPACE
 
 MAP_HIDDEN = 64
 EVIDENCE_COUNTS = (3.0, 0.5, 3.0)
 """How much what tells of a look-up counts to begin with: its largest share of attention, how much the place
 stands out, and minus how unlike its colour is to the one asked for."""
 
+PLACE_SCALE = 4.0  # the table's things lie within a part of a picture of [-1, 1]: to numbers of about 1
 TRUST_SCALE = 10.0  # so that an optimizer's steps of 0.002 stop listening within some hundred
 
 
 class Goals(NamedTuple):
-    """Where to go: (N, 3) by all cameras together, (N, cameras, 3) by each of them alone."""
+    """Where to go.
 
-    together: Tensor
-    alone: Tensor
+    Attributes:
+        pointed: (N, cameras, heads, 3) by each look-up alone.
+        shares: (N, cameras, heads) how far each is believed among those of its camera; of sum 1.
+        camera_shares: (N, cameras) how far each camera is; of sum 1.
+    """
+
+    pointed: Tensor
+    shares: Tensor
+    camera_shares: Tensor
+
+    @property
+    def alone(self) -> Tensor:
+        """(N, cameras, 3) by each camera alone."""
+        return (self.shares[..., None] * self.pointed).sum(dim=2)
+
+    @property
+    def together(self) -> Tensor:
+        """(N, 3) by all of them."""
+        return (self.camera_shares[..., None] * self.alone).sum(dim=1)
 
 
 class GoalLayer(nn.Module):
     """The mean of where the look-ups point to, weighted by how far each is believed: by camera, then of both.
 
+    What a fixed camera sees lies where it lies, wherever the arm is: its map knows nothing but the place in
+    the picture. A place in the picture of a camera on the arm is a ray that leaves the tool: where it meets
+    the table depends on nothing but the tool's height, linearly, and turns and moves with the tool. Maps are
+    not told more of the arm than that: one that is learns to tell the demonstration's end from the way on
+    which the arm already is (low down, it is there), and not from the picture. Each map also says how sure
+    it is at a place.
+
     Args:
-        cameras: pictures of a step.
+        on_arm: of each camera, whether it is on the arm.
         heads: look-ups per camera.
-        state: numbers of proprioception, the tool centre point's position first.
     """
 
-    def __init__(self, *, cameras: int, heads: int, state: int) -> None:
+    def __init__(self, *, on_arm: Sequence[bool], heads: int) -> None:
         super().__init__()
+        cameras = len(on_arm)
+        self.on_arm = tuple(on_arm)
         self.maps = nn.ModuleList(
             nn.Sequential(
-                nn.Linear(PLACE + state, MAP_HIDDEN),
+                nn.Linear(PLACE, MAP_HIDDEN),
                 nn.GELU(),
                 nn.Linear(MAP_HIDDEN, MAP_HIDDEN),
                 nn.GELU(),
-                nn.Linear(MAP_HIDDEN, SPACE),
+                nn.Linear(MAP_HIDDEN, (2 * SPACE if rides else SPACE) + 1),
             )
-            for _ in range(cameras)
+            for rides in on_arm
         )
-        # A camera on the arm sees where things are from the tool: so far the tool's own place is added.
-        self.rides = nn.Parameter(torch.full((cameras, SPACE), 0.5))
         self.trust = nn.Parameter(torch.zeros(cameras, heads))
         self.evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, heads, 1))
         self.camera_trust = nn.Parameter(torch.zeros(cameras))
         self.camera_evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, 1))
 
     def forward(self, places: Tensor, evidence: Tensor, state: Tensor) -> Goals:
-        """Return the goals in units of `state`.
+        """Return the goals in metres.
 
         Args:
             places: (N, cameras, heads, 2) places in the pictures, -1 to 1.
             evidence: (N, cameras, heads, 3) of each look-up, see `EVIDENCE_COUNTS`.
-            state: (N, state), in numbers of about 1.
+            state: (N, state) in SI units: the tool centre point's position and the first two columns of its
+                rotation matrix.
         """
-        n_cameras, n_heads = places.shape[1:3]
-        known = torch.cat([places, state[:, None, None].expand(-1, n_cameras, n_heads, -1)], dim=-1)
-        pointed = torch.stack([each(known[:, i]) for i, each in enumerate(self.maps)], dim=1)
-        pointed = pointed + self.rides[:, None] * state[:, None, None, :SPACE]
-        belief = TRUST_SCALE * self.trust + (self.evidence * evidence).sum(dim=-1)
-        shares = belief.softmax(dim=-1)[..., None]
-        alone = (shares * pointed).sum(dim=2)
-        of_camera = (shares * evidence).sum(dim=2)
+        told = [each(PLACE_SCALE * places[:, index]) for index, each in enumerate(self.maps)]
+        pointed = torch.stack(
+            [
+                _from_the_tool(camera[..., 1:], state) if rides else camera[..., 1:] / POSITION_SCALE
+                for camera, rides in zip(told, self.on_arm, strict=True)
+            ],
+            dim=1,
+        )
+        sure = torch.stack([camera[..., 0] for camera in told], dim=1)
+        belief = TRUST_SCALE * self.trust + (self.evidence * evidence).sum(dim=-1) + sure
+        shares = belief.softmax(dim=-1)
+        of_camera = (shares[..., None] * evidence).sum(dim=2)
         believed = TRUST_SCALE * self.camera_trust + (self.camera_evidence * of_camera).sum(dim=-1)
-        together = (believed.softmax(dim=-1)[..., None] * alone).sum(dim=1)
-        return Goals(together=together, alone=alone)
+        believed = believed + (shares * sure).sum(dim=-1)
+        return Goals(pointed, shares, believed.softmax(dim=-1))
+
+
+def _from_the_tool(rays: Tensor, state: Tensor) -> Tensor:
+    """Return where rays (N, heads, 6) meet the table, (N, heads, 3) in metres.
+
+    A ray is an offset from the tool and what is added to it per unit of height, both as the tool is turned.
+    """
+    height = POSITION_SCALE * state[:, None, SPACE - 1 : SPACE]
+    from_tool = (rays[..., :SPACE] + height * rays[..., SPACE:]) / POSITION_SCALE
+    first, second = state[:, SPACE : 2 * SPACE], state[:, 2 * SPACE : 3 * SPACE]
+    turned = torch.stack(
+        [first, second, torch.linalg.cross(first, second)], dim=1
+    )  # (N, 3, 3), its transpose
+    return state[:, None, :SPACE] + from_tool @ turned

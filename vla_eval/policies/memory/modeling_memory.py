@@ -71,10 +71,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = _weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
-        goal = _in_variances(answer.goal_m, episodes.goal_m, real)
-        # Each camera learns to tell by itself: else the first to be any good is the only one that learns.
-        by_camera = [_in_variances(told, episodes.goal_m, real) for told in answer.camera_goals_m.unbind(2)]
-        goals = (goal + torch.stack(by_camera).mean()) / 2
+        goal, goals = goals_missed(answer, episodes.goal_m, real)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
         surprise = _weighted_mean(surprises, episodes.counts)
@@ -175,12 +172,34 @@ def foreseen_alone(answer: Answer) -> Tensor:
     return torch.where(foreseen.bool()[..., None], answer.actions, held)
 
 
+def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
+    """Return by how much the goal of an answer is missed, and the loss that teaches it.
+
+    Both are in units of what the mean of the batch's goals would miss, squared. In the loss each look-up
+    answers for itself, in proportion to how far it is believed (Jacobs et al. 1991, "Adaptive Mixtures of
+    Local Experts"): where only their mean has to be right, wrong ones that cancel out stay believed. And
+    each camera does: else the first to be any good is the only one that learns.
+
+    Args:
+        answer: for steps (B, T).
+        right_m: (B, 3).
+        real: (B, T) 1 for the steps that count, else 0.
+    """
+    variance = (right_m - right_m.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE)
+    of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
+    of_cameras = (answer.shares * of_look_ups).sum(dim=-1)
+    by_all = (answer.camera_shares * of_cameras).sum(dim=-1)
+    loss = _weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / variance
+    missed = (answer.goal_m - right_m[:, None]).square().mean(dim=-1)
+    return _weighted_mean(missed, real) / variance, loss
+
+
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
     """Return the sizes that a configuration and its fields ask for."""
-    images = list(config.image_features.values())
+    images = config.image_features
     return NetworkSizes(
-        cameras=len(images),
-        image_px=int(images[0].shape[-1]),
+        on_arm=tuple(name in config.arm_cameras for name in images),
+        image_px=int(next(iter(images.values())).shape[-1]),
         state=int(config.robot_state_feature.shape[0]),
         action=int(config.action_feature.shape[0]),
         chunk=config.chunk_size,
@@ -213,18 +232,3 @@ def _mixed(pictures: Tensor) -> Tensor:
 
 def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
     return (values * weights).sum() / weights.sum()
-
-
-def _in_variances(told: Tensor, right: Tensor, real: Tensor) -> Tensor:
-    """Return the mean squared error over the steps (B, T) that are real, in units of the batch's variance.
-
-    So 1 is what the mean would reach.
-
-    Args:
-        told: (B, T, …).
-        right: (B, …).
-        real: (B, T).
-    """
-    errors = (told - right[:, None]).square().flatten(2).mean(dim=-1)
-    variance = (right - right.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE)
-    return _weighted_mean(errors, real) / variance

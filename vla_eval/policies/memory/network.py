@@ -19,12 +19,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
-from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, StandingOut, in_float32
+from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, Places, StandingOut, in_float32
 from vla_eval.policies.memory.goal_layer import GoalLayer
-from vla_eval.policies.memory.sizes import KNOWN, PLACE, SPACE, NetworkSizes
+from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, NetworkSizes
 
-STATE_SCALE = 5.0  # metres of the workspace to numbers of about 1
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
+INSISTENCE = 5.0
+"""To begin with, every other pair of heads hardly lets go of the first thing that it saw: what comes later
+counts e^-5 as much. A cue comes before the choice; a mean of both would be neither's colour."""
 NOTHING = -1e4  # logarithm of a weight of 0, finite
 
 
@@ -37,26 +39,30 @@ class Answer(NamedTuple):
             it into anything but its own layer.
         goal_m: (B, T, 3) where the demonstration's tool centre point ends, told from what the memory looked
             up alone.
-        camera_goals_m: (B, T, cameras, 3) the same by each camera alone.
+        pointed_m: (B, T, cameras, heads, 3) the same by each look-up alone.
+        shares: (B, T, cameras, heads) how far each is believed among those of its camera.
+        camera_shares: (B, T, cameras) how far each camera is.
     """
 
     actions: Tensor
     doubts: Tensor
     goal_m: Tensor
-    camera_goals_m: Tensor
+    pointed_m: Tensor
+    shares: Tensor
+    camera_shares: Tensor
 
 
 class Sight(NamedTuple):
     """What is seen at N steps.
 
     Attributes:
-        places: per camera (N, P, value).
+        places: per camera.
         keys: per camera (N, P, key + KNOWN).
         things: (N, cameras · heads, value) what stood out.
         summary: (N, hidden).
     """
 
-    places: list[Tensor]
+    places: list[Places]
     keys: list[Tensor]
     things: Tensor
     summary: Tensor
@@ -97,11 +103,13 @@ class MemoryNetwork(nn.Module):
             nn.Linear(sizes.seen + n * sizes.value + sizes.state, hidden), nn.LayerNorm(hidden), nn.GELU()
         )
         self.importance = nn.Linear(hidden, n_things)
+        insisting = [INSISTENCE if head % 4 < 2 else 0.0 for head in range(sizes.heads)]
+        self.insists = nn.Parameter(torch.tensor(insisting).repeat(n))
         self.gates = nn.Linear(hidden, sizes.memory)
         self.candidate = nn.Linear(hidden, sizes.memory)
         self.first_rest = nn.Parameter(torch.zeros(sizes.memory))
         self.asks = nn.Linear(sizes.memory, n_things * sizes.key)
-        self.goal = GoalLayer(cameras=n, heads=sizes.heads, state=sizes.state)
+        self.goal = GoalLayer(on_arm=sizes.on_arm, heads=sizes.heads)
         kept = sizes.seen + sizes.memory
         self.decides = nn.Sequential(
             nn.Linear(sizes.seen + kept + hidden + sizes.state + SPACE, hidden),
@@ -135,12 +143,12 @@ class MemoryNetwork(nn.Module):
         return self._sight([eye(pictures[:, index]) for index, eye in enumerate(self.eyes)], state)
 
     @in_float32
-    def _sight(self, places: list[Tensor], state: Tensor) -> Sight:
+    def _sight(self, places: list[Places], state: Tensor) -> Sight:
         keys = [key(place) for key, place in zip(self.keys, places, strict=True)]
         looks = zip(self.standing_out, places, keys, strict=True)
         things = torch.cat([look(place, key) for look, place, key in looks], dim=1)
-        strongest = [place.amax(dim=1) for place in places]
-        known = torch.cat([things.flatten(1), *strongest, state * STATE_SCALE], dim=-1)
+        strongest = [place.strongest() for place in places]
+        known = torch.cat([things.flatten(1), *strongest, state * POSITION_SCALE], dim=-1)
         return Sight(places, keys, things, self.summary(known))
 
     @in_float32
@@ -159,8 +167,10 @@ class MemoryNetwork(nn.Module):
         memories = []
         for step in range(summaries.shape[1]):
             before = memory if self.remembers else self.begin(len(summaries))
-            total = torch.logaddexp(before.importance, importance[:, step])
-            share = (importance[:, step] - total).exp()
+            held = before.importance > NOTHING / 2  # nothing insists while nothing is held
+            weight = importance[:, step] - self.insists * held
+            total = torch.logaddexp(before.importance, weight)
+            share = (weight - total).exp()
             memory = Memory(
                 torch.lerp(before.things, things[:, step], share[..., None]),
                 total,
@@ -184,19 +194,33 @@ class MemoryNetwork(nn.Module):
         asked = functional.pad(asked, (0, KNOWN))
         things = memory.things.reshape(len(state), sizes.cameras, sizes.heads, -1)
         found = [
-            look(sight.places[index], sight.keys[index], self.keys[index](things[:, index]) + asked[:, index])
-            for index, look in enumerate(self.likeness)
+            look(places, keys, key.of(thing) + ask)
+            for look, places, keys, key, thing, ask in zip(
+                self.likeness,
+                sight.places,
+                sight.keys,
+                self.keys,
+                things.unbind(1),
+                asked.unbind(1),
+                strict=True,
+            )
         ]
         values = torch.stack([each.values for each in found], dim=1)
         looked_up = values.flatten(1)
         evidence = torch.stack([each.evidence for each in found], dim=1)
-        goals = self.goal(values[..., -PLACE:], evidence, state * STATE_SCALE)
-        goal = goals.together / STATE_SCALE
-        way_m = goal.detach() - state[:, :SPACE]
-        known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * STATE_SCALE]
+        goals = self.goal(values[..., -PLACE:], evidence, state)
+        way_m = goals.together.detach() - state[:, :SPACE]
+        known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * POSITION_SCALE]
         decided = self.decides(torch.cat([*known, way_m / WAY_SCALE_M], dim=-1))
         actions, doubts = self.acts(decided, way_m)
-        return Answer(actions=actions, doubts=doubts, goal_m=goal, camera_goals_m=goals.alone / STATE_SCALE)
+        return Answer(
+            actions=actions,
+            doubts=doubts,
+            goal_m=goals.together,
+            pointed_m=goals.pointed,
+            shares=goals.shares,
+            camera_shares=goals.camera_shares,
+        )
 
     def forward(self, pictures: Tensor, state: Tensor) -> Answer:
         """Answer for each step of episodes from their beginning.

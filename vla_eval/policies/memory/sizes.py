@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 
+STATE = 10  # numbers of the state `eef`: position, two columns of a rotation matrix, gripper
+POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
 SPACE = 3  # numbers of a position, and of the translation with which an action begins
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in a picture
 APART = 1  # one number: how much a place stands out
 KNOWN = APART + RGB + PLACE  # what is told of a place beside its learned features, in this order
 SPOTS = 4  # spots along a place's edge
+HALVES = 2  # along its edge: of each quarter of a place one spot is told
+QUARTERS = HALVES**2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -14,7 +18,7 @@ class NetworkSizes:
     """Sizes of the network.
 
     Attributes:
-        cameras: pictures of a step.
+        on_arm: of each picture of a step, whether its camera is on the arm.
         image_px: height and width of a picture, a multiple of `patch_px`.
         state: numbers of proprioception.
         action: dimensions of an action.
@@ -28,9 +32,9 @@ class NetworkSizes:
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
     """
 
-    cameras: int = 2
+    on_arm: tuple[bool, ...] = (False, True)
     image_px: int = 128
-    state: int = 10
+    state: int = STATE
     action: int = 7
     chunk: int = 8
     channels: int = 32
@@ -40,6 +44,11 @@ class NetworkSizes:
     memory: int = 256
     hidden: int = 256
     longest_span_steps: float = 100.0
+
+    @property
+    def cameras(self) -> int:
+        """Pictures of a step."""
+        return len(self.on_arm)
 
     @property
     def value(self) -> int:
