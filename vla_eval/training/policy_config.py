@@ -14,7 +14,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.data.frame_table import read_columns
-from vla_eval.errors import RecipeError, SpecMismatchError, did_you_mean, unknown_name
+from vla_eval.errors import RecipeError, SpecMismatchError, VlaEvalError, did_you_mean, unknown_name
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
 from vla_eval.training.dataset import TrainingDataset
@@ -69,6 +69,8 @@ def _check_features(config: Any, dataset: TrainingDataset) -> None:
     """Ask the policy whether it takes the dataset's fields, before anything is built."""
     try:
         copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
+    except VlaEvalError:
+        raise  # ours say what to do
     except Exception as exc:  # the policies raise what they like
         raise SpecMismatchError(f"{dataset.root} does not fit the policy: {exc}") from exc
 
