@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.memory.layers import three_layers
 from vla_eval.policies.memory.sizes import SPACE
 
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
@@ -32,13 +33,7 @@ class ActionHead(nn.Module):
         super().__init__()
         self.chunk = chunk
         self.goes = nn.Linear(hidden, chunk)
-        self.way = nn.Sequential(
-            nn.Linear(WAY_SEEN, WAY_HIDDEN),
-            nn.GELU(),
-            nn.Linear(WAY_HIDDEN, WAY_HIDDEN),
-            nn.GELU(),
-            nn.Linear(WAY_HIDDEN, chunk),
-        )
+        self.way = three_layers(WAY_SEEN, WAY_HIDDEN, chunk)
         self.others = nn.Linear(hidden, chunk * (action - SPACE))
         self.doubts = nn.Linear(hidden, chunk)
         self.register_buffer("upright", torch.eye(SPACE)[-1], persistent=False)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from vla_eval.policies.memory.layers import three_layers
 from vla_eval.policies.memory.sizes import PLACE, POSITION_SCALE, SPACE
 
 MAP_HIDDEN = 64
@@ -67,14 +68,7 @@ class GoalLayer(nn.Module):
         cameras = len(on_arm)
         self.on_arm = tuple(on_arm)
         self.maps = nn.ModuleList(
-            nn.Sequential(
-                nn.Linear(PLACE, MAP_HIDDEN),
-                nn.GELU(),
-                nn.Linear(MAP_HIDDEN, MAP_HIDDEN),
-                nn.GELU(),
-                nn.Linear(MAP_HIDDEN, (2 * SPACE if rides else SPACE) + 1),
-            )
-            for rides in on_arm
+            three_layers(PLACE, MAP_HIDDEN, (2 * SPACE if rides else SPACE) + 1) for rides in on_arm
         )
         self.trust = nn.Parameter(torch.zeros(cameras, heads))
         self.evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, heads, 1))

@@ -200,7 +200,6 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
     return NetworkSizes(
         on_arm=tuple(name in config.arm_cameras for name in images),
         image_px=int(next(iter(images.values())).shape[-1]),
-        state=int(config.robot_state_feature.shape[0]),
         action=int(config.action_feature.shape[0]),
         chunk=config.chunk_size,
         channels=config.channels,

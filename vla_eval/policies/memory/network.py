@@ -21,7 +21,7 @@ from torch.nn import functional
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
 from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, Places, StandingOut, in_float32
 from vla_eval.policies.memory.goal_layer import GoalLayer
-from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, NetworkSizes
+from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, STATE, NetworkSizes
 
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
 INSISTENCE = 5.0
@@ -100,7 +100,7 @@ class MemoryNetwork(nn.Module):
         self.standing_out = nn.ModuleList(StandingOut(sizes) for _ in range(n))
         self.likeness = nn.ModuleList(Likeness(sizes) for _ in range(n))
         self.summary = nn.Sequential(
-            nn.Linear(sizes.seen + n * sizes.value + sizes.state, hidden), nn.LayerNorm(hidden), nn.GELU()
+            nn.Linear(sizes.seen + n * sizes.value + STATE, hidden), nn.LayerNorm(hidden), nn.GELU()
         )
         self.importance = nn.Linear(hidden, n_things)
         insisting = [INSISTENCE if head % 4 < 2 else 0.0 for head in range(sizes.heads)]
@@ -112,7 +112,7 @@ class MemoryNetwork(nn.Module):
         self.goal = GoalLayer(on_arm=sizes.on_arm, heads=sizes.heads)
         kept = sizes.seen + sizes.memory
         self.decides = nn.Sequential(
-            nn.Linear(sizes.seen + kept + hidden + sizes.state + SPACE, hidden),
+            nn.Linear(sizes.seen + kept + hidden + STATE + SPACE, hidden),
             nn.LayerNorm(hidden),
             nn.GELU(),
             nn.Linear(hidden, hidden),
@@ -209,14 +209,15 @@ class MemoryNetwork(nn.Module):
         looked_up = values.flatten(1)
         evidence = torch.stack([each.evidence for each in found], dim=1)
         goals = self.goal(values[..., -PLACE:], evidence, state)
-        way_m = goals.together.detach() - state[:, :SPACE]
+        goal_m = goals.together
+        way_m = goal_m.detach() - state[:, :SPACE]
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * POSITION_SCALE]
         decided = self.decides(torch.cat([*known, way_m / WAY_SCALE_M], dim=-1))
         actions, doubts = self.acts(decided, way_m)
         return Answer(
             actions=actions,
             doubts=doubts,
-            goal_m=goals.together,
+            goal_m=goal_m,
             pointed_m=goals.pointed,
             shares=goals.shares,
             camera_shares=goals.camera_shares,

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
-STATE = 10  # numbers of the state `eef`: position, two columns of a rotation matrix, gripper
+from vla_eval.data.features import STATE_NAMES
+
+STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
 POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
 SPACE = 3  # numbers of a position, and of the translation with which an action begins
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in a picture
@@ -20,7 +22,6 @@ class NetworkSizes:
     Attributes:
         on_arm: of each picture of a step, whether its camera is on the arm.
         image_px: height and width of a picture, a multiple of `patch_px`.
-        state: numbers of proprioception.
         action: dimensions of an action.
         chunk: actions of a chunk.
         channels: learned features of a place in a picture.
@@ -34,7 +35,6 @@ class NetworkSizes:
 
     on_arm: tuple[bool, ...] = (False, True)
     image_px: int = 128
-    state: int = STATE
     action: int = 7
     chunk: int = 8
     channels: int = 32
