@@ -113,7 +113,7 @@ class TestGoalLayer:
 class TestActionHead:
     def chunks(self, ways_m: list[list[float]]) -> torch.Tensor:
         torch.manual_seed(0)
-        head = ActionHead(hidden=8, chunk=4, action=7)
+        head = ActionHead(hidden=8, chunk=4, action=7, free=False)
         decided = torch.rand(1, 8).expand(len(ways_m), -1)
         actions, _ = head(decided, torch.tensor(ways_m))
         return actions
@@ -126,6 +126,14 @@ class TestActionHead:
         near, far = self.chunks([[0.01, 0.0, 0.0], [0.2, 0.1, 0.1]])
         assert not torch.isclose(near[:, :3], far[:, :3]).any()
         assert torch.equal(near[:, 3:], far[:, 3:])
+
+    @pytest.mark.parametrize("free", [False, True])
+    def test_what_was_decided_bends_the_way_only_where_a_part_of_it_is_free(self, free: bool) -> None:
+        torch.manual_seed(0)
+        head = ActionHead(hidden=8, chunk=4, action=7, free=free)
+        actions, _ = head(torch.rand(2, 8), torch.tensor([[0.1, -0.03, 0.2]] * 2))
+        one, other = actions[..., :3]
+        assert torch.allclose(torch.linalg.cross(one, other), torch.zeros(4, 3), atol=1e-6) is not free
 
 
 @pytest.mark.slow

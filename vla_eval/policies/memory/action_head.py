@@ -3,6 +3,9 @@
 Where the arm goes is told by how far away the goal is, axis by axis, in a layer that knows nothing else:
 so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
 paths still finds the way. When to go is decided with all that is known.
+
+Not every task is a way to a place: to meet a rolling ball an arm has to follow it first. There a part of
+the translation may be free, told by all that is known.
 """
 
 import torch
@@ -25,13 +28,15 @@ class ActionHead(nn.Module):
         hidden: numbers that tell what was decided.
         chunk: actions.
         action: dimensions of an action, the first three of them a translation.
+        free: whether a part of the translation does not depend on the goal.
     """
 
     upright: Tensor
 
-    def __init__(self, *, hidden: int, chunk: int, action: int) -> None:
+    def __init__(self, *, hidden: int, chunk: int, action: int, free: bool) -> None:
         super().__init__()
         self.chunk = chunk
+        self.free = nn.Linear(hidden, chunk * SPACE) if free else None
         self.goes = nn.Linear(hidden, chunk)
         self.way = three_layers(WAY_SEEN, WAY_HIDDEN, chunk)
         self.others = nn.Linear(hidden, chunk * (action - SPACE))
@@ -51,7 +56,10 @@ class ActionHead(nn.Module):
         ways = self.way(self._along_each_axis(way_m)).transpose(1, 2)  # (N, chunk, 3)
         others = self.others(decided).reshape(len(decided), self.chunk, -1)
         doubts = functional.softplus(self.doubts(decided.detach())) + LEAST_DOUBT
-        return torch.cat([goes * ways, others], dim=-1), doubts
+        translation = goes * ways
+        if self.free is not None:
+            translation = translation + self.free(decided).reshape(translation.shape)
+        return torch.cat([translation, others], dim=-1), doubts
 
     def _along_each_axis(self, way_m: Tensor) -> Tensor:
         """(N, 3) to (N, 3, WAY_SEEN): the way along the axis, up and aside, and which kind of axis it is.

@@ -29,6 +29,8 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         chunk_size: actions of a chunk.
         n_action_steps: how many lerobot's own loop executes; ours sets its own number.
         arm_cameras: the pictures whose camera is on the arm and moves with it.
+        free_translation: a part of the translation does not depend on where the demonstration ends, for
+            tasks that are more than a way to a place.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         first_action_weight: share of a chunk's first action in the loss; the others share the rest.
         change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
@@ -56,6 +58,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     memory: int = 128
     hidden: int = 256
     longest_span_steps: float = 100.0
+    free_translation: bool = False
 
     first_action_weight: float = 0.5
     change_weight: float = 3.0

@@ -209,6 +209,7 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         memory=config.memory,
         hidden=config.hidden,
         longest_span_steps=config.longest_span_steps,
+        free_translation=config.free_translation,
     )
 
 

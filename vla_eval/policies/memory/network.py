@@ -118,7 +118,9 @@ class MemoryNetwork(nn.Module):
             nn.Linear(hidden, hidden),
             nn.GELU(),
         )
-        self.acts = ActionHead(hidden=hidden, chunk=sizes.chunk, action=sizes.action)
+        self.acts = ActionHead(
+            hidden=hidden, chunk=sizes.chunk, action=sizes.action, free=sizes.free_translation
+        )
         with torch.no_grad():
             nn.init.zeros_(self.asks.weight)
             nn.init.zeros_(self.asks.bias)

@@ -31,6 +31,7 @@ class NetworkSizes:
         memory: units of the memory.
         hidden: units of the layers between.
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
+        free_translation: whether a part of the translation does not depend on the goal.
     """
 
     on_arm: tuple[bool, ...] = (False, True)
@@ -44,6 +45,7 @@ class NetworkSizes:
     memory: int = 256
     hidden: int = 256
     longest_span_steps: float = 100.0
+    free_translation: bool = False
 
     @property
     def cameras(self) -> int:
