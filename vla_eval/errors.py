@@ -6,7 +6,7 @@ and what to do next.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 class VlaEvalError(Exception):
@@ -112,3 +112,20 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "")
     return UnknownNameError(
         f"{prefix}there is no {kind} '{name}'.{did_you_mean(name, names)} Known: {', '.join(names)}."
     )
+
+
+def check_names(kind: str, names: Iterable[str], known: Collection[str], *, where: str = "") -> None:
+    """Refuse the first name that does not exist.
+
+    Args:
+        kind: what is named, in the singular.
+        names: what the user wrote.
+        known: the names that exist.
+        where: the field or flag in which they stand.
+
+    Raises:
+        UnknownNameError: one does not exist.
+    """
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known, where=where)

@@ -10,7 +10,7 @@ import torch
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import SpecMismatchError
+from vla_eval.errors import SpecMismatchError, UnknownNameError
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
@@ -198,8 +198,10 @@ class TestTraining:
             tiny_policy(recorded, window_steps=2)
 
     def test_a_camera_on_the_arm_that_is_not_there_is_refused(self, recorded: Path) -> None:
-        with pytest.raises(SpecMismatchError, match=r"arm_cameras names \['observation.images.hand'\]"):
-            tiny_policy(recorded, arm_cameras=["observation.images.hand"])
+        with pytest.raises(
+            UnknownNameError, match=r"arm_cameras .* 'observation.images.wirst'. Did you mean"
+        ):
+            tiny_policy(recorded, arm_cameras=["observation.images.wirst"])
 
     def test_a_state_that_does_not_tell_how_the_tool_is_turned_is_refused(self, recorded: Path) -> None:
         config = tiny_policy(recorded).config

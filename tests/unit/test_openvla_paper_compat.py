@@ -10,7 +10,7 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from vla_eval.core import ActionChunk, Observation, ObservationWindow
-from vla_eval.errors import RecipeError
+from vla_eval.errors import UnknownNameError
 from vla_eval.policies.openvla.paper_compat import PaperCompatPolicy, jpeg_round_trip, make_openvla
 from vla_eval.specs import PolicySpec
 
@@ -77,5 +77,5 @@ def test_a_plain_picture_survives_jpeg() -> None:
 
 def test_a_mistyped_switch_is_named() -> None:
     context: Any = None
-    with pytest.raises(RecipeError, match="Did you mean 'gripper_sign'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'gripper_sign'"):
         make_openvla(context, paper_compat=["gripper_sing"])

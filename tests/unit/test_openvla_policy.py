@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from tests.unit import openvla_golden as golden
-from vla_eval.errors import MissingInstructionError, RecipeError, SpecMismatchError, TrainingError
+from vla_eval.errors import (
+    MissingInstructionError,
+    RecipeError,
+    SpecMismatchError,
+    TrainingError,
+    UnknownNameError,
+)
 from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
 from vla_eval.policies.openvla.prompt import BYTE_SIZES, finished, prompt_text
@@ -90,12 +96,15 @@ class TestConfiguration:
             ({"dtype": "bfloat"}, "Did you mean 'bfloat16'"),
             ({"n_action_steps": 9}, r"expected 1 to chunk_size \(8\)"),
             ({"sizes": {"lm_width": 64}}, "Did you mean 'llm_width'"),
-            ({"pictures": ["observation.images.bas"]}, "Did you mean 'observation.images.base'"),
         ],
     )
     def test_what_is_mistyped_is_named(self, recorded: Path, fields: dict[str, Any], message: str) -> None:
         with pytest.raises(RecipeError, match=message):
             tiny(recorded, **fields)
+
+    def test_a_mistyped_picture_is_named(self, recorded: Path) -> None:
+        with pytest.raises(UnknownNameError, match=r"Did you mean 'observation\.images\.base'"):
+            tiny(recorded, pictures=["observation.images.bas"])
 
     def test_the_published_sizes_are_the_default(self) -> None:
         sizes = network_sizes({})

@@ -12,7 +12,13 @@ from scipy.stats import norm
 
 from tests.unit import spatialvla_golden as golden
 from vla_eval.data.frame_table import read_columns
-from vla_eval.errors import MissingInstructionError, RecipeError, SpecMismatchError, TrainingError
+from vla_eval.errors import (
+    MissingInstructionError,
+    RecipeError,
+    SpecMismatchError,
+    TrainingError,
+    UnknownNameError,
+)
 from vla_eval.policies.spatialvla.action_grid import uniform_grid
 from vla_eval.policies.spatialvla.action_tokens import to_tokens
 from vla_eval.policies.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
@@ -157,7 +163,6 @@ class TestConfiguration:
             ({"camera_fov_rad": 90.0}, r"radians in \(0, π\)"),
             ({"sizes": {"lm_width": 64}}, "Did you mean 'llm_width'"),
             ({"pictures": []}, "pictures is empty"),
-            ({"pictures": ["observation.images.bas"]}, "Did you mean 'observation.images.base'"),
             ({"action_grid": "kept"}, "no base with a grid"),
         ],
     )
@@ -166,6 +171,10 @@ class TestConfiguration:
     ) -> None:
         with pytest.raises(RecipeError, match=message):
             tiny(recorded, **fields)
+
+    def test_a_mistyped_picture_is_named(self, recorded: Path) -> None:
+        with pytest.raises(UnknownNameError, match=r"Did you mean 'observation\.images\.base'"):
+            tiny(recorded, pictures=["observation.images.bas"])
 
     def test_a_policy_without_a_grid_is_refused(self, recorded: Path) -> None:
         config = tiny(recorded)[0].config

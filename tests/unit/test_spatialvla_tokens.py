@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.unit import spatialvla_golden as golden
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.policies.spatialvla.action_grid import (
     AXES,
     LEAST_SIGMA,
@@ -193,5 +193,5 @@ class TestRefit:
     ],
 )
 def test_sizes_that_cannot_be_are_named(changes: dict[str, int], message: str) -> None:
-    with pytest.raises(RecipeError, match=message):
+    with pytest.raises(UnknownNameError if "Did you mean" in message else RecipeError, match=message):
         network_sizes(changes)

@@ -16,7 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vla_eval.cache import cache_dir
 from vla_eval.core import ImageArray
 from vla_eval.data.frame_cache import EpisodeRows, FrameSource, frames_in_memory, frames_on_disk
-from vla_eval.errors import DatasetError, unknown_name
+from vla_eval.errors import DatasetError, check_names
 
 Storage = Literal["disk", "memory"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
@@ -65,9 +65,7 @@ class MemoryDataset(torch.utils.data.Dataset[Sample]):
         self._transforms: Callable[[Any], Any] | None = reader._image_transforms
         self._return_uint8 = bool(reader._return_uint8)
         self._columns = read_columns(source)
-        for key in self._deltas or ():
-            if key not in source.meta.features:
-                raise unknown_name("field", key, source.meta.features, where="delta_timestamps")
+        check_names("field", self._deltas or (), source.meta.features, where="delta_timestamps")
         self._bounds, frame_source = frame_layout(source, self._columns)
         self._files: dict[str, Path] = {}
         self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share

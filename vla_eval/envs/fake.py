@@ -22,7 +22,7 @@ from vla_eval.core import (
     TaskStatus,
 )
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
-from vla_eval.errors import unknown_name
+from vla_eval.errors import check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
@@ -99,9 +99,7 @@ class FakeEnv:
         check_arguments(task, settings.kwargs, TASKS.values())
         defaults = _defaults(task)
         known = ("horizon_steps", *defaults)
-        for name in settings.kwargs:
-            if name not in known:
-                raise unknown_name("argument", name, known, where=task.id)
+        check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
         self._n_items: int = arguments.get("n_items", 0)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)

@@ -24,7 +24,7 @@ from vla_eval.core import (
     TaskStatus,
 )
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
-from vla_eval.errors import RenderingError, TaskArgumentError, unknown_name
+from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.arms import CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -84,9 +84,7 @@ class ManiSkillEnv:
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
         _check_arguments(env_class(row), kwargs, row.id)
-        for camera in settings.cameras:
-            if camera not in {known.name for known in CAMERAS}:
-                raise unknown_name("camera", camera, [c.name for c in CAMERAS], where=row.id)
+        check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
         self._settings = settings
         self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
         batched = settings.sim_backend == "gpu"
@@ -266,9 +264,7 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
     # The sentence is chosen by the prompt set; and an episode that depends on those before it is nothing
     # to ask for.
     known -= {"instruction", "reconfiguration_freq"}
-    for name in kwargs:
-        if name not in known:
-            raise unknown_name("argument", name, known, where=task)
+    check_names("argument", kwargs, known, where=task)
 
 
 def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> int:

@@ -14,7 +14,13 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.data.frame_table import read_columns
-from vla_eval.errors import RecipeError, SpecMismatchError, VlaEvalError, did_you_mean, unknown_name
+from vla_eval.errors import (
+    RecipeError,
+    SpecMismatchError,
+    VlaEvalError,
+    check_names,
+    did_you_mean,
+)
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
 from vla_eval.training.dataset import TrainingDataset
@@ -41,9 +47,7 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     """
     cls = config_class(recipe.type, where="finetune.type")
     known = [field.name for field in dataclasses.fields(cls)]
-    for name in recipe.policy:
-        if name not in known:
-            raise unknown_name("field", name, known, where=f"finetune.policy ({recipe.type})")
+    check_names("field", recipe.policy, known, where=f"finetune.policy ({recipe.type})")
     data: dict[str, Any] = {}
     if recipe.base_checkpoint is not None:
         data = _base_config(recipe)

@@ -7,7 +7,7 @@ import numpy as np
 
 from vla_eval.core import FloatArray
 from vla_eval.envs.settings import Simulator
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError, check_names
 
 ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")  # of pd_ee_delta_pose
 
@@ -60,9 +60,7 @@ class PpoSettings:
 
     def __post_init__(self) -> None:
         """Check that the dimensions are some of the action's."""
-        for name in self.learned_dims:
-            if name not in ACTION_DIMS:
-                raise unknown_name("dimension of the action", name, ACTION_DIMS)
+        check_names("dimension of the action", self.learned_dims, ACTION_DIMS)
         if not self.learned_dims or len(set(self.learned_dims)) != len(self.learned_dims):
             raise RecipeError(
                 f"learned_dims is {self.learned_dims}, expected at least one, none of them twice."

@@ -7,6 +7,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.errors import check_names
 from vla_eval.policies.memory.sizes import SPOTS, STATE
 
 TYPE = "mikasa_memory"
@@ -110,12 +111,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
                 f"'{TYPE}' needs the state 'eef' of {STATE} numbers, found {self.robot_state_feature.shape}: "
                 "record with state: eef"
             )
-        unknown = sorted(set(self.arm_cameras) - set(self.image_features))
-        if unknown:
-            raise ValueError(
-                f"'{TYPE}': arm_cameras names {unknown}, the pictures are {sorted(self.image_features)}: set "
-                "policy.arm_cameras to those whose camera is on the arm ([] if none is)"
-            )
+        check_names("picture", self.arm_cameras, self.image_features, where=f"policy.arm_cameras ({TYPE})")
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
             raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")

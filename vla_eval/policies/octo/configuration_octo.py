@@ -7,6 +7,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from vla_eval.data.features import ACTION_KEY
+from vla_eval.errors import check_names
 from vla_eval.policies.octo.diffusion_head import HeadSizes
 from vla_eval.policies.octo.language import T5Sizes
 from vla_eval.policies.octo.transformer import PATCH_PX, TransformerSizes
@@ -139,12 +140,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         """Check the fields of the dataset."""
         if self.action_feature is None:
             raise ValueError(f"'{TYPE}' needs the field action")
-        missing = [key for key in self.cameras.values() if key not in self.image_features]
-        if missing:
-            raise ValueError(
-                f"'{TYPE}' needs the images {', '.join(missing)} (there are: "
-                f"{', '.join(self.image_features) or 'none'}); name others with `cameras`"
-            )
+        check_names("picture", self.cameras.values(), self.image_features, where=f"policy.cameras ({TYPE})")
 
     reads_state = False  # the published checkpoints have no proprioception
     masks_history = True  # our adapter tells it which frames lie before the episode

@@ -9,7 +9,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
-from vla_eval.errors import RecipeError, did_you_mean, unknown_name
+from vla_eval.errors import RecipeError, check_names, unknown_name
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, network_sizes
 from vla_eval.policies.steps.gripper import Gripper
@@ -110,7 +110,7 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         super().__post_init__()
         for name, value, known in (("head", self.head, HEADS), ("dtype", self.dtype, DTYPES)):
             if value not in known:
-                raise RecipeError(str(unknown_name(name, value, known, where=TYPE)))
+                raise unknown_name(name, value, known, where=TYPE)
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise RecipeError(
                 f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
@@ -125,12 +125,7 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
             raise RecipeError(f"'{TYPE}' needs pictures and an action.")
         if self.use_proprio and self.robot_state_feature is None:
             raise RecipeError(f"'{TYPE}' with use_proprio needs {STATE_KEY}.")
-        for name in self.pictures:
-            if name not in self.image_features:
-                raise RecipeError(
-                    f"'{TYPE}': pictures names '{name}', which the dataset does not have."
-                    f"{did_you_mean(name, self.image_features)}"
-                )
+        check_names("picture", self.pictures, self.image_features, where=f"policy.pictures ({TYPE})")
 
     @property
     def picture_fields(self) -> tuple[str, ...]:

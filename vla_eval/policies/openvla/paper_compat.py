@@ -22,7 +22,7 @@ import torch
 from PIL import Image
 
 from vla_eval.core import ActionChunk, EpisodeStart, ImageArray, Observation, ObservationWindow
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.steps.gripper import Gripper
@@ -83,12 +83,10 @@ def make_openvla(
         args: of `make_lerobot`.
 
     Raises:
-        RecipeError: there is no such switch.
+        UnknownNameError: there is no such switch.
         CheckpointError, SpecMismatchError: see `make_lerobot`.
     """
-    for name in paper_compat:
-        if name not in SWITCHES:
-            raise RecipeError(str(unknown_name("switch", name, SWITCHES, where="args.paper_compat")))
+    check_names("switch", paper_compat, SWITCHES, where="args.paper_compat")
     policy = make_lerobot(context, **args)
     n_action_steps = context.chunking.n_action_steps
     if "last_k_queue" in paper_compat and context.chunking.min_chunk_size != n_action_steps:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError, check_names
 
 Head = Literal["l1", "parallel_tokens", "tokens"]
 N_BINS = 256
@@ -107,10 +107,9 @@ def network_sizes(changes: Mapping[str, int]) -> NetworkSizes:
     """Return the published sizes with some of them changed.
 
     Raises:
-        RecipeError: there is no such size, or a value is impossible.
+        UnknownNameError: there is no such size.
+        RecipeError: a value is impossible.
     """
     known = [field.name for field in dataclasses.fields(NetworkSizes)]
-    for name in changes:
-        if name not in known:
-            raise RecipeError(str(unknown_name("size", name, known, where="finetune.policy.sizes")))
+    check_names("size", changes, known, where="finetune.policy.sizes")
     return NetworkSizes(**changes)

@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS
-from vla_eval.errors import RecipeError, did_you_mean, unknown_name
+from vla_eval.errors import RecipeError, check_names, unknown_name
 from vla_eval.policies.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,
@@ -136,7 +136,7 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
             ("dtype", self.dtype, DTYPES),
         ):
             if value not in known:
-                raise RecipeError(str(unknown_name(name, value, known, where=TYPE)))
+                raise unknown_name(name, value, known, where=TYPE)
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise RecipeError(
                 f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
@@ -159,12 +159,7 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
                 f"'{TYPE}' tells translation, rotation and gripper: expected actions of {N_ACTION} numbers, "
                 f"found shape {found}."
             )
-        for name in self.pictures:
-            if name not in self.image_features:
-                raise RecipeError(
-                    f"'{TYPE}': pictures names '{name}', which the dataset does not have."
-                    f"{did_you_mean(name, self.image_features)}"
-                )
+        check_names("picture", self.pictures, self.image_features, where=f"policy.pictures ({TYPE})")
 
     @property
     def reads_state(self) -> bool:
