@@ -1,0 +1,48 @@
+"""What an unattended run writes into its log: how far it has come, and how long the rest takes."""
+
+import pytest
+
+from vla_eval.cli.episode_bar import EpisodeBar
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.seconds = 100.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def test_a_line_tells_what_is_left_at_the_rate_of_this_start(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    bar = EpisodeBar(clock=clock)
+    bar.begin(n_done=10, n_total=50, title="RememberColor3-v0")
+    bar.advance(n_done=14, note="success 0.50, errors 0")
+    clock.seconds += 59
+    bar.tick()
+    assert capsys.readouterr().err == ""
+    clock.seconds += 61
+    bar.tick()
+    # 4 episodes in 2 minutes; the 10 of before took none of them. 36 are left.
+    assert capsys.readouterr().err == (
+        "RememberColor3-v0: 14/50 episodes after 2.0 min, 2.0 per minute, 18.0 min left, "
+        "success 0.50, errors 0\n"
+    )
+
+
+def test_the_end_is_told_once_and_nothing_is_left(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    bar = EpisodeBar(clock=clock)
+    bar.begin(n_done=0, n_total=2)
+    bar.advance(n_done=2)
+    clock.seconds += 60
+    bar.close()
+    bar.close()
+    assert capsys.readouterr().err == "2/2 episodes after 1.0 min, 2.0 per minute\n"
+
+
+def test_where_nothing_was_done_nothing_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = EpisodeBar(clock=Clock())
+    bar.begin(n_done=2, n_total=2)
+    bar.close()
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,83 @@
+"""How many episodes are done: a bar on a terminal, elsewhere now and then a line."""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from tqdm import tqdm
+
+LINE_EVERY_SECONDS = 60.0
+
+
+class EpisodeBar:
+    """Shows on standard error how far it has come, and how long the rest will take at this rate.
+
+    Args:
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._bar: tqdm[Any] | None = None
+        self._title = self._note = ""
+        self._n_done = self._n_before = self._n_total = 0
+        self._begun = self._last_line = clock()
+
+    def begin(self, *, n_done: int, n_total: int, title: str = "") -> None:
+        """Begin anew, with `n_done` episodes that were there before."""
+        self.close()
+        self._title, self._note = title, ""
+        self._n_done = self._n_before = n_done
+        self._n_total = n_total
+        self._begun = self._last_line = self._clock()
+        if sys.stderr.isatty():
+            self._bar = tqdm(
+                total=n_total,
+                initial=n_done,
+                desc=title or None,
+                unit="ep",
+                file=sys.stderr,
+                dynamic_ncols=True,
+            )
+
+    def advance(self, *, n_done: int, note: str = "") -> None:
+        """Count; `note` says how it goes."""
+        moved, self._n_done, self._note = n_done - self._n_done, n_done, note
+        if self._bar is not None:
+            self._bar.update(moved)
+            self._bar.set_postfix_str(note)
+
+    def tick(self) -> None:
+        """Write a line if it is time and there is no bar."""
+        if self._bar is None and self._clock() - self._last_line >= LINE_EVERY_SECONDS:
+            self._line()
+
+    def close(self) -> None:
+        """Write how far it has come, if it has."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        elif self._n_done > self._n_before:
+            self._line()
+        self._n_before = self._n_done
+
+    def write(self, text: str) -> None:
+        """Write a sentence above the bar."""
+        tqdm.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+    def _line(self) -> None:
+        self._last_line = self._clock()
+        minutes = (self._last_line - self._begun) / 60
+        per_minute = (self._n_done - self._n_before) / max(minutes, 1e-9)
+        n_left = self._n_total - self._n_done
+        parts = [
+            f"{self._n_done}/{self._n_total} episodes after {minutes:.1f} min",
+            f"{per_minute:.1f} per minute",
+        ]
+        if n_left and per_minute > 0:
+            parts.append(f"{n_left / per_minute:.1f} min left")
+        if self._note:
+            parts.append(self._note)
+        self.write((f"{self._title}: " if self._title else "") + ", ".join(parts))
