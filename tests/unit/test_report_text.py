@@ -4,6 +4,7 @@ import argparse
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +13,8 @@ import pytest
 
 from tests.unit.stored_runs import episode, episodes, stored
 from vla_eval.cli import report as report_verb
-from vla_eval.errors import UnknownNameError
-from vla_eval.results.report import FORMATS, Table, build_table, render
+from vla_eval.errors import ReportError, UnknownNameError
+from vla_eval.results.report import FORMATS, Format, Table, build_table, render
 from vla_eval.results.store import RunFolder
 
 # ------------------------------------------------------------------------------- formats
@@ -29,6 +30,32 @@ def test_markdown_columns_are_aligned() -> None:
     assert len({len(line) for line in lines}) == 1
     positions = [[i for i, char in enumerate(line) if char == "|"] for line in lines]
     assert all(found == positions[0] for found in positions)
+
+
+@pytest.mark.parametrize("fmt", ["markdown", "latex"])
+def test_only_the_columns_that_were_asked_for_are_shown_in_their_order(fmt: Format) -> None:
+    head = next(line for line in render(a_table(), fmt, columns=["K", "policy"]).splitlines() if "K" in line)
+    assert re.findall(r"\w+", head) == ["K", "policy"]
+
+
+def test_columns_that_are_mistyped_or_of_no_use_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'success'"):
+        render(a_table(), "markdown", columns=["policy", "succes"])
+    with pytest.raises(ReportError, match="csv holds every column"):
+        render(a_table(), "csv", columns=["policy"])
+
+
+def test_the_help_names_every_column(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UnknownNameError) as error:
+        render(a_table(), "markdown", columns=["?"])
+    known = re.search(r"Known: (.*)\.", str(error.value))
+    assert known is not None
+    parser = argparse.ArgumentParser()
+    report_verb.add_parser(parser.add_subparsers())
+    with pytest.raises(SystemExit):
+        parser.parse_args(["report", "--help"])
+    told = capsys.readouterr().out.partition("latex:")[2].partition("--html")[0]
+    assert sorted(told.split()) == sorted(known[1].split(", "))
 
 
 def test_json_holds_every_column_and_null_where_undefined() -> None:

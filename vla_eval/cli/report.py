@@ -33,6 +33,14 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
     parser.add_argument(
+        "--columns",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="only these, in this order, in markdown or latex: task policy K variant episodes errors success "
+        "at_end first_choice steps inferences difference chance ceiling corrected",
+    )
+    parser.add_argument(
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
     )
     parser.add_argument(
@@ -55,12 +63,14 @@ def run(args: argparse.Namespace) -> int:
         from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
 
-        if args.paper or args.format != "markdown":
-            raise ReportError("--html writes a page, which --format and --paper say nothing of. Drop them.")
+        if args.paper or args.columns or args.format != "markdown":
+            raise ReportError(
+                "--html writes a page, which --format, --columns and --paper say nothing of. Drop them."
+            )
         print(write_page(runs, args.html, baseline=args.baseline))
         return 0
     table = build_table(runs, baseline=args.baseline)
-    print(render(table, args.format, paper=args.paper))
+    print(render(table, args.format, paper=args.paper, columns=args.columns))
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from typing import Literal, NamedTuple, get_args
 
+from vla_eval.errors import ReportError, check_names
 from vla_eval.results import paper_table
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
@@ -23,37 +24,43 @@ PAPER_TITLE = f"The paper's figures, not measured here ({paper_table.PROTOCOL})"
 
 
 class Column(NamedTuple):
-    """One column of the printed table."""
+    """One column of the printed table; `--columns` calls it by its name."""
 
+    name: str
     title: str
     cell: Callable[[Row], str]
     is_number: bool = True
 
 
-def render(table: Table, fmt: Format, *, paper: bool = False) -> str:
+def render(table: Table, fmt: Format, *, paper: bool = False, columns: Sequence[str] = ()) -> str:
     """Write the table.
 
     Args:
         table: what `build_table` returned.
         fmt: `markdown` and `latex` are to be read, `csv` and `json` hold every column in full precision.
         paper: add the paper's figures for the same tasks, marked as such and apart from one's own.
+        columns: names of those to be shown in the formats that are to be read, in this order; none: all.
 
     Returns:
         The text, without a newline at its end.
+
+    Raises:
+        UnknownNameError: there is no such column.
+        ReportError: columns are chosen for a format that holds all.
     """
     figures = _paper_figures(table) if paper else None
-    writers: dict[Format, Callable[[Table, Sequence[PaperFigure] | None], str]] = {
-        "markdown": _markdown,
-        "csv": _csv,
-        "json": _json,
-        "latex": _latex,
-    }
-    return writers[fmt](table, figures)
+    if fmt == "markdown":
+        return _markdown(table, _chosen(table, columns), figures)
+    if fmt == "latex":
+        return _latex(table, _chosen(table, columns), figures)
+    if columns:
+        raise ReportError(f"--columns: {fmt} holds every column. Leave it out, or use markdown or latex.")
+    return (_csv if fmt == "csv" else _json)(table, figures)
 
 
 def table_cells(table: Table) -> tuple[list[Column], list[list[str]]]:
     """Return the columns that are to be read, and each row's cells."""
-    columns = _columns(table)
+    columns = _chosen(table, ())
     return columns, [[column.cell(row) for column in columns] for row in table.rows]
 
 
@@ -65,24 +72,33 @@ def _paper_figures(table: Table) -> list[PaperFigure]:
 # ------------------------------------------------------------------------------------------ cells
 
 
+def _chosen(table: Table, names: Sequence[str]) -> list[Column]:
+    """Return the columns of these names, or all: `variant` only where there is more than one."""
+    by_name = {column.name: column for column in _columns(table)}
+    check_names("column", names, by_name, where="--columns")
+    if not names and not any(row.variant for row in table.rows):
+        del by_name["variant"]
+    return [by_name[name] for name in names or by_name]
+
+
 def _columns(table: Table) -> list[Column]:
-    variant = [Column("variant", lambda row: row.variant or UNDEFINED, False)]
+    baseline = f"vs {table.baseline}" if table.baseline else "vs baseline"
     return [
-        Column("task", lambda row: row.task, False),
-        Column("policy", lambda row: row.policy, False),
-        Column("K", lambda row: str(row.n_action_steps)),
-        *(variant if any(row.variant for row in table.rows) else []),
-        Column("episodes", _episodes),
-        Column("errors", lambda row: str(row.n_errors)),
-        Column("success once", _success_once),
-        Column("at end", lambda row: _rate(row.success_at_end)),
-        Column("1st choice", lambda row: _rate(row.first_choice_success)),
-        Column("steps", lambda row: _count(row.mean_success_step)),
-        Column("infer.", lambda row: _count(row.inferences_per_episode)),
-        Column(f"vs {table.baseline}" if table.baseline else "vs baseline", _difference),
-        Column("chance", _chance),
-        Column("ceiling", lambda row: _rate(row.ceiling)),
-        Column("corrected", lambda row: _rate(row.chance_corrected)),
+        Column("task", "task", lambda row: row.task, False),
+        Column("policy", "policy", lambda row: row.policy, False),
+        Column("K", "K", lambda row: str(row.n_action_steps)),
+        Column("variant", "variant", lambda row: row.variant or UNDEFINED, False),
+        Column("episodes", "episodes", _episodes),
+        Column("errors", "errors", lambda row: str(row.n_errors)),
+        Column("success", "success once", _success_once),
+        Column("at_end", "at end", lambda row: _rate(row.success_at_end)),
+        Column("first_choice", "1st choice", lambda row: _rate(row.first_choice_success)),
+        Column("steps", "steps", lambda row: _count(row.mean_success_step)),
+        Column("inferences", "infer.", lambda row: _count(row.inferences_per_episode)),
+        Column("difference", baseline, _difference),
+        Column("chance", "chance", _chance),
+        Column("ceiling", "ceiling", lambda row: _rate(row.ceiling)),
+        Column("corrected", "corrected", lambda row: _rate(row.chance_corrected)),
     ]
 
 
@@ -133,8 +149,7 @@ NOT_IN_PAPER = "The paper's table of VLA models has none of these tasks."
 # ------------------------------------------------------------------------------------------ formats
 
 
-def _markdown(table: Table, figures: Sequence[PaperFigure] | None) -> str:
-    columns = _columns(table)
+def _markdown(table: Table, columns: Sequence[Column], figures: Sequence[PaperFigure] | None) -> str:
     parts = [
         _markdown_table(
             [column.title for column in columns],
@@ -229,8 +244,7 @@ _LATEX = str.maketrans(
 )
 
 
-def _latex(table: Table, figures: Sequence[PaperFigure] | None) -> str:
-    columns = _columns(table)
+def _latex(table: Table, columns: Sequence[Column], figures: Sequence[PaperFigure] | None) -> str:
     lines = ["% needs \\usepackage{booktabs}"]
     lines += _latex_table(
         [column.title for column in columns],
