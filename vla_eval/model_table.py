@@ -1,6 +1,6 @@
 """A table of learned policies: which fine-tunings and evaluations it takes, and where each of them lies.
 
-`configs/paper_vla_table.yaml` is one. A row is a policy at its own number of action steps; it is fine-tuned
+`configs/paper_vla_table.yaml` is one. A row is a policy at its own numbers of action steps; it is fine-tuned
 for each task and run seed by itself, and each such checkpoint is evaluated on the same seeds. Nothing is run
 here. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait for torch.
 """
@@ -13,12 +13,12 @@ from typing import Any, Literal, NamedTuple
 import yaml
 
 from vla_eval.envs.settings import Simulator
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.recipes import EvalConfig, PolicyRecipe, check_run_name, load_recipe, recipe_fields
 from vla_eval.results.durable import replace_file
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.training.recipe import FinetuneConfig
+from vla_eval.training.recipe import FinetuneConfig, merge_fields
 
 Trained = Literal["all", "adapters", "heads"]
 
@@ -33,31 +33,54 @@ SUSTAINED_TFLOPS = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TableRow:
-    """One row: a policy at one number of action steps.
+class StepCost:
+    """What tells the operations of a training step.
 
     Attributes:
-        name: what the table calls it.
-        policy: recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`.
-        n_action_steps: actions executed per inference.
-        parameters: weights that each sample goes through; for the estimate of GPU hours.
-        tokens: of a sample, likewise.
-        trained: likewise.
+        parameters: weights that each sample goes through.
+        tokens: of a sample.
+        trained: which of the weights are.
     """
 
-    name: str
-    policy: str
-    n_action_steps: int
     parameters: float
     tokens: int
     trained: Trained
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_run_name(self.name)
-        for name in ("n_action_steps", "parameters", "tokens"):
+        for name in ("parameters", "tokens"):
             if getattr(self, name) < 1:
-                raise RecipeError(f"row {self.name}: {name} is {getattr(self, name)}, expected ≥ 1.")
+                raise RecipeError(f"cost: {name} is {getattr(self, name)}, expected ≥ 1.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableRow:
+    """One row: a policy at one or more numbers of action steps.
+
+    Attributes:
+        name: what the table calls it.
+        policy: recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`.
+        n_action_steps: actions executed per inference; each checkpoint is evaluated at all of them.
+        tasks: those of the table's tasks that the row is for; None: all.
+        finetune: fields of the recipe's `finetune` section that are set to other values in this row.
+        cost: what a training step costs, for the estimate of GPU hours; None where it is small.
+    """
+
+    name: str
+    policy: str
+    n_action_steps: tuple[int, ...]
+    tasks: tuple[str, ...] | None = None
+    finetune: dict[str, Any] | None = None  # Any: decoded with the row's recipe
+    cost: StepCost | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_run_name(self.name)
+        steps = self.n_action_steps
+        if not steps or len(set(steps)) != len(steps) or min(steps) < 1:
+            raise RecipeError(
+                f"row {self.name}: n_action_steps is {list(steps)}, expected numbers ≥ 1, none of them twice."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,13 +88,14 @@ class ModelTable:
     """`configs/*.yaml` with `rows`: a table of learned policies. `docs/paper_table.md` explains it.
 
     Attributes:
-        tasks: task ids; each row is fine-tuned for each of them.
+        tasks: task ids; each row is fine-tuned for each of them, but for rows that name their own.
         datasets: folder with one dataset per task, named like the task.
-        steps: gradient steps of each fine-tuning.
+        steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
         run_seeds: one fine-tuning each; the SEM is over them.
         episodes, seed_start: of each evaluation.
         controls: scripted policies beside the rows, at every number of action steps of a row.
         simulator: what the evaluations run on.
+        stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
         allow_unreplayed: see `FinetuneConfig`.
     """
@@ -80,22 +104,23 @@ class ModelTable:
     tasks: tuple[str, ...]
     datasets: str
     rows: tuple[TableRow, ...]
-    steps: int
+    steps: int | None = None
     description: str = ""
     run_seeds: tuple[int, ...] = (0,)
     episodes: int = 100
     seed_start: int = 1
     controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
     simulator: Simulator = "maniskill"
+    stop_at_success: bool = False
     finetune: dict[str, Any] | None = None  # Any: decoded with each row's recipe
     allow_unreplayed: bool = False
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
         check_run_name(self.name)
-        for name in ("steps", "episodes"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        for name, value in (("steps", self.steps), ("episodes", self.episodes)):
+            if value is not None and value < 1:
+                raise RecipeError(f"{name} is {value}, expected a number ≥ 1.")
         for name, values in (
             ("tasks", self.tasks),
             ("rows", [row.name for row in self.rows]),
@@ -107,6 +132,12 @@ class ModelTable:
             raise RecipeError("rows and controls share a name; records tell them apart by it.")
         for task in self.tasks:
             task_spec(task)
+        for row in self.rows:
+            check_names("task", row.tasks or (), self.tasks, where=f"row {row.name}")
+
+    def rows_of(self, task: str) -> tuple[TableRow, ...]:
+        """Return the rows that a task has."""
+        return tuple(row for row in self.rows if row.tasks is None or task in row.tasks)
 
 
 class Finetuning(NamedTuple):
@@ -148,12 +179,16 @@ def finetunings(table: ModelTable, out: Path) -> tuple[Finetuning, ...]:
                 dataset=str(Path(table.datasets) / task),
                 out=str(_training_folder(out, row, task, run_seed)),
                 run_seed=run_seed,
-                finetune={"steps": table.steps, **(table.finetune or {})},
+                finetune=merge_fields(
+                    {**({} if table.steps is None else {"steps": table.steps}), **(table.finetune or {})},
+                    row.finetune or {},
+                ),
                 allow_unreplayed=table.allow_unreplayed,
             ),
         )
         for row in table.rows
         for task in table.tasks
+        if row in table.rows_of(task)
         for run_seed in table.run_seeds
     )
 
@@ -167,8 +202,8 @@ def evaluations(
 ) -> Iterator[tuple[Path, EvalConfig]]:
     """Yield run folder and configuration of every evaluation: the controls first, then task by task.
 
-    The recipes that name the checkpoints are written to `out`: a row keeps its name and its number of action
-    steps, wherever its weights lie.
+    Rows with the same numbers of action steps share a run folder. The recipes that name the checkpoints are
+    written to `out`: a row keeps its name, wherever its weights lie.
 
     Args:
         table: what to evaluate.
@@ -177,18 +212,21 @@ def evaluations(
     """
     if table.controls:
         # Chance and ceiling are those of the same number of action steps.
-        steps = tuple(sorted({row.n_action_steps for row in table.rows}))
-        config = _evaluation(table, "controls", table.tasks, table.controls, n_action_steps=steps)
+        every = tuple(sorted({steps for row in table.rows for steps in row.n_action_steps}))
+        config = _evaluation(table, "controls", table.tasks, table.controls, every)
         yield out / "evaluation" / config.name, config
     own = adapters or {}
     for task in table.tasks:
         for run_seed in table.run_seeds:
-            name = f"{task}-run-{run_seed}"
-            recipes = [
-                _write_recipe(table, out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
-                for row in table.rows
-            ]
-            yield out / "evaluation" / name, _evaluation(table, name, (task,), recipes)
+            rows = table.rows_of(task)
+            for steps in dict.fromkeys(row.n_action_steps for row in rows):
+                name = f"{task}-run-{run_seed}-k{'-'.join(map(str, steps))}"
+                recipes = [
+                    _write_recipe(out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
+                    for row in rows
+                    if row.n_action_steps == steps
+                ]
+                yield out / "evaluation" / name, _evaluation(table, name, (task,), recipes, steps)
 
 
 def _evaluation(
@@ -196,7 +234,7 @@ def _evaluation(
     name: str,
     tasks: Sequence[str],
     policies: Sequence[str],
-    n_action_steps: tuple[int, ...] | None = None,
+    n_action_steps: tuple[int, ...],
 ) -> EvalConfig:
     return EvalConfig(
         name=name,
@@ -206,17 +244,18 @@ def _evaluation(
         episodes=table.episodes,
         seed_start=table.seed_start,
         simulator=table.simulator,
+        stop_at_success=table.stop_at_success,
     )
 
 
-def _write_recipe(table: ModelTable, out: Path, row: TableRow, task: str, run_seed: int, adapter: str) -> str:
+def _write_recipe(out: Path, row: TableRow, task: str, run_seed: int, adapter: str) -> str:
     folder = out / "policies" / f"{task}-run-{run_seed}"
     recipe = {
         "version": 1,
-        "description": f"{row.policy}, fine-tuned on {task} for {table.steps} steps, run seed {run_seed}.",
+        "description": f"{row.policy}, fine-tuned on {task}, run seed {run_seed}.",
         "adapter": adapter,
         "args": {"checkpoint": str(_training_folder(out, row, task, run_seed))},
-        "default_n_action_steps": row.n_action_steps,
+        "default_n_action_steps": row.n_action_steps[0],
         "max_workers": load_recipe("policies", row.policy, PolicyRecipe).value.max_workers,
     }
     path = folder / f"{row.name}.yaml"
@@ -225,8 +264,8 @@ def _write_recipe(table: ModelTable, out: Path, row: TableRow, task: str, run_se
     return str(path)
 
 
-def gpu_hours(row: TableRow, *, steps: int) -> float:
-    """Return a rough estimate of one fine-tuning's GPU hours, from operations alone.
+def gpu_hours(row: TableRow, *, steps: int | None) -> float | None:
+    """Return a rough estimate of one fine-tuning's GPU hours, from operations alone; None without a cost.
 
     Operations of a step over `SUSTAINED_TFLOPS`; loading and decoding are not counted. Good for telling a
     day from a month.
@@ -234,19 +273,27 @@ def gpu_hours(row: TableRow, *, steps: int) -> float:
     recipe = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
     if recipe is None:
         raise RecipeError(f"policies/{row.policy}.yaml has no section `finetune`: there is nothing to train.")
-    per_step = FLOPS_PER_WEIGHT_AND_TOKEN[row.trained] * row.parameters * row.tokens * recipe.batch_size
-    return per_step * steps / (SUSTAINED_TFLOPS * 1e12) / 3600
+    if row.cost is None:
+        return None
+    of_a_sample = FLOPS_PER_WEIGHT_AND_TOKEN[row.cost.trained] * row.cost.parameters * row.cost.tokens
+    operations = of_a_sample * recipe.batch_size * (steps or recipe.steps)
+    return operations / (SUSTAINED_TFLOPS * 1e12) / 3600
 
 
 def describe_effort(table: ModelTable, *, n_finished: int) -> str:
     """Return what is ahead, for a person."""
-    n_all = len(table.rows) * len(table.tasks) * len(table.run_seeds)
+    every = finetunings(table, Path())
+    told = (
+        f"{table.name}: {len(every)} fine-tunings ({len(table.rows)} rows, {len(table.tasks)} tasks, "
+        f"{len(table.run_seeds)} run seeds), {n_finished} of them finished."
+    )
     per_row = {row.name: gpu_hours(row, steps=table.steps) for row in table.rows}
-    total = sum(per_row.values()) * len(table.tasks) * len(table.run_seeds)
-    each = ", ".join(f"{name} {hours:.2g}" for name, hours in per_row.items())
+    known = {name: hours for name, hours in per_row.items() if hours is not None}
+    if not known:
+        return told
+    total = sum(known.get(one.row.name, 0.0) for one in every)
+    each = ", ".join(f"{name} {hours:.2g}" for name, hours in known.items())
     return (
-        f"{table.name}: {n_all} fine-tunings ({len(table.rows)} rows, {len(table.tasks)} tasks, "
-        f"{len(table.run_seeds)} run seeds), {n_finished} of them finished. All of them take about "
-        f"{total:.0f} GPU hours at {SUSTAINED_TFLOPS} TFLOP/s (operations only, an assumption and no "
-        f"measurement; each: {each})."
+        f"{told} All of them take about {total:.0f} GPU hours at {SUSTAINED_TFLOPS} TFLOP/s (operations "
+        f"only, an assumption and no measurement; each: {each})."
     )

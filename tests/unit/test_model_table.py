@@ -15,6 +15,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import VlaEvalError
 from vla_eval.model_table import (
+    describe_effort,
     evaluations,
     finetunings,
     gpu_hours,
@@ -31,6 +32,7 @@ from vla_eval.tasks.catalog import task_spec
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
+ROW = {"name": "one", "policy": "act", "n_action_steps": [4]}
 USED = {
     "eval": {
         "out",
@@ -70,7 +72,7 @@ def changed(small: Path, **changes: Any) -> Path:
 
 def test_the_papers_table_is_five_rows_on_five_tasks_in_three_runs() -> None:
     table = load_model_table(PAPER)
-    assert {(row.n_action_steps) for row in table.rows} == {4, 8} and len(table.rows) == 5
+    assert {row.n_action_steps for row in table.rows} == {(4,), (8,)} and len(table.rows) == 5
     assert set(table.tasks) == {figure.task for figure in PAPER_TABLE}
     every = finetunings(table, Path("out"))
     assert len(every) == 5 * 5 * 3 and len({one.config.out for one in every}) == 75
@@ -81,19 +83,60 @@ def test_the_papers_table_is_five_rows_on_five_tasks_in_three_runs() -> None:
 def test_each_row_executes_no_more_than_the_chunk_that_its_policy_is_trained_for() -> None:
     for row in load_model_table(PAPER).rows:
         recipe = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
-        assert recipe is not None and recipe.policy["chunk_size"] == row.n_action_steps, row.name
+        assert recipe is not None and recipe.policy["chunk_size"] == row.n_action_steps[0], row.name
 
 
 def test_chance_and_ceiling_are_measured_at_the_number_of_action_steps_of_each_row(tmp_path: Path) -> None:
     configs = dict(evaluations(load_model_table(PAPER), tmp_path))
-    assert len(configs) == 1 + 5 * 3
+    assert len(configs) == 1 + 5 * 3 * 2  # K = 4 and K = 8 in folders of their own
     controls = configs[tmp_path / "evaluation" / "controls"]
     assert controls.n_action_steps == (4, 8) and set(controls.policies) == {"random", "cue_blind", "oracle"}
-    one = configs[tmp_path / "evaluation" / f"{TASK}-run-2"]
-    assert one.tasks == (TASK,) and one.n_action_steps is None
+    one = configs[tmp_path / "evaluation" / f"{TASK}-run-2-k4"]
+    assert one.tasks == (TASK,) and one.n_action_steps == (4,) and len(one.policies) == 4
     recipe = yaml.safe_load(Path(one.policies[0]).read_text())
     assert recipe["args"]["checkpoint"] == str(tmp_path / "training" / "octo_small" / TASK / "run-2")
     assert recipe["default_n_action_steps"] == 4
+
+
+def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their_own(
+    small: Path, tmp_path: Path
+) -> None:
+    other = "InterceptMedium-v0"
+    free = {"policy": {"free_translation": True}}
+    rows: list[dict[str, Any]] = [
+        {"name": "still", "policy": "memory", "n_action_steps": [1, 4, 8], "tasks": [TASK]},
+        {
+            "name": "moving",
+            "policy": "memory",
+            "n_action_steps": [1, 4, 8],
+            "tasks": [other],
+            "finetune": free,
+        },
+        {"name": "plain", "policy": "act", "n_action_steps": [4]},
+    ]
+    fields = {"policy": {"heads": 4}, "num_workers": 0}
+    changes = {"rows": rows, "tasks": [TASK, other], "steps": None, "finetune": fields}
+    table = load_model_table(str(changed(small, **changes)))
+    every = {(one.row.name, one.task): one.config.finetune for one in finetunings(table, tmp_path)}
+    assert every == {
+        ("still", TASK): fields,
+        ("moving", other): {"policy": {"heads": 4, "free_translation": True}, "num_workers": 0},
+        ("plain", TASK): fields,
+        ("plain", other): fields,
+    }
+    told = [
+        (folder.name, config.n_action_steps, [Path(policy).stem for policy in config.policies])
+        for folder, config in evaluations(table, tmp_path)
+    ]
+    assert told == [
+        ("controls", (1, 4, 8), ["random", "cue_blind", "oracle"]),
+        (f"{TASK}-run-0-k1-4-8", (1, 4, 8), ["still"]),
+        (f"{TASK}-run-0-k4", (4,), ["plain"]),
+        (f"{other}-run-0-k1-4-8", (1, 4, 8), ["moving"]),
+        (f"{other}-run-0-k4", (4,), ["plain"]),
+    ]
+    assert "4 fine-tunings" in describe_effort(table, n_finished=0)
+    assert "GPU hours" not in describe_effort(table, n_finished=0)  # nobody said what they cost
 
 
 def test_gpu_hours_count_the_passes_that_training_needs() -> None:
@@ -114,6 +157,10 @@ def test_a_table_is_told_from_an_evaluation() -> None:
         ({"steps": 0}, "steps"),
         ({"controls": ["pi0"]}, "share a name"),
         ({"tasks": ["RememberColour3-v0"]}, "Did you mean"),
+        ({"rows": [{**ROW, "n_action_steps": []}]}, "expected numbers ≥ 1"),
+        ({"rows": [{**ROW, "n_action_steps": [4, 4]}]}, "none of them twice"),
+        ({"rows": [{**ROW, "tasks": ["RememberColor5-v0"]}]}, f"Did you mean '{TASK}'"),
+        ({"rows": [{**ROW, "cost": {"parameters": 0, "tokens": 1, "trained": "all"}}]}, "parameters is 0"),
     ],
 )
 def test_what_makes_no_table_is_refused(small: Path, changes: dict[str, Any], message: str) -> None:
@@ -187,6 +234,21 @@ def test_demonstrations_of_every_task_of_the_table_can_be_recorded_on_the_stand_
     assert record.success_once
 
 
+def test_small_policies_come_to_a_table_at_several_numbers_of_action_steps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = yaml.safe_load(Path("configs/memory_table.yaml").read_text(encoding="utf-8"))
+    path = tmp_path / "memory.yaml"
+    path.write_text(yaml.safe_dump(data | {"tasks": [TASK]}), encoding="utf-8")
+    assert main(["eval", str(path), "--tiny", "--format", "json", "--out", str(tmp_path / "out")]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    names = ("random", "cue_blind", "oracle", "memory", "memoryless", "act")
+    assert {(row["policy"], row["n_action_steps"]) for row in rows} == {
+        (name, steps) for name in names for steps in (1, 4, 8)
+    }
+    assert all(row["n_episodes"] == 2 and row["n_errors"] == 0 for row in rows)
+
+
 @pytest.mark.slow
 def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_figures(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -196,7 +258,7 @@ def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_fig
     first = capsys.readouterr()
     told = json.loads(first.out)
     rows = {(row["policy"], row["n_action_steps"]) for row in told["rows"]}
-    models = {(row.name, row.n_action_steps) for row in load_model_table(PAPER).rows}
+    models = {(row.name, row.n_action_steps[0]) for row in load_model_table(PAPER).rows}
     controls = {(name, n) for name in ("random", "cue_blind", "oracle") for n in (4, 8)}
     assert rows == models | controls
     assert len(told["paper"]["rows"]) == 5

@@ -171,7 +171,9 @@ class TestFinding:
         for name in list_recipes("policies"):
             assert load_recipe("policies", name, PolicyRecipe).value.description
         tables = [name for name in list_recipes("configs") if is_model_table(name)]
-        assert tables == [load_model_table(name).name for name in tables] == ["paper_vla_table"]
+        assert (
+            tables == [load_model_table(name).name for name in tables] == ["memory_table", "paper_vla_table"]
+        )
         for name in list_recipes("configs").keys() - set(tables):
             loaded = load_recipe("configs", name, EvalConfig).value
             assert loaded.name == name

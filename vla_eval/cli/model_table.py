@@ -155,12 +155,13 @@ def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
 
 
 def _unfinished(work: _Work) -> list[Finetuning]:
+    from vla_eval.training.finetune import load_finetune_recipe
     from vla_eval.training.run_folder import whole_checkpoints
 
     found = []
     for one in finetunings(work.table, work.out):
         whole = whole_checkpoints(Path(str(one.config.out)))
-        if not whole or int(whole[-1].name) < work.table.steps:
+        if not whole or int(whole[-1].name) < load_finetune_recipe(one.config).value.steps:
             found.append(one)
     return found
 
@@ -171,7 +172,7 @@ def _refuse_unfinished(work: _Work, config: str) -> None:
         names = [f"{one.row.name} on {one.task}, run seed {one.run_seed}" for one in unfinished[:3]]
         more = f" and {len(unfinished) - 3} more" if len(unfinished) > 3 else ""
         raise RecipeError(
-            f"{work.table.name}: not fine-tuned for {work.table.steps} steps yet: {'; '.join(names)}{more}. "
+            f"{work.table.name}: not fine-tuned to the end yet: {'; '.join(names)}{more}. "
             f"First: mikasa-vla finetune {config} --out {work.out}"
         )
 

@@ -35,7 +35,7 @@ from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut, check_held_out
 from vla_eval.training.loop import LoopHooks, append_metrics, run_loop
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, LoraRecipe
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, LoraRecipe, merge_fields
 from vla_eval.training.run_folder import (
     LOG_FILE,
     METRICS_FILE,
@@ -85,7 +85,7 @@ def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
             f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
             f"`mikasa-vla list policies` shows the recipes."
         )
-    data = _merged(to_data(recipe.value.finetune), config.finetune)
+    data = merge_fields(to_data(recipe.value.finetune), config.finetune)
     value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
     return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
 
@@ -359,13 +359,3 @@ def _tokenizer_from(folder: str | None, kind: str) -> Any:
         processing, TOKENIZER_STEP, lambda **fields: step(**{**fields, "tokenizer_name": folder})
     ):
         yield
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
-    """Put changes on top, field by field; an empty mapping empties."""
-    merged = dict(base)
-    for name, value in changes.items():
-        inner = merged.get(name)
-        merges = isinstance(inner, dict) and isinstance(value, dict) and value
-        merged[name] = _merged(inner, value) if merges and inner else value
-    return merged

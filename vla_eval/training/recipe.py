@@ -3,6 +3,7 @@
 Standard library only: `mikasa-vla list` reads recipes without waiting for torch.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -154,3 +155,13 @@ class FinetuneConfig:
     device: str = "auto"
     evaluation: HeldOutEvaluation | None = None
     allow_unreplayed: bool = False
+
+
+def merge_fields(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+    """Put changes on top, field by field; an empty mapping empties."""
+    merged = dict(base)
+    for name, value in changes.items():
+        inner = merged.get(name)
+        merges = isinstance(inner, dict) and isinstance(value, dict) and value
+        merged[name] = merge_fields(inner, value) if merges and inner else value
+    return merged

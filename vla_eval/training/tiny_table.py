@@ -24,6 +24,8 @@ TINY_RECIPES = {
     "mikasa_spatialvla": "spatialvla_tiny",
 }
 """Type of a policy -> recipe of its tiny form."""
+SMALL = ("act", "mikasa_memory")
+"""Types whose own recipes are small enough."""
 TINY_PI0_ADAPTER = "vla_eval.training.tiny_models:make_tiny_pi0"
 N_EPISODES = 2
 N_STEPS = 2
@@ -52,7 +54,7 @@ def tiny_table(table: ModelTable, out: Path) -> tuple[ModelTable, dict[str, str]
         path = out / "tiny" / f"{row.name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, yaml.safe_dump(recipe, sort_keys=False, allow_unicode=True))
-        rows.append(replace(row, policy=str(path)))
+        rows.append(replace(row, policy=str(path), finetune=None))
         adapters[row.name] = adapter
     tiny = replace(
         table,
@@ -78,17 +80,18 @@ def tiny_dataset(table: ModelTable) -> DatasetRecipe:
 def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
     real = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
     kind = None if real is None else real.type
-    chunk = {"chunk_size": row.n_action_steps, "n_action_steps": row.n_action_steps}
+    longest = max(row.n_action_steps)
+    chunk = {"chunk_size": longest, "n_action_steps": longest}
     if kind == "pi0":
         policy = {**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": N_STEPS, **chunk}
         tokenizer = str(write_tiny_tokenizer(folder / "tokenizer"))
         section: dict[str, Any] = {"type": "pi0", "tokenizer": tokenizer, "policy": policy, **SHORT}
         return _recipe(row, section), TINY_PI0_ADAPTER
-    if kind not in TINY_RECIPES:
-        known = ", ".join(("pi0", *TINY_RECIPES))
+    if kind not in TINY_RECIPES and kind not in SMALL:
+        known = ", ".join(("pi0", *SMALL, *TINY_RECIPES))
         raise RecipeError(f"row {row.name}: there is no tiny form of the type {kind}. Known: {known}.")
-    tiny = load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune
-    assert tiny is not None  # it ships with one
+    tiny = real if kind in SMALL else load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune
+    assert tiny is not None  # these ship with one
     section = {**to_data(tiny), **SHORT}
     section["policy"] = {**section["policy"], **chunk}
     return _recipe(row, section), LEROBOT_ADAPTER
@@ -99,6 +102,6 @@ def _recipe(row: TableRow, section: dict[str, Any]) -> dict[str, Any]:
         "version": 1,
         "description": f"Tiny random weights in the place of {row.policy}.",
         "adapter": LEROBOT_ADAPTER,
-        "default_n_action_steps": row.n_action_steps,
+        "default_n_action_steps": row.n_action_steps[0],
         "finetune": section,
     }
