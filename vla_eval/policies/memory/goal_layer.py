@@ -82,7 +82,7 @@ class GoalLayer(nn.Module):
         self.camera_trust = nn.Parameter(torch.zeros(cameras))
         self.camera_evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, 1))
         rides = torch.tensor(self.on_arm, dtype=torch.float32)
-        self.nearness = nn.Parameter(NEARNESS_COUNT / TRUST_SCALE * rides) if weighs_nearness else None
+        self.nearness = nn.Parameter(NEARNESS_COUNT * rides) if weighs_nearness else None
 
     def forward(self, places: Tensor, evidence: Tensor, state: Tensor) -> Goals:
         """Return the goals in metres.
@@ -109,7 +109,7 @@ class GoalLayer(nn.Module):
         believed = believed + (shares * sure).sum(dim=-1)
         if self.nearness is not None:
             height_m = state[:, SPACE - 1 : SPACE].clamp(min=LEAST_HEIGHT_M)
-            believed = believed - TRUST_SCALE * self.nearness * (height_m / NEAR_M).log()
+            believed = believed - self.nearness * (height_m / NEAR_M).log()
         return Goals(pointed, shares, believed.softmax(dim=-1))
 
 
