@@ -70,11 +70,10 @@ class TestGoalLayer:
         tool_m: tuple[float, float, float] = (0.0, 0.0, 0.3),
         yaw: float = 0.0,
         sure: float = 0.0,
-        weighs_nearness: bool = False,
     ) -> Goals:
         """The goals of a tool at a place that points down, turned by so much about the vertical."""
         torch.manual_seed(0)
-        layer = GoalLayer(on_arm=(False, True), heads=2, weighs_nearness=weighs_nearness)
+        layer = GoalLayer(on_arm=(False, True), heads=2)
         with torch.no_grad():
             for each in layer.maps:
                 each[-1].weight[0] *= sure  # each place is as sure as any other if it is 0
@@ -93,15 +92,6 @@ class TestGoalLayer:
     def test_the_place_itself_tells_how_sure_its_map_is_there(self) -> None:
         torch.testing.assert_close(self.goals().shares, torch.full((1, 2, 2), 0.5))
         assert self.goals(sure=1e5).shares.amax(dim=-1).min() > 0.99
-
-    def test_errors_of_an_angle_count_by_the_inverse_square_of_their_length(self) -> None:
-        high, low = (
-            self.goals(tool_m=(0.0, 0.0, z), weighs_nearness=True).camera_shares[0] for z in (0.3, 0.1)
-        )
-        torch.testing.assert_close(low[1] / low[0], 9 * high[1] / high[0])
-        for z in (0.3, 0.1):
-            plain = self.goals(tool_m=(0.0, 0.0, z)).camera_shares[0]
-            assert torch.equal(plain, self.goals().camera_shares[0])
 
     def test_what_the_camera_on_the_arm_sees_moves_with_the_tool(self) -> None:
         moved = self.goals(tool_m=(0.3, -0.1, 0.3)).alone - self.goals().alone

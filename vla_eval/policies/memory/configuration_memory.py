@@ -32,7 +32,6 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         arm_cameras: the pictures whose camera is on the arm and moves with it.
         free_translation: a part of the translation does not depend on where the demonstration ends, for
             tasks that are more than a way to a place.
-        weighs_nearness: a camera on the arm is believed the more the lower the tool is.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         first_action_weight: share of a chunk's first action in the loss; the others share the rest.
         change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
@@ -61,7 +60,6 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     hidden: int = 256
     longest_span_steps: float = 100.0
     free_translation: bool = False
-    weighs_nearness: bool = False
 
     first_action_weight: float = 0.5
     change_weight: float = 3.0

@@ -21,12 +21,6 @@ EVIDENCE_COUNTS = (3.0, 0.5, 3.0)
 stands out, and minus how unlike its colour is to the one asked for."""
 
 PLACE_SCALE = 4.0  # the table's things lie within a part of a picture of [-1, 1]: to numbers of about 1
-NEARNESS_COUNT = 2.0
-"""To begin with, what a camera on the arm says counts as the inverse square of the tool's height: what is off
-by an angle is off by the more metres the farther away it is, and estimates are to be weighed by the inverse
-of their variance."""
-LEAST_HEIGHT_M = 0.01
-NEAR_M = 0.15  # height at which that is 1
 TRUST_SCALE = 10.0  # so that an optimizer's steps of 0.002 stop listening within some hundred
 
 
@@ -67,10 +61,9 @@ class GoalLayer(nn.Module):
     Args:
         on_arm: of each camera, whether it is on the arm.
         heads: look-ups per camera.
-        weighs_nearness: whether a camera on the arm is believed the more the lower the tool is.
     """
 
-    def __init__(self, *, on_arm: Sequence[bool], heads: int, weighs_nearness: bool) -> None:
+    def __init__(self, *, on_arm: Sequence[bool], heads: int) -> None:
         super().__init__()
         cameras = len(on_arm)
         self.on_arm = tuple(on_arm)
@@ -81,8 +74,6 @@ class GoalLayer(nn.Module):
         self.evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, heads, 1))
         self.camera_trust = nn.Parameter(torch.zeros(cameras))
         self.camera_evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, 1))
-        rides = torch.tensor(self.on_arm, dtype=torch.float32)
-        self.nearness = nn.Parameter(NEARNESS_COUNT * rides) if weighs_nearness else None
 
     def forward(self, places: Tensor, evidence: Tensor, state: Tensor) -> Goals:
         """Return the goals in metres.
@@ -107,9 +98,6 @@ class GoalLayer(nn.Module):
         of_camera = (shares[..., None] * evidence).sum(dim=2)
         believed = TRUST_SCALE * self.camera_trust + (self.camera_evidence * of_camera).sum(dim=-1)
         believed = believed + (shares * sure).sum(dim=-1)
-        if self.nearness is not None:
-            height_m = state[:, SPACE - 1 : SPACE].clamp(min=LEAST_HEIGHT_M)
-            believed = believed - self.nearness * (height_m / NEAR_M).log()
         return Goals(pointed, shares, believed.softmax(dim=-1))
 
 

@@ -210,7 +210,6 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         hidden=config.hidden,
         longest_span_steps=config.longest_span_steps,
         free_translation=config.free_translation,
-        weighs_nearness=config.weighs_nearness,
     )
 
 

@@ -109,7 +109,7 @@ class MemoryNetwork(nn.Module):
         self.candidate = nn.Linear(hidden, sizes.memory)
         self.first_rest = nn.Parameter(torch.zeros(sizes.memory))
         self.asks = nn.Linear(sizes.memory, n_things * sizes.key)
-        self.goal = GoalLayer(on_arm=sizes.on_arm, heads=sizes.heads, weighs_nearness=sizes.weighs_nearness)
+        self.goal = GoalLayer(on_arm=sizes.on_arm, heads=sizes.heads)
         kept = sizes.seen + sizes.memory
         self.decides = nn.Sequential(
             nn.Linear(sizes.seen + kept + hidden + STATE + SPACE, hidden),

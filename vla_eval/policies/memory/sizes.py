@@ -32,7 +32,6 @@ class NetworkSizes:
         hidden: units of the layers between.
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
         free_translation: whether a part of the translation does not depend on the goal.
-        weighs_nearness: whether a camera on the arm is believed the more the lower the tool is.
     """
 
     on_arm: tuple[bool, ...] = (False, True)
@@ -47,7 +46,6 @@ class NetworkSizes:
     hidden: int = 256
     longest_span_steps: float = 100.0
     free_translation: bool = False
-    weighs_nearness: bool = False
 
     @property
     def cameras(self) -> int:
