@@ -16,6 +16,7 @@ from vla_eval.model_table import ModelTable, TableRow
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.results.durable import replace_file
+from vla_eval.training.recipe import merge_fields
 from vla_eval.training.tiny_models import TINY_POLICY, write_tiny_tokenizer
 
 TINY_RECIPES = {
@@ -90,9 +91,11 @@ def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
     if kind not in TINY_RECIPES and kind not in SMALL:
         known = ", ".join(("pi0", *SMALL, *TINY_RECIPES))
         raise RecipeError(f"row {row.name}: there is no tiny form of the type {kind}. Known: {known}.")
-    tiny = real if kind in SMALL else load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune
-    assert tiny is not None  # these ship with one
-    section = {**to_data(tiny), **SHORT}
+    if kind in SMALL:
+        section = merge_fields(to_data(real), row.finetune or {})
+    else:
+        section = to_data(load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune)
+    section |= SHORT
     section["policy"] = {**section["policy"], **chunk}
     return _recipe(row, section), LEROBOT_ADAPTER
 
