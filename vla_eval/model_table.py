@@ -6,13 +6,13 @@ here. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait f
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import yaml
 
-from vla_eval.envs.settings import Simulator
+from vla_eval.envs.settings import RenderSettings, Simulator
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.recipes import EvalConfig, PolicyRecipe, check_run_name, load_recipe, recipe_fields
@@ -95,7 +95,7 @@ class ModelTable:
         episodes, seed_start: of each evaluation.
         controls: scripted policies beside the rows, at every number of action steps of a row.
         simulator: what the evaluations run on.
-        stop_at_success: see `EvalConfig`.
+        render, stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
         allow_unreplayed: see `FinetuneConfig`.
     """
@@ -111,6 +111,7 @@ class ModelTable:
     seed_start: int = 1
     controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
     simulator: Simulator = "maniskill"
+    render: RenderSettings = field(default_factory=RenderSettings)
     stop_at_success: bool = False
     finetune: dict[str, Any] | None = None  # Any: decoded with each row's recipe
     allow_unreplayed: bool = False
@@ -244,6 +245,7 @@ def _evaluation(
         episodes=table.episodes,
         seed_start=table.seed_start,
         simulator=table.simulator,
+        render=table.render,
         stop_at_success=table.stop_at_success,
     )
 

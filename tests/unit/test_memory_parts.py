@@ -70,6 +70,7 @@ class TestGoalLayer:
         tool_m: tuple[float, float, float] = (0.0, 0.0, 0.3),
         yaw: float = 0.0,
         sure: float = 0.0,
+        usual_errors: tuple[float, float] | None = None,
     ) -> Goals:
         """The goals of a tool at a place that points down, turned by so much about the vertical."""
         torch.manual_seed(0)
@@ -77,6 +78,8 @@ class TestGoalLayer:
         with torch.no_grad():
             for each in layer.maps:
                 each[-1].weight[0] *= sure  # each place is as sure as any other if it is 0
+        if usual_errors is not None:  # as when it acts
+            layer.eval().usual_error.copy_(torch.tensor(usual_errors).square())
         places = torch.tensor([[-0.5, 0.2], [0.7, 0.1]]).expand(1, 2, 2, 2)
         evidence = torch.tensor([[0.0, 0.0, -unlike[0]], [0.0, 0.0, -unlike[1]]]).expand(1, 2, 2, 3)
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -92,6 +95,32 @@ class TestGoalLayer:
     def test_the_place_itself_tells_how_sure_its_map_is_there(self) -> None:
         torch.testing.assert_close(self.goals().shares, torch.full((1, 2, 2), 0.5))
         assert self.goals(sure=1e5).shares.amax(dim=-1).min() > 0.99
+
+    @pytest.mark.parametrize(("height_m", "share"), [(0.2, 0.5), (0.4, 0.2), (0.1, 0.8)])
+    def test_when_it_acts_cameras_are_weighed_by_the_inverse_of_their_variance(
+        self, height_m: float, share: float
+    ) -> None:
+        """The fixed camera is off by 1 cm, the ray of the other by 5 % of its length: 1 cm at 20 cm."""
+        goals = self.goals(tool_m=(0.0, 0.0, height_m), usual_errors=(0.01, 0.05))
+        torch.testing.assert_close(goals.camera_shares, torch.tensor([[1 - share, share]]))
+
+    def test_and_less_where_what_they_found_is_less_like_than_usual(self) -> None:
+        layer = GoalLayer(on_arm=(False, False), heads=1).eval()
+        layer.usual_evidence.copy_(torch.tensor([[1.0, 2.0, -0.5], [1.0, 2.0, -3.0]]))
+        for less, share in ((0.0, 0.5), (1.0, 1 / (1 + math.exp(3)))):  # EVIDENCE_COUNTS: e^-3 as much
+            evidence = layer.usual_evidence - torch.tensor([[0.0, 0.0, less], [0.0, 0.0, 0.0]])
+            goals = layer(torch.zeros(1, 2, 1, 2), evidence[None, :, None], torch.ones(1, 10))
+            torch.testing.assert_close(goals.camera_shares[0, 0], torch.tensor(share))
+
+    def test_usual_errors_are_medians_that_rare_large_ones_do_not_move(self) -> None:
+        layer = GoalLayer(on_arm=(False, True), heads=1)
+        missed = torch.tensor([0.01, 0.02, 0.02, 0.02, 5.0])[:, None, None] * torch.tensor([1.0, 0.0, 0.0])
+        state = torch.zeros(5, 10)
+        state[:, 2] = 0.4
+        for _ in range(400):
+            layer.note_errors(missed.expand(5, 2, 3), torch.ones(5, 2, 3), state)
+        torch.testing.assert_close(layer.usual_error.sqrt(), torch.tensor([0.02, 0.05]))
+        torch.testing.assert_close(layer.usual_evidence, torch.ones(2, 3))
 
     def test_what_the_camera_on_the_arm_sees_moves_with_the_tool(self) -> None:
         moved = self.goals(tool_m=(0.3, -0.1, 0.3)).alone - self.goals().alone

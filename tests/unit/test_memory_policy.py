@@ -185,6 +185,7 @@ class TestTraining:
 
     def test_each_camera_is_taught_to_tell_by_itself(self, recorded: Path) -> None:
         policy = tiny_policy(recorded)
+        policy.network.goal.train()
         with torch.no_grad():
             policy.network.goal.camera_trust.copy_(torch.tensor([1e4, 0.0]))  # the second is not listened to
         self.loss(policy).backward()
@@ -192,6 +193,16 @@ class TestTraining:
             sum(float(p.grad.abs().sum()) for p in each.parameters()) for each in policy.network.goal.maps
         ]
         assert min(taught) > 0
+
+    def test_only_training_notes_how_far_off_each_camera_was(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded)
+        usual = policy.network.goal.usual_error
+        noted = []
+        for training in (True, False):
+            policy.train(training).forward(self.batch(policy, n_real=4))
+            noted.append(usual.clone())
+        assert (noted[0] != 1).all() and torch.equal(*noted)
+        assert torch.equal(policy.state_dict()["network.goal.usual_error"], usual)
 
     def test_a_window_that_does_not_reach_the_beginning_is_refused(self, recorded: Path) -> None:
         with pytest.raises(SpecMismatchError, match="a memory must begin where the episode does"):
@@ -263,6 +274,7 @@ class TestGoalsMissed:
             pointed_m=pointed,
             shares=believed,
             camera_shares=torch.ones(2, 1, 1),
+            evidence=torch.zeros(2, 1, 1, 3),
         )
         goal, loss = goals_missed(answer, right, torch.ones(2, 1))
         return float(goal), float(loss)
@@ -288,6 +300,7 @@ class TestForesight:
             pointed_m=nowhere[:, None, None],
             shares=torch.ones(1, 1, 1),
             camera_shares=torch.ones(1, 1),
+            evidence=torch.zeros(1, 1, 3),
         )
 
     def test_a_chunk_is_held_from_its_first_guess_with_the_gripper_as_it_was(self) -> None:

@@ -115,7 +115,8 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
         {"name": "plain", "policy": "act", "n_action_steps": [4]},
     ]
     fields = {"policy": {"heads": 4}, "num_workers": 0}
-    changes = {"rows": rows, "tasks": [TASK, other], "steps": None, "finetune": fields}
+    settings = {"render": {"wrist_mesh": "simplified"}, "stop_at_success": True}
+    changes = {"rows": rows, "tasks": [TASK, other], "steps": None, "finetune": fields, **settings}
     table = load_model_table(str(changed(small, **changes)))
     every = {(one.row.name, one.task): one.config.finetune for one in finetunings(table, tmp_path)}
     assert every == {
@@ -135,6 +136,8 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
         (f"{other}-run-0-k1-4-8", (1, 4, 8), ["moving"]),
         (f"{other}-run-0-k4", (4,), ["plain"]),
     ]
+    for _, config in evaluations(table, tmp_path):
+        assert config.stop_at_success and config.render.wrist_mesh == "simplified"
     assert "4 fine-tunings" in describe_effort(table, n_finished=0)
     assert "GPU hours" not in describe_effort(table, n_finished=0)  # nobody said what they cost
 

@@ -21,6 +21,9 @@ EVIDENCE_COUNTS = (3.0, 0.5, 3.0)
 stands out, and minus how unlike its colour is to the one asked for."""
 
 PLACE_SCALE = 4.0  # the table's things lie within a part of a picture of [-1, 1]: to numbers of about 1
+LEAST_HEIGHT_M = 0.02
+LEAST_ERROR_M2 = 1e-8  # a camera without error would be believed alone
+KEPT_PER_BATCH = 0.95  # of what was known of errors and evidence before
 TRUST_SCALE = 10.0  # so that an optimizer's steps of 0.002 stop listening within some hundred
 
 
@@ -31,11 +34,13 @@ class Goals(NamedTuple):
         pointed: (N, cameras, heads, 3) by each look-up alone.
         shares: (N, cameras, heads) how far each is believed among those of its camera; of sum 1.
         camera_shares: (N, cameras) how far each camera is; of sum 1.
+        evidence: (N, cameras, 3) for each camera.
     """
 
     pointed: Tensor
     shares: Tensor
     camera_shares: Tensor
+    evidence: Tensor
 
     @property
     def alone(self) -> Tensor:
@@ -58,10 +63,20 @@ class GoalLayer(nn.Module):
     which the arm already is (low down, it is there), and not from the picture. Each map also says how sure
     it is at a place.
 
+    In training, how far each camera is believed is learned with the rest (a mixture of experts). Squared
+    errors teach it to listen to a camera that is hardly ever far off, as the one on the arm, even where the
+    other is nearer to the truth, as at a first look from high up. So when it acts, cameras are weighed by the
+    inverse of the variance of their errors, as independent measurements are: that of a fixed camera is a
+    number, that of a ray grows with the square of its length. Both are medians over what the training met.
+
     Args:
         on_arm: of each camera, whether it is on the arm.
         heads: look-ups per camera.
     """
+
+    usual_error: Tensor
+    usual_evidence: Tensor
+    rides: Tensor
 
     def __init__(self, *, on_arm: Sequence[bool], heads: int) -> None:
         super().__init__()
@@ -74,6 +89,9 @@ class GoalLayer(nn.Module):
         self.evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, heads, 1))
         self.camera_trust = nn.Parameter(torch.zeros(cameras))
         self.camera_evidence = nn.Parameter(torch.tensor(EVIDENCE_COUNTS).repeat(cameras, 1))
+        self.register_buffer("usual_error", torch.ones(cameras))
+        self.register_buffer("usual_evidence", torch.zeros(cameras, len(EVIDENCE_COUNTS)))
+        self.register_buffer("rides", torch.tensor(self.on_arm), persistent=False)
 
     def forward(self, places: Tensor, evidence: Tensor, state: Tensor) -> Goals:
         """Return the goals in metres.
@@ -96,9 +114,34 @@ class GoalLayer(nn.Module):
         belief = TRUST_SCALE * self.trust + (self.evidence * evidence).sum(dim=-1) + sure
         shares = belief.softmax(dim=-1)
         of_camera = (shares[..., None] * evidence).sum(dim=2)
-        believed = TRUST_SCALE * self.camera_trust + (self.camera_evidence * of_camera).sum(dim=-1)
-        believed = believed + (shares * sure).sum(dim=-1)
-        return Goals(pointed, shares, believed.softmax(dim=-1))
+        if self.training:
+            believed = TRUST_SCALE * self.camera_trust + (self.camera_evidence * of_camera).sum(dim=-1)
+            believed = believed + (shares * sure).sum(dim=-1)
+        else:
+            unusual = (self.camera_evidence * (of_camera - self.usual_evidence)).sum(dim=-1)
+            believed = unusual - (self.usual_error * self._squared_length(state)).log()
+        return Goals(pointed, shares, believed.softmax(dim=-1), of_camera)
+
+    @torch.no_grad()
+    def note_errors(self, missed_m: Tensor, evidence: Tensor, state: Tensor) -> None:
+        """Keep in mind how far off each camera was at N steps, and by which evidence.
+
+        Args:
+            missed_m: (N, cameras, 3) goals of each camera alone, minus what they should have been.
+            evidence: (N, cameras, 3), see `Goals`.
+            state: (N, state).
+        """
+        squared = missed_m.square().sum(dim=-1) / self._squared_length(state)
+        for usual, now in (
+            (self.usual_error, squared.median(dim=0).values.clamp(min=LEAST_ERROR_M2)),
+            (self.usual_evidence, evidence.median(dim=0).values),
+        ):
+            usual.lerp_(now, 1 - KEPT_PER_BATCH)
+
+    def _squared_length(self, state: Tensor) -> Tensor:
+        """(N, cameras) of the ray in square metres; 1 for a fixed camera."""
+        height_m = state[:, SPACE - 1 : SPACE].clamp(min=LEAST_HEIGHT_M)
+        return torch.where(self.rides, height_m.square(), torch.ones_like(height_m))
 
 
 def _from_the_tool(rays: Tensor, state: Tensor) -> Tensor:

@@ -72,12 +72,21 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         imitation = _weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal, goals = goals_missed(answer, episodes.goal_m, real)
+        if self.training:
+            self._note_errors(answer, episodes, real > 0)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
         surprise = _weighted_mean(surprises, episodes.counts)
         loss = imitation + config.goal_weight * goals + config.doubt_weight * surprise
         parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    @torch.no_grad()
+    def _note_errors(self, answer: Answer, episodes: Episodes, real: Tensor) -> None:
+        """Tell the goal layer how far off each camera was."""
+        alone = (answer.shares[..., None] * answer.pointed_m).sum(dim=-2)
+        missed = alone - episodes.goal_m[:, None, None]
+        self.network.goal.note_errors(missed[real], answer.evidence[real], episodes.state[real])
 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:

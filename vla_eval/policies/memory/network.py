@@ -42,6 +42,7 @@ class Answer(NamedTuple):
         pointed_m: (B, T, cameras, heads, 3) the same by each look-up alone.
         shares: (B, T, cameras, heads) how far each is believed among those of its camera.
         camera_shares: (B, T, cameras) how far each camera is.
+        evidence: (B, T, cameras, 3) what told of each camera how far to believe it.
     """
 
     actions: Tensor
@@ -50,6 +51,7 @@ class Answer(NamedTuple):
     pointed_m: Tensor
     shares: Tensor
     camera_shares: Tensor
+    evidence: Tensor
 
 
 class Sight(NamedTuple):
@@ -223,6 +225,7 @@ class MemoryNetwork(nn.Module):
             pointed_m=goals.pointed,
             shares=goals.shares,
             camera_shares=goals.camera_shares,
+            evidence=goals.evidence,
         )
 
     def forward(self, pictures: Tensor, state: Tensor) -> Answer:
