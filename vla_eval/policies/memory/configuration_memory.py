@@ -111,7 +111,8 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
                 f"'{TYPE}' needs the state 'eef' of {STATE} numbers, found {self.robot_state_feature.shape}: "
                 "record with state: eef"
             )
-        check_names("picture", self.arm_cameras, self.image_features, where=f"policy.arm_cameras ({TYPE})")
+        where = f"policy.arm_cameras ({TYPE}; those whose camera is on the arm, [] if none is)"
+        check_names("picture", self.arm_cameras, self.image_features, where=where)
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
             raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")
