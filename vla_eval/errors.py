@@ -53,6 +53,10 @@ class RunFolderError(VlaEvalError):
     """A run folder is in use, damaged, or not a run folder."""
 
 
+class FolderInUseError(RunFolderError):
+    """Another process is writing into the folder."""
+
+
 class RunChangedError(RunFolderError):
     """A run cannot be continued, because its configuration or its machine has changed."""
 

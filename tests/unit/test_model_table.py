@@ -13,7 +13,7 @@ from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import VlaEvalError
+from vla_eval.errors import FolderInUseError, VlaEvalError
 from vla_eval.model_table import (
     describe_effort,
     evaluations,
@@ -29,6 +29,7 @@ from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.results.paper_table import PAPER_TABLE
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.training.recipe import FinetuneConfig
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
@@ -177,6 +178,31 @@ def test_a_missing_dataset_is_found_before_the_first_training(
     assert main(["finetune", str(small), "--out", str(tmp_path / "out")]) == 1
     told = capsys.readouterr().err
     assert "5 fine-tunings" in told and "GPU hours" in told and "mikasa-vla record" in told
+
+
+def test_processes_share_a_table_and_leave_each_other_alone(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "data" / TASK).mkdir(parents=True)
+    out = tmp_path / "out"
+    rows = [{**ROW, "name": name} for name in ("first", "second", "third", "fourth")]
+    begun: list[str] = []
+
+    def train(config: FinetuneConfig, **_: Any) -> None:
+        folder = Path(str(config.out))
+        name = folder.relative_to(out / "training").parts[0]
+        begun.append(name)
+        if name == "second":
+            raise FolderInUseError(f"{folder}: another process")
+        monkeypatch.setattr(  # the other process comes to an end with the third meanwhile
+            "vla_eval.cli.model_table._is_finished", lambda one: one.row.name in (*begun, "third")
+        )
+
+    monkeypatch.setattr("vla_eval.training.finetune.finetune", train)
+    path = changed(small, rows=rows, steps=5, finetune={"save_every_steps": 5})
+    assert main(["finetune", str(path), "--out", str(out)]) == 0
+    assert begun == ["first", "second", "fourth"]
+    assert "second on RememberColor3-v0, run seed 0\n  another process is at it" in capsys.readouterr().err
 
 
 def test_an_evaluation_says_what_has_not_been_trained(

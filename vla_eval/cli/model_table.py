@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
-from vla_eval.errors import RecipeError
+from vla_eval.errors import FolderInUseError, RecipeError
 from vla_eval.model_table import (
     Finetuning,
     ModelTable,
@@ -121,7 +121,7 @@ def _work(args: argparse.Namespace) -> _Work:
 
 
 def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> None:
-    """Run one fine-tuning after the other."""
+    """Run one fine-tuning after the other; leave out those that another process has begun."""
     from vla_eval.training.finetune import finetune
 
     everything = finetunings(work.table, work.out)
@@ -130,10 +130,15 @@ def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> No
     _check(work.table, unfinished)
     with contextlib.redirect_stdout(sys.stderr), _tiny_models(work):
         for index, one in enumerate(unfinished):
+            if _is_finished(one):
+                continue
             _say(f"[{index + 1}/{len(unfinished)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
             allowed = allow_unreplayed or one.config.allow_unreplayed
             config = replace(one.config, device=device, allow_unreplayed=allowed)
-            finetune(config, command=typed_command(), say=_say)
+            try:
+                finetune(config, command=typed_command(), say=_say)
+            except FolderInUseError:
+                _say("  another process is at it")
             _free_memory()
 
 
@@ -155,15 +160,15 @@ def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
 
 
 def _unfinished(work: _Work) -> list[Finetuning]:
+    return [one for one in finetunings(work.table, work.out) if not _is_finished(one)]
+
+
+def _is_finished(one: Finetuning) -> bool:
     from vla_eval.training.finetune import load_finetune_recipe
     from vla_eval.training.run_folder import whole_checkpoints
 
-    found = []
-    for one in finetunings(work.table, work.out):
-        whole = whole_checkpoints(Path(str(one.config.out)))
-        if not whole or int(whole[-1].name) < load_finetune_recipe(one.config).value.steps:
-            found.append(one)
-    return found
+    whole = whole_checkpoints(Path(str(one.config.out)))
+    return bool(whole) and int(whole[-1].name) >= load_finetune_recipe(one.config).value.steps
 
 
 def _refuse_unfinished(work: _Work, config: str) -> None:

@@ -10,7 +10,7 @@ import logging
 import os
 from pathlib import Path
 
-from vla_eval.errors import RunFolderError, StorageFullError
+from vla_eval.errors import FolderInUseError, RunFolderError, StorageFullError
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ class FolderLock:
         path: the lock file; it holds the process id of whoever has the lock.
 
     Raises:
-        RunFolderError: another process has it, or the file system knows no locks.
+        FolderInUseError: another process has it.
+        RunFolderError: the file system knows no locks.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,7 +130,7 @@ class FolderLock:
         except BlockingIOError as exc:
             holder = os.pread(self._fd, 32, 0).decode(errors="replace").strip() or "unknown"
             os.close(self._fd)
-            raise RunFolderError(
+            raise FolderInUseError(
                 f"{path.parent}: another process (pid {holder}) is writing into this run folder. Wait for "
                 f"it, stop it, or use another --out."
             ) from exc
