@@ -46,7 +46,8 @@ class EpisodeBar:
         moved, self._n_done, self._note = n_done - self._n_done, n_done, note
         if self._bar is not None:
             self._bar.update(moved)
-            self._bar.set_postfix_str(note)
+            if note:  # each postfix is a redraw, which a bar without one need not have
+                self._bar.set_postfix_str(note)
 
     def tick(self) -> None:
         """Write a line if it is time and there is no bar."""

@@ -45,7 +45,7 @@ class Goals(NamedTuple):
     @property
     def alone(self) -> Tensor:
         """(N, cameras, 3) by each camera alone."""
-        return (self.shares[..., None] * self.pointed).sum(dim=2)
+        return by_camera(self.pointed, self.shares)
 
     @property
     def together(self) -> Tensor:
@@ -142,6 +142,11 @@ class GoalLayer(nn.Module):
         """(N, cameras) of the ray in square metres; 1 for a fixed camera."""
         height_m = state[:, SPACE - 1 : SPACE].clamp(min=LEAST_HEIGHT_M)
         return torch.where(self.rides, height_m.square(), torch.ones_like(height_m))
+
+
+def by_camera(pointed: Tensor, shares: Tensor) -> Tensor:
+    """Return the goals (…, cameras, 3) of each camera's look-ups (…, cameras, heads, 3), by their shares."""
+    return (shares[..., None] * pointed).sum(dim=-2)
 
 
 def _from_the_tool(rays: Tensor, state: Tensor) -> Tensor:

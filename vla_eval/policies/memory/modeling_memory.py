@@ -9,6 +9,7 @@ from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
+from vla_eval.policies.memory.goal_layer import by_camera
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.policies.memory.sizes import SPACE, NetworkSizes
 
@@ -84,8 +85,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     @torch.no_grad()
     def _note_errors(self, answer: Answer, episodes: Episodes, real: Tensor) -> None:
         """Tell the goal layer how far off each camera was."""
-        alone = (answer.shares[..., None] * answer.pointed_m).sum(dim=-2)
-        missed = alone - episodes.goal_m[:, None, None]
+        missed = by_camera(answer.pointed_m, answer.shares) - episodes.goal_m[:, None, None]
         self.network.goal.note_errors(missed[real], answer.evidence[real], episodes.state[real])
 
     @torch.no_grad()
