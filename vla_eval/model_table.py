@@ -5,8 +5,8 @@ for each task and run seed by itself, and each such checkpoint is evaluated on t
 here. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait for torch.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -93,7 +93,7 @@ class ModelTable:
         steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
         run_seeds: one fine-tuning each; the SEM is over them.
         episodes, seed_start: of each evaluation.
-        controls: scripted policies beside the rows, at every number of action steps of a row.
+        controls: scripted policies beside the rows of a task, at each of their numbers of action steps.
         simulator: what the evaluations run on.
         render, stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
@@ -139,6 +139,33 @@ class ModelTable:
     def rows_of(self, task: str) -> tuple[TableRow, ...]:
         """Return the rows that a task has."""
         return tuple(row for row in self.rows if row.tasks is None or task in row.tasks)
+
+
+def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[str] = ()) -> ModelTable:
+    """Return the part of a table that has these tasks and rows, in the table's order.
+
+    What it takes lies where it lies for the whole table.
+
+    Args:
+        table: the whole.
+        tasks: names of tasks; none: all.
+        rows: names of rows; none: all.
+
+    Raises:
+        UnknownNameError: one is not in the table.
+        RecipeError: none of the rows is for one of the tasks.
+    """
+    check_names("task", tasks, table.tasks, where=table.name)
+    check_names("row", rows, [row.name for row in table.rows], where=table.name)
+    chosen = tuple(task for task in table.tasks if not tasks or task in tasks)
+    kept = []
+    for row in table.rows:
+        own = tuple(task for task in chosen if row.tasks is None or task in row.tasks)
+        if own and (not rows or row.name in rows):
+            kept.append(replace(row, tasks=None if row.tasks is None else own))
+    if not kept:
+        raise RecipeError(f"{table.name}: none of the rows {', '.join(rows)} is for {', '.join(tasks)}.")
+    return replace(table, tasks=chosen, rows=tuple(kept))
 
 
 class Finetuning(NamedTuple):
@@ -201,45 +228,43 @@ def _training_folder(out: Path, row: TableRow, task: str, run_seed: int) -> Path
 def evaluations(
     table: ModelTable, out: Path, *, adapters: dict[str, str] | None = None
 ) -> Iterator[tuple[Path, EvalConfig]]:
-    """Yield run folder and configuration of every evaluation: the controls first, then task by task.
+    """Yield run folder and configuration of every evaluation: task by task, the controls first.
 
-    Rows with the same numbers of action steps share a run folder. The recipes that name the checkpoints are
-    written to `out`: a row keeps its name, wherever its weights lie.
+    Each row has run folders of its own, so that a table to which rows or tasks are added keeps what it has.
+    The recipes that name the checkpoints are written to `out`: a row keeps its name, wherever its weights
+    lie.
 
     Args:
         table: what to evaluate.
         out: folder of the table.
         adapters: row -> adapter where it is not lerobot's.
     """
-    if table.controls:
-        # Chance and ceiling are those of the same number of action steps.
-        every = tuple(sorted({steps for row in table.rows for steps in row.n_action_steps}))
-        config = _evaluation(table, "controls", table.tasks, table.controls, every)
-        yield out / "evaluation" / config.name, config
     own = adapters or {}
+    folder = out / "evaluation"
     for task in table.tasks:
-        for run_seed in table.run_seeds:
-            rows = table.rows_of(task)
-            for steps in dict.fromkeys(row.n_action_steps for row in rows):
-                name = f"{task}-run-{run_seed}-k{'-'.join(map(str, steps))}"
-                recipes = [
-                    _write_recipe(out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
-                    for row in rows
-                    if row.n_action_steps == steps
-                ]
-                yield out / "evaluation" / name, _evaluation(table, name, (task,), recipes, steps)
+        rows = table.rows_of(task)
+        # Chance and ceiling are those of the same number of action steps.
+        for steps in sorted({steps for row in rows for steps in row.n_action_steps}):
+            if table.controls:
+                name = f"{task}-controls-k{steps}"
+                yield folder / name, _evaluation(table, name, task, table.controls, (steps,))
+        for row in rows:
+            for run_seed in table.run_seeds:
+                recipe = _write_recipe(out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
+                name = f"{task}-{row.name}-run-{run_seed}"
+                yield folder / name, _evaluation(table, name, task, [recipe], row.n_action_steps)
 
 
 def _evaluation(
     table: ModelTable,
     name: str,
-    tasks: Sequence[str],
+    task: str,
     policies: Sequence[str],
     n_action_steps: tuple[int, ...],
 ) -> EvalConfig:
     return EvalConfig(
         name=name,
-        tasks=tuple(tasks),
+        tasks=(task,),
         policies=tuple(policies),
         n_action_steps=n_action_steps,
         episodes=table.episodes,

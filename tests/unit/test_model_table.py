@@ -21,6 +21,7 @@ from vla_eval.model_table import (
     gpu_hours,
     is_model_table,
     load_model_table,
+    narrow,
 )
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
@@ -45,8 +46,10 @@ USED = {
         "tiny",
         "html",
         "help",
+        "tasks",
+        "policies",
     },
-    "finetune": {"out", "device", "allow_unreplayed", "help"},
+    "finetune": {"out", "device", "allow_unreplayed", "help", "tasks", "policy"},
 }
 
 
@@ -89,11 +92,13 @@ def test_each_row_executes_no_more_than_the_chunk_that_its_policy_is_trained_for
 
 def test_chance_and_ceiling_are_measured_at_the_number_of_action_steps_of_each_row(tmp_path: Path) -> None:
     configs = dict(evaluations(load_model_table(PAPER), tmp_path))
-    assert len(configs) == 1 + 5 * 3 * 2  # K = 4 and K = 8 in folders of their own
-    controls = configs[tmp_path / "evaluation" / "controls"]
-    assert controls.n_action_steps == (4, 8) and set(controls.policies) == {"random", "cue_blind", "oracle"}
-    one = configs[tmp_path / "evaluation" / f"{TASK}-run-2-k4"]
-    assert one.tasks == (TASK,) and one.n_action_steps == (4,) and len(one.policies) == 4
+    assert len(configs) == 5 * (2 + 5 * 3)  # a task: controls at K = 4 and 8, five rows in three runs
+    for steps in (4, 8):
+        controls = configs[tmp_path / "evaluation" / f"{TASK}-controls-k{steps}"]
+        assert controls.n_action_steps == (steps,) and controls.tasks == (TASK,)
+        assert set(controls.policies) == {"random", "cue_blind", "oracle"}
+    one = configs[tmp_path / "evaluation" / f"{TASK}-octo_small-run-2"]
+    assert one.tasks == (TASK,) and one.n_action_steps == (4,) and len(one.policies) == 1
     recipe = yaml.safe_load(Path(one.policies[0]).read_text())
     assert recipe["args"]["checkpoint"] == str(tmp_path / "training" / "octo_small" / TASK / "run-2")
     assert recipe["default_n_action_steps"] == 4
@@ -130,17 +135,53 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
         (folder.name, config.n_action_steps, [Path(policy).stem for policy in config.policies])
         for folder, config in evaluations(table, tmp_path)
     ]
+    controls = [(k, (k,), ["random", "cue_blind", "oracle"]) for k in (1, 4, 8)]
     assert told == [
-        ("controls", (1, 4, 8), ["random", "cue_blind", "oracle"]),
-        (f"{TASK}-run-0-k1-4-8", (1, 4, 8), ["still"]),
-        (f"{TASK}-run-0-k4", (4,), ["plain"]),
-        (f"{other}-run-0-k1-4-8", (1, 4, 8), ["moving"]),
-        (f"{other}-run-0-k4", (4,), ["plain"]),
+        *((f"{TASK}-controls-k{k}", *rest) for k, *rest in controls),
+        (f"{TASK}-still-run-0", (1, 4, 8), ["still"]),
+        (f"{TASK}-plain-run-0", (4,), ["plain"]),
+        *((f"{other}-controls-k{k}", *rest) for k, *rest in controls),
+        (f"{other}-moving-run-0", (1, 4, 8), ["moving"]),
+        (f"{other}-plain-run-0", (4,), ["plain"]),
     ]
     for _, config in evaluations(table, tmp_path):
         assert config.stop_at_success and config.render.wrist_mesh == "simplified"
     assert "4 fine-tunings" in describe_effort(table, n_finished=0)
     assert "GPU hours" not in describe_effort(table, n_finished=0)  # nobody said what they cost
+
+
+def test_a_part_of_a_table_lies_where_the_whole_has_it(tmp_path: Path) -> None:
+    """So a table is evaluated row by row, while the others are still trained, and is whole in the end."""
+    table = load_model_table("memory_table")
+    parts = [
+        narrow(table, rows=["memory", "memoryless"]),
+        narrow(table, rows=["memory_free", "memoryless_free"]),
+        narrow(table, tasks=["RememberColor9-v0", "ShellGameTouch-v0"], rows=["act"]),
+        narrow(table, tasks=["RememberColor3-v0", "RememberColor5-v0", "InterceptMedium-v0"], rows=["act"]),
+    ]
+    whole = dict(evaluations(table, tmp_path))
+    found: dict[Path, Any] = {}
+    for part in parts:
+        for folder, config in evaluations(part, tmp_path):
+            assert config == whole[folder]
+            found[folder] = config
+    assert found == whole
+    trained = [str(one.config.out) for part in parts for one in finetunings(part, tmp_path)]
+    assert sorted(trained) == sorted(str(one.config.out) for one in finetunings(table, tmp_path))
+    assert narrow(table) == table
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"tasks": ["RememberColour9-v0"]}, "Did you mean 'RememberColor9-v0'"),
+        ({"rows": ["memoryles"]}, "Did you mean 'memoryless'"),
+        ({"tasks": ["InterceptMedium-v0"], "rows": ["memory"]}, "none of the rows memory is for"),
+    ],
+)
+def test_a_part_that_the_table_has_not_is_refused(part: dict[str, list[str]], message: str) -> None:
+    with pytest.raises(VlaEvalError, match=message):
+        narrow(load_model_table("memory_table"), **part)
 
 
 def test_gpu_hours_count_the_passes_that_training_needs() -> None:
@@ -211,7 +252,20 @@ def test_an_evaluation_says_what_has_not_been_trained(
     assert main(["eval", str(small), "--out", str(tmp_path / "out")]) == 1
     told = capsys.readouterr().err
     assert "octo_small on RememberColor3-v0, run seed 0" in told and "2 more" in told
-    assert f"mikasa-vla finetune {small}" in told
+    assert f"mikasa-vla finetune {small} --out" in told
+    flags = ["--task", TASK, "--policy", "pi0", "spatialvla"]
+    assert main(["eval", str(small), *flags, "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert "octo_small" not in told and "more" not in told
+    assert f"mikasa-vla finetune {small} {' '.join(flags)} --out" in told
+
+
+def test_a_part_of_a_table_is_for_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    alone = ["finetune", "--dataset", str(tmp_path), "--policy", "act"]
+    assert main([*alone, "--task", TASK]) == 1
+    assert "--task is for a table" in capsys.readouterr().err
+    assert main([*alone, "memory"]) == 1
+    assert "expected one name" in capsys.readouterr().err
 
 
 def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,7 +278,7 @@ def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.
 @pytest.mark.parametrize(
     "flags",
     [
-        ("eval", "--task", TASK),
+        ("eval", "--episodes", "3"),
         ("eval", "--seed-start", "0"),
         ("eval", "--set", "runs=2"),
         ("finetune", "--run-seed", "0"),

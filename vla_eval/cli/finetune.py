@@ -17,7 +17,8 @@ DESCRIPTION = """Train a policy on a dataset: lerobot's training loop, the recip
 CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `evaluation`; or name
 --policy and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
 `finetune` section (--set policy.chunk_size=8). The same command again goes on after a kill, exactly.
-CONFIG may also be a table of learned policies, such as paper_vla_table: all its fine-tunings in turn.
+CONFIG may also be a table of learned policies, such as paper_vla_table: all its fine-tunings in turn, or
+those of some rows (--policy) and tasks (--task).
 Then: mikasa-vla eval --policy RUN --task TASK"""
 
 
@@ -32,7 +33,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         allow_abbrev=False,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
-    parser.add_argument("--policy", metavar="NAME", help="recipe in policies/ with a `finetune` section")
+    parser.add_argument(
+        "--policy",
+        nargs="+",
+        metavar="NAME",
+        help="recipe in policies/ with a `finetune` section; of a table: its rows",
+    )
+    parser.add_argument("--task", nargs="+", dest="tasks", metavar="T", help="of a table: its tasks")
     parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset")
     parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")
     parser.add_argument("--batch-size", type=int, metavar="B", help="samples per step (the recipe's)")
@@ -79,9 +86,11 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
     """Return the configuration: the file, flags on top of it, `--set` on top of those."""
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        for name in ("policy", "dataset", "run_seed", "device", "out"):
+        for name in ("dataset", "run_seed", "device", "out"):
             if getattr(args, name) is not None:
                 data[name] = getattr(args, name)
+        if args.policy is not None:
+            data["policy"] = _one_policy(args.policy)
         if args.allow_unreplayed:
             data["allow_unreplayed"] = True
         evaluation = {"every_steps": args.eval_every, "episodes": args.eval_episodes}
@@ -94,6 +103,8 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
                 changes[name] = getattr(args, name)
         apply_overrides(changes, args.overrides, cls=FinetuneRecipe)
 
+    if args.tasks is not None:
+        raise RecipeError("--task is for a table of learned policies; otherwise the dataset says the task.")
     if args.config is not None:
         return load_recipe("configs", args.config, FinetuneConfig, edit=edit).value
     data: dict[str, Any] = {}
@@ -105,3 +116,11 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
                 f"finetune --policy act --dataset demos/RememberColor3-v0 --steps 20000"
             )
     return decode(FinetuneConfig, data, where="command line")
+
+
+def _one_policy(names: list[str]) -> str:
+    if len(names) > 1:
+        raise RecipeError(
+            f"--policy {' '.join(names)}: expected one name; several are for a table of learned policies."
+        )
+    return names[0]

@@ -17,11 +17,11 @@ from vla_eval.model_table import (
     evaluations,
     finetunings,
     load_model_table,
+    narrow,
 )
 
 RUNS_FOLDER = Path("runs")
 FINETUNE_FLAGS = {
-    "policy": "--policy",
     "dataset": "--dataset",
     "steps": "--steps",
     "batch_size": "--batch-size",
@@ -32,8 +32,6 @@ FINETUNE_FLAGS = {
     "overrides": "--set",
 }
 EVAL_FLAGS = {
-    "tasks": "--task",
-    "policies": "--policy",
     "n_action_steps": "--n-action-steps",
     "episodes": "--episodes",
     "seed_start": "--seed-start",
@@ -42,7 +40,9 @@ EVAL_FLAGS = {
     "record_video": "--record-video",
     "record_rrd": "--record-rrd",
 }
-"""Flags that a table does not take, by the name of their value."""
+"""Flags that a table does not take, by the name of their value.
+
+`--task` and `--policy` choose a part of it."""
 
 
 class _Work(NamedTuple):
@@ -60,7 +60,7 @@ def finetune_table(args: argparse.Namespace) -> int:
         VlaEvalError: a flag that a table does not take, a missing dataset, a mistake in a recipe.
     """
     _refuse(args, FINETUNE_FLAGS)
-    work = _work(args)
+    work = _work(args, rows=args.policy)
     _finetune(work, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
     for one in finetunings(work.table, work.out):
         print(one.config.out)
@@ -78,12 +78,12 @@ def evaluate_table(args: argparse.Namespace) -> int:
     from vla_eval.results.store import read_run
 
     _refuse(args, EVAL_FLAGS)
-    work = _work(args)
+    work = _work(args, rows=args.policies)
     check_baseline(args.baseline, [*work.table.controls, *(row.name for row in work.table.rows)])
     if args.tiny:
         _record_tiny(work, allow_environment_change=args.allow_environment_change)
         _finetune(work, device="cpu")
-    _refuse_unfinished(work, args.config)
+    _refuse_unfinished(work, args)
     command = typed_command()
     n_errors, folders = 0, []
     with stop_on_signals() as stop, _tiny_models(work):
@@ -108,8 +108,8 @@ def evaluate_table(args: argparse.Namespace) -> int:
     return EXIT_EPISODE_ERRORS if n_errors else 0
 
 
-def _work(args: argparse.Namespace) -> _Work:
-    table = load_model_table(args.config)
+def _work(args: argparse.Namespace, *, rows: Sequence[str] | None) -> _Work:
+    table = narrow(load_model_table(args.config), tasks=args.tasks or (), rows=rows or ())
     is_tiny = getattr(args, "tiny", False)
     out = Path(args.out) if args.out else RUNS_FOLDER / (table.name + ("_tiny" if is_tiny else ""))
     if not is_tiny:
@@ -171,15 +171,21 @@ def _is_finished(one: Finetuning) -> bool:
     return bool(whole) and int(whole[-1].name) >= load_finetune_recipe(one.config).value.steps
 
 
-def _refuse_unfinished(work: _Work, config: str) -> None:
+def _refuse_unfinished(work: _Work, args: argparse.Namespace) -> None:
     unfinished = _unfinished(work)
     if unfinished:
         names = [f"{one.row.name} on {one.task}, run seed {one.run_seed}" for one in unfinished[:3]]
         more = f" and {len(unfinished) - 3} more" if len(unfinished) > 3 else ""
         raise RecipeError(
             f"{work.table.name}: not fine-tuned to the end yet: {'; '.join(names)}{more}. "
-            f"First: mikasa-vla finetune {config} --out {work.out}"
+            f"First: mikasa-vla finetune {args.config}{_part(args)} --out {work.out}"
         )
+
+
+def _part(args: argparse.Namespace) -> str:
+    """Return the flags that choose a part of the table, as one would type them."""
+    flags = (("--task", args.tasks), ("--policy", args.policies))
+    return "".join(f" {flag} {' '.join(names)}" for flag, names in flags if names)
 
 
 def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
