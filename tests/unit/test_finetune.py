@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
+from urllib.error import URLError
 
 import pytest
 import torch
@@ -203,7 +204,20 @@ class TestRuns:
             finetune(config)
             assert run_an_episode(make_lerobot(context(), checkpoint=str(run))) == 3
 
+    def test_weights_that_cannot_be_downloaded_are_named_and_how_to_do_without(
+        self, recorded: Path, tmp_path: Path
+    ) -> None:
+        def offline(**_: Any) -> torch.nn.Module:
+            raise URLError("Name or service not known")
 
-def small_resnet(**_: Any) -> torch.nn.Module:
+        with (
+            patch.object(torchvision.models, "resnet18", offline),
+            pytest.raises(TrainingError, match=r"not known.*pretrained_backbone_weights=null"),
+        ):
+            finetune(act(recorded, tmp_path / "run"))
+
+
+def small_resnet(*, weights: Any) -> torch.nn.Module:
     """Stand for ResNet-18 in Diffusion Policy, which leaves out the last two layers of it."""
+    assert weights is None, "a recipe from scratch would download weights"
     return torch.nn.Sequential(torch.nn.Conv2d(3, 8, 32, 32), torch.nn.Identity(), torch.nn.Identity())

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 from unittest.mock import patch
+from urllib.error import URLError
 
 import numpy as np
 from accelerate.state import AcceleratorState
@@ -140,7 +141,13 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         path, cfg.pretrained_path = cfg.pretrained_path, None  # lerobot's loader is not to be asked
         peft, cfg.use_peft = cfg.use_peft, False
         set_seed(hooks.run_seed)
-        policy = originals["make_policy"](cfg=cfg, ds_meta=ds_meta, rename_map=rename_map or {"": ""})
+        try:
+            policy = originals["make_policy"](cfg=cfg, ds_meta=ds_meta, rename_map=rename_map or {"": ""})
+        except URLError as exc:
+            raise TrainingError(
+                f"the policy asks for weights that are not on this machine, and they could not be downloaded "
+                f"({exc.reason}). Without them: --set policy.pretrained_backbone_weights=null"
+            ) from exc
         cfg.pretrained_path, cfg.use_peft = path, peft
         if hooks.weights is None:
             return policy
