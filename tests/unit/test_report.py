@@ -250,6 +250,30 @@ def test_another_environment_or_recipe_is_named() -> None:
     assert has_note(table, "different contents of policies/p")
 
 
+def test_a_run_without_pictures_differs_in_no_renderer() -> None:
+    """Scripted policies see none: such a run has no renderer, where others may have two."""
+    software, gpu = {"render_device": "llvmpipe"}, {"render_device": "H100"}
+
+    def notes_of(*devices: dict[str, str]) -> tuple[str, ...]:
+        runs = []
+        for index, device in enumerate(devices):
+            description = RunDescription(
+                name="demo",
+                config={},
+                recipes={},
+                environment={"device": {"simulator": "physx_cpu", **device}},
+                options={},
+                command="",
+            )
+            run = stored(episodes(f"p{index}", "+"), path=f"runs/{index}")
+            runs.append(StoredRun(path=run.path, description=description, records=run.records))
+        return build_table(runs).notes
+
+    assert not any("different environments" in note for note in notes_of(software, {}, software))
+    (told,) = [note for note in notes_of(software, {}, gpu) if "different environments" in note]
+    assert told.endswith("what differs: device.render_device.")
+
+
 def test_a_run_that_was_continued_elsewhere_is_named() -> None:
     session = Session(
         started_at="2030-01-01T00:00:00+00:00",

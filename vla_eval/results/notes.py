@@ -13,6 +13,7 @@ from vla_eval.results.table import Row
 from vla_eval.tasks.catalog import find_task
 
 MAX_NAMED = 6
+RENDERER = "device.render_"
 VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
 
@@ -243,7 +244,12 @@ def _continued_elsewhere(run: StoredRun) -> list[str]:
 def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
     texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
     names = _unique(name for text in texts for name in text)
-    differing = [name for name in names if len({text.get(name) for text in texts}) > 1]
+    # A run without pictures has no renderer, and no other one either.
+    found = {
+        name: [text.get(name) for text in texts if name in text or not name.startswith(RENDERER)]
+        for name in names
+    }
+    differing = [name for name, values in found.items() if len(set(values)) > 1]
     if not differing:
         return []
     return [f"the run folders were made in different environments; what differs: {_names(differing)}."]
