@@ -160,7 +160,7 @@ def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[s
     chosen = tuple(task for task in table.tasks if not tasks or task in tasks)
     kept = []
     for row in table.rows:
-        own = tuple(task for task in chosen if row.tasks is None or task in row.tasks)
+        own = tuple(task for task in chosen if row in table.rows_of(task))
         if own and (not rows or row.name in rows):
             kept.append(replace(row, tasks=None if row.tasks is None else own))
     if not kept:

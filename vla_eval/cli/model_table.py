@@ -42,7 +42,8 @@ EVAL_FLAGS = {
 }
 """Flags that a table does not take, by the name of their value.
 
-`--task` and `--policy` choose a part of it."""
+`--task` and `--policy` choose a part of it.
+"""
 
 
 class _Work(NamedTuple):
