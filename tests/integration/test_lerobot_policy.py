@@ -262,3 +262,26 @@ class TestFramesOfAPluginPolicy:
         assert levels(*(observation(2 + i, 30 + 10 * i) for i in range(4))) == [40, 50, 60]
         policy.reset([start()])
         assert levels(observation(0, 70)) == [70, 70, 70]
+
+    @pytest.mark.parametrize(("deltas", "n_times"), [(None, 0), ([0], 1)])
+    def test_a_single_frame_has_the_axes_that_training_gave_it(
+        self,
+        counter_config: Any,
+        tmp_path: Path,
+        env: EnvSpec,
+        deltas: list[int] | None,
+        n_times: int,
+    ) -> None:
+        """lerobot's datasets give (B, 1, …) for `[0]` and (B, …) for None."""
+        policy = self.make(counter_config, tmp_path / "m", env, deltas=deltas)
+        shapes: list[tuple[int, ...]] = []
+
+        def watched(batch: dict[str, Any], **extra: Any) -> torch.Tensor:
+            shapes.append(tuple(batch["observation.images.base"].shape))
+            return torch.zeros(1, 4, 7)
+
+        policy._loaded.policy.predict_action_chunk = watched
+        policy.reset([start()])
+        policy.act(window(0, observation(0, 10)))
+        assert shapes == [(1, *([1] * n_times), 3, 128, 128)]
+        assert policy.spec.reads == "last"

@@ -182,8 +182,11 @@ class TestRuns:
         finetune(config)
         assert run_an_episode(make_lerobot(context(), checkpoint=str(run))) == 3
 
-    def test_a_small_diffusion_policy_goes_the_whole_way(self, recorded: Path, tmp_path: Path) -> None:
-        """It reads two frames, so the window of the adapter is tried, too."""
+    @pytest.mark.parametrize("n_obs_steps", [1, 2])
+    def test_a_small_diffusion_policy_goes_the_whole_way(
+        self, recorded: Path, tmp_path: Path, n_obs_steps: int
+    ) -> None:
+        """It reads its frames in time, a single one too, so the window of the adapter is tried."""
         run = tmp_path / "run"
         network = {
             "down_dims": [16, 32],
@@ -191,7 +194,8 @@ class TestRuns:
             "diffusion_step_embed_dim": 16,
             "num_train_timesteps": 4,
         }
-        policy = {"horizon": 8, "n_action_steps": 4, "num_inference_steps": 2, **network}
+        frames = {"n_obs_steps": n_obs_steps, "horizon": 8, "n_action_steps": 4}
+        policy = {**frames, "num_inference_steps": 2, **network}
         config = FinetuneConfig(
             policy="diffusion",
             dataset=str(recorded),

@@ -6,10 +6,10 @@ the frames of an episode are kept here, per slot, at control rate, however long 
 
 Three kinds of policies, told apart by their configuration:
 
-- `observation_delta_indices` is None or [0]: it reads the last frame (ACT, π0, π0.5, π0-FAST, SmolVLA).
-- with other indices, such as [-1, 0]: it gets these frames, (B, T, …); before the first frame of an
-  episode there is the first frame again, as in training (Diffusion Policy). One whose configuration says
-  `masks_history = True` is told which frames these are, by `FIELD_is_pad` (Octo).
+- `observation_delta_indices` is None: it reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
+- with indices, such as [-1, 0] or [0]: it gets these frames, (B, T, …), as in training (Diffusion
+  Policy, SmolVLA); before the first frame of an episode there is the first frame again. One whose
+  configuration says `masks_history = True` is told which frames these are, by `FIELD_is_pad` (Octo).
 - with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
   gets `memory` (a recurrent policy of one's own).
@@ -110,7 +110,7 @@ class LeRobotPolicy:
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
         for episode in episodes:
-            n_kept = 1 - min(self._deltas)
+            n_kept = 1 - min(self._deltas, default=0)
             self._slots[episode.slot] = _Slot(start=episode, frames=deque(maxlen=n_kept))
 
     def act(self, window: ObservationWindow) -> ActionChunk:
@@ -159,7 +159,7 @@ class LeRobotPolicy:
 
     def _frame(self, slot: _Slot) -> dict[str, Tensor]:
         """Return the frame, or the frames in time, that the next inference reads."""
-        if self._deltas == (0,):
+        if not self._deltas:
             return slot.frames[-1]
         last = len(slot.frames) - 1
         frames = _in_time([slot.frames[max(0, last + delta)] for delta in self._deltas])
@@ -274,10 +274,10 @@ def noise_shape(config: Any) -> tuple[int, int] | None:
 
 
 def history(config: Any) -> tuple[int, ...]:
-    """Return which frames it reads, 0 being the newest."""
+    """Return which frames it reads in time, 0 being the newest; none: the newest, without an axis of time."""
     # A policy that keeps its own history may read other frames in training than when it acts.
     deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices)
-    return tuple(int(delta) for delta in deltas) if deltas else (0,)
+    return tuple(int(delta) for delta in deltas or ())
 
 
 def _seed(slot: _Slot) -> int:

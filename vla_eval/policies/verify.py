@@ -102,8 +102,6 @@ def _act(loaded: LoadedPolicy) -> Tensor:
     if callable(getattr(loaded.policy, "remember", None)):
         extra["memory"] = loaded.policy.remember(loaded.preprocessor(_batch(config, (0,), draws)), None)
         deltas = ()
-    elif deltas == (0,):
-        deltas = ()
     loaded.policy.reset()
     batch = loaded.preprocessor(_batch(config, deltas, draws))
     actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))

@@ -139,9 +139,9 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         return [*range(1 - self.n_window_steps, 1), self.n_window_steps]
 
     @property
-    def inference_delta_indices(self) -> list[int]:
+    def inference_delta_indices(self) -> None:
         """Only the frame itself: the policy keeps its own history."""
-        return [0]
+        return None
 
     @property
     def action_delta_indices(self) -> list[int]:
