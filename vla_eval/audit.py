@@ -19,14 +19,16 @@ from vla_eval.results.store import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
-Kind = Literal["choice", "several", "no_choice"]
+Kind = Literal["choice", "several", "ball", "no_choice"]
 
 CONTROLS: Mapping[Kind, tuple[str, ...]] = {
     "choice": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch", "body_memory"),
     # One width of the gripper stands for one candidate; nobody has written a body that keeps several.
     "several": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch"),
+    "ball": ("random", "hold", "oracle", "cue_blind", "one_frame"),
     "no_choice": ("random", "hold", "oracle", "cue_blind"),
 }
+WITHOUT_PHASES: frozenset[Kind] = frozenset({"ball", "no_choice"})
 ALPHA = 0.001
 """Level of each test. Some 200 tests are made for all tasks: less than one false finding in five audits."""
 
@@ -38,6 +40,7 @@ SHORTCUTS = {
     "body_memory": "body can store the cue",
     "cue_touch": "won by staying at the cue",
     "cue_blind": "won without the cue",
+    "one_frame": "won from single frames",
 }
 WITHOUT_ACTING = "won without acting"
 
@@ -74,9 +77,9 @@ class TaskAudit:
 
 
 def kind_of(task: TaskSpec) -> Kind:
-    """Return whether one candidate has to be chosen, several, or none."""
+    """Return whether one candidate has to be chosen, several, or none; and there, whether a ball rolls."""
     if task.candidates is None:
-        return "no_choice"
+        return "ball" if "velocity_range_m_s" in task.kwargs else "no_choice"
     return "several" if "n_shown" in task.kwargs else "choice"
 
 
@@ -107,7 +110,7 @@ def audit_configs(
     for protocol in protocols:
         for kind, controls in CONTROLS.items():
             of_kind = tuple(task for task in tasks if kind_of(task_spec(task)) == kind)
-            if not of_kind or (protocol == "strict" and kind == "no_choice"):
+            if not of_kind or (protocol == "strict" and kind in WITHOUT_PHASES):
                 continue
             configs.append(
                 EvalConfig(
@@ -186,25 +189,29 @@ def _count(records: Sequence[EpisodeRecord]) -> Counts:
 def verdict(counts: Mapping[str, Counts], chance: float | None) -> tuple[str, ...]:
     """Return what the counts say: the shortcuts found, or that the oracle's knowledge of the cue decides.
 
-    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`); where
-    chance has to be measured, only doing nothing counts as one. Without a shortcut a task `needs memory` if
-    the oracle beats the blind arm (one-sided Fisher test at `ALPHA`); else there were too few episodes.
+    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, where
+    chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`); so has doing nothing that
+    ever succeeds. Without a shortcut a task `needs memory` if the oracle beats the blind arm; else there
+    were too few episodes.
 
     Args:
         counts: control -> what it reached.
         chance: success rate of a perfect arm that ignores the cue.
     """
-    found = []
-    if "hold" in counts and counts["hold"].success_once:
-        found.append(WITHOUT_ACTING)
-    for control, words in SHORTCUTS.items():
-        if control in counts and chance is not None and beats_chance(counts[control], chance):
-            found.append(words)
+    blind = counts.get("cue_blind")
+
+    def beats_memoryless(control: str) -> bool:
+        if control not in counts:
+            return False
+        if chance is not None and control != "oracle":
+            return beats_chance(counts[control], chance)
+        return blind is not None and beats(counts[control], blind)
+
+    found = [WITHOUT_ACTING] if "hold" in counts and counts["hold"].success_once else []
+    found += [words for control, words in SHORTCUTS.items() if beats_memoryless(control)]
     if found:
         return tuple(found)
-    oracle, blind = counts.get("oracle"), counts.get("cue_blind")
-    decided = oracle is not None and blind is not None and beats(oracle, blind)
-    return (NEEDS_MEMORY if decided else UNDECIDED,)
+    return (NEEDS_MEMORY if beats_memoryless("oracle") else UNDECIDED,)
 
 
 def beats_chance(counts: Counts, chance: float) -> bool:

@@ -27,6 +27,7 @@ POLICIES = {
     "tour": "vla_eval.policies.scripted:make_tour",
     "body_memory": "vla_eval.policies.shortcuts:make_body_memory",
     "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
+    "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
     "openvla": "vla_eval.policies.openvla.paper_compat:make_openvla",
     "ppo_expert": "vla_eval.policies.ppo_expert:make_ppo_expert",

@@ -38,6 +38,7 @@ FACTORIES = {
     "tour": scripted.make_tour,
     "body_memory": shortcuts.make_body_memory,
     "cue_touch": shortcuts.make_cue_touch,
+    "one_frame": shortcuts.make_one_frame,
 }
 
 
@@ -279,6 +280,50 @@ def test_staying_over_the_ball_wins_the_shell_game() -> None:
     assert n_successes(run("ShellGameTouch-v0", "cue_touch", range(1, 10))) >= 7  # by luck: 0.8 %
 
 
+@pytest.mark.parametrize(
+    "task", ["InterceptMedium-v0", pytest.param("InterceptGrabMedium-v0", marks=pytest.mark.slow)]
+)
+def test_an_arm_that_sees_one_frame_at_a_time_meets_the_ball(task: str) -> None:
+    """It is never told the ball's speed, and keeps nothing: the same frame gets the same answer."""
+    assert n_successes(run(task, "one_frame", range(101, 111))) >= 7  # the blind arm: 2 of 10 and 1 of 10
+    env = privileged_env(task)
+    seen: list[ActionChunk] = []
+
+    class Twice:
+        """Asks one policy that has played so far and one that has just been made."""
+
+        def __init__(self) -> None:
+            self._played = make_policy("one_frame", env, 1)
+            self.spec = self._played.spec
+
+        def reset(self, episodes: Any) -> None:
+            self._episodes = episodes
+            self._played.reset(episodes)
+
+        def act(self, window: ObservationWindow) -> ActionChunk:
+            state = window.last.privileged
+            assert state is not None
+            told = replace(
+                state,
+                bodies={
+                    **state.bodies,
+                    "ball": replace(state.bodies["ball"], velocity_m_s=np.full(3, np.nan)),
+                },
+            )
+            fresh = make_policy("one_frame", env, 1)
+            fresh.reset(self._episodes)
+            last = replace(window.last, privileged=told)
+            other = fresh.act(replace(window, frames=(last,)))
+            chunk = self._played.act(window)
+            assert chunk.actions.tobytes() == other.actions.tobytes()
+            seen.append(chunk)
+            return chunk
+
+    start = EpisodeStart(slot=0, task=task, seed=101, run=0, instruction="go", horizon_steps=40)
+    rollout(env, Twice(), [start], RolloutSettings(chunking=ChunkingSpec(n_action_steps=1)))
+    assert len(seen) == 40
+
+
 CHOICES = [task for task in sorted(TASKS) if kind_of(TASKS[task]) == "choice"]
 
 
@@ -307,6 +352,11 @@ def test_a_body_that_has_nothing_to_choose_among_is_refused(task: str) -> None:
 def test_a_tour_of_a_task_without_candidates_is_refused() -> None:
     with pytest.raises(SpecMismatchError, match="has none"):
         make_policy("tour", privileged_env("InterceptMedium-v0"), 1)
+
+
+def test_single_frames_of_a_task_without_a_ball_are_refused() -> None:
+    with pytest.raises(SpecMismatchError, match="no ball rolls"):
+        make_policy("one_frame", privileged_env("TakeItBack-v0"), 1)
 
 
 def test_a_privileged_policy_needs_an_environment_that_tells() -> None:

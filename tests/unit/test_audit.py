@@ -51,12 +51,21 @@ def test_where_chance_is_measured_the_blind_arm_is_what_the_oracle_is_compared_w
     assert verdict(counts(hold=0, random=0, oracle=5, cue_blind=4), None) == ("not decided",)
 
 
+def test_a_ball_that_single_frames_catch_needs_no_memory() -> None:
+    """The blind arm is what the control is compared with; Fisher, 4 of 30: 15 has p = 2.5e-3, 17 has 5e-4."""
+    met = {"hold": 0, "random": 0, "oracle": 30, "cue_blind": 4}
+    assert verdict(counts(**met, one_frame=17), None) == ("won from single frames",)
+    assert verdict(counts(**met, one_frame=15), None) == ("needs memory",)
+
+
 def test_every_task_is_played_by_the_controls_that_fit_it() -> None:
     kinds = {task: kind_of(spec) for task, spec in TASKS.items()}
     assert sum(kind == "several" for kind in kinds.values()) == 9  # Bunch, Seq, Chain of 3, 5, 7
-    assert {task for task, kind in kinds.items() if kind == "no_choice"} == {
-        task for task in TASKS if task.startswith(("Intercept", "Rotate", "TakeItBack"))
-    }
+    families = {"ball": "Intercept", "no_choice": ("Rotate", "TakeItBack")}
+    for kind, names in families.items():
+        assert {task for task in TASKS if kinds[task] == kind} == {
+            task for task in TASKS if task.startswith(names)
+        }
     paper = audit_configs(list(TASKS), ("paper",), episodes=3, workers=1)
     assert sorted(task for config in paper for task in config.tasks) == sorted(TASKS)
     strict = audit_configs(list(TASKS), ("strict",), episodes=3, workers=1)
@@ -102,12 +111,12 @@ def test_the_command_plays_prints_and_goes_on_where_it_stopped(
     assert all(control in header for control in CONTROLS["choice"])
     assert color.startswith("| RememberColor3-v0 | paper | 33.3 |")
     assert ball.startswith("| InterceptMedium-v0 | paper | measured |")
-    assert color.count("| – ") == 0 and ball.count("| – ") == 3  # tour, cue_touch, body_memory
+    assert color.count("| – ") == 1 and ball.count("| – ") == 3  # one_frame; tour, cue_touch, body_memory
 
     assert main([*arguments, "--format", "json"]) == 0
     shown = capsys.readouterr()
     assert "all 14 episodes are there" in shown.err  # 7 controls, 2 episodes each
-    assert "all 8 episodes are there" in shown.err
+    assert "all 10 episodes are there" in shown.err
     audited = json.loads(shown.out)
     assert [row["task"] for row in audited] == ["RememberColor3-v0", "InterceptMedium-v0"]
     oracle = audited[0]["counts"]["oracle"]

@@ -8,19 +8,26 @@
 - `cue_touch`: goes to the place where the cue is shown as soon as the episode begins, and stays there. It
   wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
   answer: over the ball of a shell game, where it goes down on the mug that it finds nearest.
+- `one_frame`: plays a rolling ball with the oracle's law, but begins anew at each inference, and is told
+  where the ball is, not how fast it rolls. It supposes the mean speed of the task; beside the ball, which
+  it has followed to be there, the speed of its own arm. So any policy that reads the last frame and its
+  joints' speeds could do the same.
 """
 
 from dataclasses import replace
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vla_eval.core import ActionChunk, ObservationWindow, PrivilegedState
+from vla_eval.core import ActionChunk, BodyState, ObservationWindow, PrivilegedState
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
+from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.choices import CandidateExpert
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.scripted import BallExpertFactory
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 from vla_eval.tasks.catalog import task_spec
 
@@ -115,3 +122,55 @@ def make_cue_touch(context: PolicyContext) -> CueTouchPolicy:
             "place of its own. Leave this task out for this policy."
         )
     return CueTouchPolicy(context)
+
+
+BESIDE_M = 0.09
+"""The arm is beside the ball, seen from above: an arm that waits next to the lane is nearer than this only
+while the ball passes."""
+
+
+class OneFramePolicy(ScriptedPolicy):
+    """Sees where the ball is, not how it moves; see the module's text."""
+
+    privileged = True
+
+    def __init__(
+        self, context: PolicyContext, make_expert: BallExpertFactory, velocity_range_m_s: tuple[float, float]
+    ) -> None:
+        """Take the expert of the task's family, and the (least, most) initial speed along y."""
+        super().__init__(context)
+        self._make_expert = make_expert
+        self._rolling_m_s = ROLLING_SHARE * np.array(velocity_range_m_s)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Plan a chunk with an expert that has seen nothing before this frame."""
+        state = self.privileged_state(window)
+        ball = replace(state.bodies["ball"], velocity_m_s=self._supposed_velocity_m_s(state))
+        bodies: dict[str, BodyState] = {**state.bodies, "ball": ball}
+        expert = self._make_expert(rng=self._rng[window.slot], imagined=False)
+        rows = expert.plan(replace(state, bodies=bodies), window.last.step, self._n_actions)
+        return ActionChunk(actions=rows)
+
+    def _supposed_velocity_m_s(self, state: PrivilegedState) -> NDArray[np.float64]:
+        least, most = self._rolling_m_s
+        own_y = state.tcp_velocity_m_s[1]
+        away_m = np.linalg.norm((state.bodies["ball"].position_m - state.tcp_position_m)[:2])
+        follows = away_m < BESIDE_M and own_y > least / 2
+        along_y = np.clip(own_y, least, most) if follows else (least + most) / 2
+        return np.array([ROLLING_SHARE * np.mean(IMAGINED_VELOCITY_X_M_S), along_y, 0.0])
+
+
+def make_one_frame(context: PolicyContext) -> OneFramePolicy:
+    """Make the `one_frame` control.
+
+    Raises:
+        SpecMismatchError: no ball rolls in the task.
+    """
+    task = task_spec(context.env.task)
+    if "velocity_range_m_s" not in task.kwargs:
+        raise SpecMismatchError(
+            f"policy '{context.name}' plays a ball without being told its speed; in {context.env.task} no ball "
+            "rolls. Leave this task out for this policy."
+        )
+    expert = cast(BallExpertFactory, task_expert(context))
+    return OneFramePolicy(context, expert, task.kwargs["velocity_range_m_s"])
