@@ -44,8 +44,8 @@ def _notes(audits: Sequence[TaskAudit]) -> list[str]:
     spread = f"{episodes[0]} to {episodes[-1]}" if len(episodes) > 1 else "".join(map(str, episodes))
     notes = [
         f"Success once / right first choices, in percent of {spread} episodes per cell. A shortcut is named "
-        f"where its control beats chance (exact binomial test, p < {ALPHA}) or, where chance is measured, the "
-        "blind arm (Fisher's test); `needs memory`: no such control, and the oracle beats the blind arm.",
+        f"where its control beats chance (exact binomial test, p < {ALPHA}) or, where that is measured, "
+        "the blind arm (Fisher's test); `needs memory`: no such control, and the oracle beats the blind arm.",
     ]
     n_errors = sum(audit.n_errors for audit in audits)
     if n_errors:

@@ -169,8 +169,8 @@ def make_one_frame(context: PolicyContext) -> OneFramePolicy:
     task = task_spec(context.env.task)
     if "velocity_range_m_s" not in task.kwargs:
         raise SpecMismatchError(
-            f"policy '{context.name}' plays a ball without being told its speed; in {context.env.task} no ball "
-            "rolls. Leave this task out for this policy."
+            f"policy '{context.name}' plays a ball without being told its speed; in {context.env.task} "
+            "no ball rolls. Leave this task out for this policy."
         )
     expert = cast(BallExpertFactory, task_expert(context))
     return OneFramePolicy(context, expert, task.kwargs["velocity_range_m_s"])
