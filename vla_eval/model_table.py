@@ -63,6 +63,7 @@ class TableRow:
         n_action_steps: actions executed per inference; each checkpoint is evaluated at all of them.
         tasks: those of the table's tasks that the row is for; None: all.
         finetune: fields of the recipe's `finetune` section that are set to other values in this row.
+        slots_per_worker: episodes that a worker evaluates side by side, one forward pass for all of them.
         cost: what a training step costs, for the estimate of GPU hours; None where it is small.
     """
 
@@ -71,6 +72,7 @@ class TableRow:
     n_action_steps: tuple[int, ...]
     tasks: tuple[str, ...] | None = None
     finetune: dict[str, Any] | None = None  # Any: decoded with the row's recipe
+    slots_per_worker: int = 1
     cost: StepCost | None = None
 
     def __post_init__(self) -> None:
@@ -80,6 +82,10 @@ class TableRow:
         if not steps or len(set(steps)) != len(steps) or min(steps) < 1:
             raise RecipeError(
                 f"row {self.name}: n_action_steps is {list(steps)}, expected numbers ≥ 1, none of them twice."
+            )
+        if self.slots_per_worker < 1:
+            raise RecipeError(
+                f"row {self.name}: slots_per_worker is {self.slots_per_worker}, expected a number ≥ 1."
             )
 
 
@@ -252,7 +258,8 @@ def evaluations(
             for run_seed in table.run_seeds:
                 recipe = _write_recipe(out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
                 name = f"{task}-{row.name}-run-{run_seed}"
-                yield folder / name, _evaluation(table, name, task, [recipe], row.n_action_steps)
+                config = _evaluation(table, name, task, [recipe], row.n_action_steps)
+                yield folder / name, replace(config, slots_per_worker=row.slots_per_worker)
 
 
 def _evaluation(

@@ -13,7 +13,7 @@ from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import FolderInUseError, VlaEvalError
+from vla_eval.errors import FolderInUseError, RecipeError, VlaEvalError
 from vla_eval.model_table import (
     describe_effort,
     evaluations,
@@ -118,7 +118,7 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
             "tasks": [other],
             "finetune": free,
         },
-        {"name": "plain", "policy": "act", "n_action_steps": [4]},
+        {"name": "plain", "policy": "act", "n_action_steps": [4], "slots_per_worker": 8},
     ]
     fields = {"policy": {"heads": 4}, "num_workers": 0}
     settings = {"render": {"wrist_mesh": "simplified"}, "stop_at_success": True}
@@ -146,8 +146,15 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
     ]
     for _, config in evaluations(table, tmp_path):
         assert config.stop_at_success and config.render.wrist_mesh == "simplified"
+        assert config.slots_per_worker == (8 if "plain" in config.name else 1)
     assert "4 fine-tunings" in describe_effort(table, n_finished=0)
     assert "GPU hours" not in describe_effort(table, n_finished=0)  # nobody said what they cost
+
+
+def test_a_row_without_a_slot_is_refused(small: Path) -> None:
+    row = {"name": "plain", "policy": "act", "n_action_steps": [4], "slots_per_worker": 0}
+    with pytest.raises(RecipeError, match="row plain: slots_per_worker is 0, expected a number ≥ 1"):
+        load_model_table(str(changed(small, rows=[row])))
 
 
 def test_a_part_of_a_table_lies_where_the_whole_has_it(tmp_path: Path) -> None:
@@ -156,8 +163,9 @@ def test_a_part_of_a_table_lies_where_the_whole_has_it(tmp_path: Path) -> None:
     parts = [
         narrow(table, rows=["memory", "memoryless"]),
         narrow(table, rows=["memory_free", "memoryless_free"]),
-        narrow(table, tasks=["RememberColor9-v0", "ShellGameTouch-v0"], rows=["act"]),
-        narrow(table, tasks=["RememberColor3-v0", "RememberColor5-v0", "InterceptMedium-v0"], rows=["act"]),
+        narrow(table, tasks=["RememberColor9-v0", "ShellGameTouch-v0"], rows=["diffusion"]),
+        narrow(table, tasks=["RememberColor3-v0", "RememberColor5-v0"], rows=["diffusion"]),
+        narrow(table, tasks=["InterceptMedium-v0"], rows=["diffusion"]),
     ]
     whole = dict(evaluations(table, tmp_path))
     found: dict[Path, Any] = {}
@@ -331,8 +339,8 @@ def test_small_policies_come_to_a_table_at_several_numbers_of_action_steps(
     rows = json.loads(capsys.readouterr().out)["rows"]
     controls = ["random", "cue_blind", "oracle"]
     policies = {
-        TASK: [*controls, "memory", "memoryless", "act"],
-        tasks[1]: [*controls, "memory_free", "memoryless_free", "act"],
+        TASK: [*controls, "memory", "memoryless", "diffusion"],
+        tasks[1]: [*controls, "memory_free", "memoryless_free", "diffusion"],
     }
     assert {(row["task"], row["policy"], row["n_action_steps"]) for row in rows} == {
         (task, name, steps) for task in tasks for name in policies[task] for steps in (4, 8)

@@ -25,8 +25,9 @@ TINY_RECIPES = {
     "mikasa_spatialvla": "spatialvla_tiny",
 }
 """Type of a policy -> recipe of its tiny form."""
-SMALL = ("act", "mikasa_memory")
-"""Types whose own recipes are small enough."""
+TINY_UNET: dict[str, Any] = {"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}
+SMALL = ("act", "diffusion", "mikasa_memory")
+"""Types whose own recipes are small enough; of a diffusion the U-Net is not."""
 TINY_PI0_ADAPTER = "vla_eval.training.tiny_models:make_tiny_pi0"
 N_EPISODES = 2
 N_STEPS = 2
@@ -96,7 +97,8 @@ def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
     else:
         section = to_data(load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune)
     section |= SHORT
-    section["policy"] = {**section["policy"], **chunk}
+    # A diffusion's chunk is what its horizon leaves of it: the recipe's own.
+    section["policy"] = {**section["policy"], **(TINY_UNET if kind == "diffusion" else chunk)}
     return _recipe(row, section), LEROBOT_ADAPTER
 
 
