@@ -159,7 +159,7 @@ def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[s
 
     Raises:
         UnknownNameError: one is not in the table.
-        RecipeError: none of the rows is for one of the tasks.
+        RecipeError: no row, or none of these, is for one of the tasks.
     """
     check_names("task", tasks, table.tasks, where=table.name)
     check_names("row", rows, [row.name for row in table.rows], where=table.name)
@@ -170,7 +170,8 @@ def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[s
         if own and (not rows or row.name in rows):
             kept.append(replace(row, tasks=None if row.tasks is None else own))
     if not kept:
-        raise RecipeError(f"{table.name}: none of the rows {', '.join(rows)} is for {', '.join(tasks)}.")
+        named = f"none of the rows {', '.join(rows)}" if rows else "no row"
+        raise RecipeError(f"{table.name}: {named} is for {', '.join(tasks)}.")
     return replace(table, tasks=chosen, rows=tuple(kept))
 
 

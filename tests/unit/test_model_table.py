@@ -13,7 +13,7 @@ from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
-from vla_eval.errors import FolderInUseError, RecipeError, VlaEvalError
+from vla_eval.errors import FolderInUseError, VlaEvalError
 from vla_eval.model_table import (
     describe_effort,
     evaluations,
@@ -151,12 +151,6 @@ def test_rows_may_have_several_numbers_of_action_steps_tasks_and_fields_of_their
     assert "GPU hours" not in describe_effort(table, n_finished=0)  # nobody said what they cost
 
 
-def test_a_row_without_a_slot_is_refused(small: Path) -> None:
-    row = {"name": "plain", "policy": "act", "n_action_steps": [4], "slots_per_worker": 0}
-    with pytest.raises(RecipeError, match="row plain: slots_per_worker is 0, expected a number ≥ 1"):
-        load_model_table(str(changed(small, rows=[row])))
-
-
 def test_a_part_of_a_table_lies_where_the_whole_has_it(tmp_path: Path) -> None:
     """So a table is evaluated row by row, while the others are still trained, and is whole in the end."""
     table = load_model_table("memory_table")
@@ -192,6 +186,13 @@ def test_a_part_that_the_table_has_not_is_refused(part: dict[str, list[str]], me
         narrow(load_model_table("memory_table"), **part)
 
 
+def test_a_task_that_no_row_is_for_is_said_so(small: Path) -> None:
+    rows = [{"name": "other", "policy": "act", "n_action_steps": [4], "tasks": [TASK]}]
+    table = load_model_table(str(changed(small, rows=rows, tasks=[TASK, "InterceptMedium-v0"])))
+    with pytest.raises(VlaEvalError, match="no row is for InterceptMedium-v0"):
+        narrow(table, tasks=["InterceptMedium-v0"])
+
+
 def test_gpu_hours_count_the_passes_that_training_needs() -> None:
     """π0, all weights, batch 32: 6 · 3.3e9 · 570 · 32 · 50,000 operations at 1e14 per second."""
     rows = {row.name: row for row in load_model_table(PAPER).rows}
@@ -212,6 +213,7 @@ def test_a_table_is_told_from_an_evaluation() -> None:
         ({"tasks": ["RememberColour3-v0"]}, "Did you mean"),
         ({"rows": [{**ROW, "n_action_steps": []}]}, "expected numbers ≥ 1"),
         ({"rows": [{**ROW, "n_action_steps": [4, 4]}]}, "none of them twice"),
+        ({"rows": [{**ROW, "slots_per_worker": 0}]}, "slots_per_worker is 0, expected a number ≥ 1"),
         ({"rows": [{**ROW, "tasks": ["RememberColor5-v0"]}]}, f"Did you mean '{TASK}'"),
         ({"rows": [{**ROW, "cost": {"parameters": 0, "tokens": 1, "trained": "all"}}]}, "parameters is 0"),
     ],
