@@ -57,9 +57,39 @@ def test_success_at_end_is_undefined_where_episodes_stop_at_success() -> None:
     assert only_row(build_table([stored(records)]), "p").success_at_end is None
 
 
+def test_of_the_episodes_that_chose_it_is_told_how_many_chose_right() -> None:
+    """An arm that often touches nothing: its success says how it aims, this what it knows."""
+    records = [
+        *episodes("p", "++", first_choice=1),
+        episode("p", 3, "-", first_choice=2),
+        episode("p", 4, "+", first_choice=0, first_choice_success=False),  # the right one later on
+        *(episode("p", seed, "-") for seed in (5, 6, 7)),
+        episode("p", 8, "e"),
+    ]
+    row = only_row(build_table([stored(records)]), "p")
+    assert (row.n_chose, row.n_chose_right) == (4, 2)
+    # Wilson, 2 of 4: (0.5 ± 1.96 * sqrt(1/16 + 0.96 / 16)) / 1.96 with z² / n = 0.96
+    shown = render(build_table([stored(records)]), "markdown", columns=["chose", "right_if_chose"])
+    assert [cell.strip() for cell in shown.splitlines()[2].strip("|").split("|")] == [
+        "4",
+        "0.50 [0.15, 0.85]",
+    ]
+    nobody = render(
+        build_table([stored(episodes("p", "--"))]), "markdown", columns=["chose", "right_if_chose"]
+    )
+    assert [cell.strip() for cell in nobody.splitlines()[2].strip("|").split("|")] == ["0", "—"]
+
+
+def test_what_was_chosen_in_several_runs_has_no_interval_over_episodes() -> None:
+    runs = [record for run in (0, 1) for record in episodes("p", "+-", run=run, first_choice=1)]
+    shown = render(build_table([stored(runs)]), "markdown", columns=["chose", "right_if_chose"])
+    assert [cell.strip() for cell in shown.splitlines()[2].strip("|").split("|")] == ["4", "0.50"]
+
+
 def test_there_is_no_first_choice_without_candidates() -> None:
     records = episodes("p", "+-", task=INTERCEPT, n_candidates=None, first_choice_success=None)
-    assert only_row(build_table([stored(records)]), "p").first_choice_success is None
+    row = only_row(build_table([stored(records)]), "p")
+    assert row.first_choice_success is row.n_chose is row.n_chose_right is None
 
 
 def test_a_run_folder_given_twice_counts_once() -> None:

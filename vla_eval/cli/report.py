@@ -38,7 +38,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         default=[],
         metavar="NAME",
         help="only these, in this order, in markdown or latex: task policy K variant episodes errors success "
-        "at_end first_choice steps inferences difference chance ceiling corrected",
+        "at_end first_choice chose right_if_chose steps inferences difference chance ceiling corrected",
     )
     parser.add_argument(
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"

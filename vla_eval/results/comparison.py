@@ -35,6 +35,8 @@ class Measured:
     sem: float | None = None
     success_at_end: float | None = None
     first_choice_success: float | None = None
+    n_chose: int | None = None
+    n_chose_right: int | None = None
     mean_success_step: float | None = None
     inferences_per_episode: float | None = None
 
@@ -71,6 +73,8 @@ def measure(group: RowGroup) -> Measured:
     smallest = min((run.results.values() for run in runs), key=len)
     one_run = wilson_interval(_n_success(smallest), len(smallest))
     results = group.results
+    chose = [record for record in results if record.first_choice is not None]
+    has_candidates = any(record.first_choice_success is not None for record in results)
     return Measured(
         n_runs=len(runs),
         n_success_once=_n_success(results),
@@ -80,6 +84,8 @@ def measure(group: RowGroup) -> Measured:
         sem=estimate.sem,
         success_at_end=_mean_over_runs(runs, lambda record: record.success_at_end),
         first_choice_success=_mean_over_runs(runs, lambda record: record.first_choice_success),
+        n_chose=len(chose) if has_candidates else None,
+        n_chose_right=sum(bool(record.first_choice_success) for record in chose) if has_candidates else None,
         mean_success_step=_rate([r for r in results if r.success_once], lambda record: record.success_step),
         inferences_per_episode=_rate(results, lambda record: record.n_inferences),
     )

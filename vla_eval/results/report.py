@@ -94,6 +94,8 @@ def _row(
         sem=own.sem,
         success_at_end=own.success_at_end,
         first_choice_success=own.first_choice_success,
+        n_chose=own.n_chose,
+        n_chose_right=own.n_chose_right,
         mean_success_step=own.mean_success_step,
         inferences_per_episode=own.inferences_per_episode,
         baseline=comparison.baseline.policy if comparison else None,

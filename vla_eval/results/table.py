@@ -22,6 +22,7 @@ class Row:
         n_runs: independent runs with a result; sem: standard error over them.
         success_at_end: share that succeeded at the last step.
         first_choice_success: share whose first candidate touched was the right one.
+        n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
         mean_success_step: control steps until success, over the successes.
         inferences_per_episode: calls of the policy.
         baseline, baseline_n_action_steps: what this row is compared with, on the same episodes.
@@ -48,6 +49,8 @@ class Row:
     sem: float | None
     success_at_end: float | None
     first_choice_success: float | None
+    n_chose: int | None
+    n_chose_right: int | None
     mean_success_step: float | None
     inferences_per_episode: float | None
     baseline: str | None

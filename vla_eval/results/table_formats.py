@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 from vla_eval.errors import ReportError, check_names
 from vla_eval.results import paper_table
-from vla_eval.results.estimates import CONFIDENCE
+from vla_eval.results.estimates import CONFIDENCE, wilson_interval
 from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
 from vla_eval.results.table import Row, Table
 
@@ -24,12 +24,13 @@ PAPER_TITLE = f"The paper's figures, not measured here ({paper_table.PROTOCOL})"
 
 
 class Column(NamedTuple):
-    """One column of the printed table; `--columns` calls it by its name."""
+    """One column of the printed table; `--columns` calls it by its name. An extra one has to be asked for."""
 
     name: str
     title: str
     cell: Callable[[Row], str]
     is_number: bool = True
+    is_extra: bool = False
 
 
 def render(table: Table, fmt: Format, *, paper: bool = False, columns: Sequence[str] = ()) -> str:
@@ -39,7 +40,8 @@ def render(table: Table, fmt: Format, *, paper: bool = False, columns: Sequence[
         table: what `build_table` returned.
         fmt: `markdown` and `latex` are to be read, `csv` and `json` hold every column in full precision.
         paper: add the paper's figures for the same tasks, marked as such and apart from one's own.
-        columns: names of those to be shown in the formats that are to be read, in this order; none: all.
+        columns: names of those to be shown in the formats that are to be read, in this order; none: all but
+            the extra ones.
 
     Returns:
         The text, without a newline at its end.
@@ -73,12 +75,14 @@ def _paper_figures(table: Table) -> list[PaperFigure]:
 
 
 def _chosen(table: Table, names: Sequence[str]) -> list[Column]:
-    """Return the columns of these names, or all: `variant` only where there is more than one."""
+    """Return the columns of these names, or all but the extra ones: `variant` where there are several."""
     by_name = {column.name: column for column in _columns(table)}
     check_names("column", names, by_name, where="--columns")
     if not names and not any(row.variant for row in table.rows):
         del by_name["variant"]
-    return [by_name[name] for name in names or by_name]
+    if not names:
+        return [column for column in by_name.values() if not column.is_extra]
+    return [by_name[name] for name in names]
 
 
 def _columns(table: Table) -> list[Column]:
@@ -93,6 +97,8 @@ def _columns(table: Table) -> list[Column]:
         Column("success", "success once", _success_once),
         Column("at_end", "at end", lambda row: _rate(row.success_at_end)),
         Column("first_choice", "1st choice", lambda row: _rate(row.first_choice_success)),
+        Column("chose", "chose", lambda row: _number(row.n_chose), is_extra=True),
+        Column("right_if_chose", "right if chose", _right_if_chose, is_extra=True),
         Column("steps", "steps", lambda row: _count(row.mean_success_step)),
         Column("inferences", "infer.", lambda row: _count(row.inferences_per_episode)),
         Column("difference", baseline, _difference),
@@ -108,6 +114,18 @@ def _rate(value: float | None) -> str:
 
 def _count(value: float | None) -> str:
     return UNDEFINED if value is None else f"{value:.1f}"
+
+
+def _number(value: int | None) -> str:
+    return UNDEFINED if value is None else str(value)
+
+
+def _right_if_chose(row: Row) -> str:
+    if not row.n_chose or row.n_chose_right is None:
+        return UNDEFINED
+    share = _rate(row.n_chose_right / row.n_chose)
+    interval = wilson_interval(row.n_chose_right, row.n_chose) if row.n_runs == 1 else None
+    return share if interval is None else f"{share} [{_rate(interval.low)}, {_rate(interval.high)}]"
 
 
 def _episodes(row: Row) -> str:
