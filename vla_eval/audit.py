@@ -198,20 +198,21 @@ def verdict(counts: Mapping[str, Counts], chance: float | None) -> tuple[str, ..
         counts: control -> what it reached.
         chance: success rate of a perfect arm that ignores the cue.
     """
-    blind = counts.get("cue_blind")
-
-    def beats_memoryless(control: str) -> bool:
-        if control not in counts:
-            return False
-        if chance is not None and control != "oracle":
-            return beats_chance(counts[control], chance)
-        return blind is not None and beats(counts[control], blind)
-
+    oracle, blind = counts.get("oracle"), counts.get("cue_blind")
     found = [WITHOUT_ACTING] if "hold" in counts and counts["hold"].success_once else []
-    found += [words for control, words in SHORTCUTS.items() if beats_memoryless(control)]
+    for control, words in SHORTCUTS.items():
+        if control in counts and _beats_memoryless(counts[control], chance, blind):
+            found.append(words)
     if found:
         return tuple(found)
-    return (NEEDS_MEMORY if beats_memoryless("oracle") else UNDECIDED,)
+    decided = oracle is not None and blind is not None and beats(oracle, blind)
+    return (NEEDS_MEMORY if decided else UNDECIDED,)
+
+
+def _beats_memoryless(counts: Counts, chance: float | None, blind: Counts | None) -> bool:
+    if chance is not None:
+        return beats_chance(counts, chance)
+    return blind is not None and beats(counts, blind)
 
 
 def beats_chance(counts: Counts, chance: float) -> bool:

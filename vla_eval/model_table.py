@@ -259,8 +259,10 @@ def evaluations(
             for run_seed in table.run_seeds:
                 recipe = _write_recipe(out, row, task, run_seed, own.get(row.name, LEROBOT_ADAPTER))
                 name = f"{task}-{row.name}-run-{run_seed}"
-                config = _evaluation(table, name, task, [recipe], row.n_action_steps)
-                yield folder / name, replace(config, slots_per_worker=row.slots_per_worker)
+                config = _evaluation(
+                    table, name, task, [recipe], row.n_action_steps, slots_per_worker=row.slots_per_worker
+                )
+                yield folder / name, config
 
 
 def _evaluation(
@@ -269,6 +271,8 @@ def _evaluation(
     task: str,
     policies: Sequence[str],
     n_action_steps: tuple[int, ...],
+    *,
+    slots_per_worker: int = 1,
 ) -> EvalConfig:
     return EvalConfig(
         name=name,
@@ -280,6 +284,7 @@ def _evaluation(
         simulator=table.simulator,
         render=table.render,
         stop_at_success=table.stop_at_success,
+        slots_per_worker=slots_per_worker,
     )
 
 

@@ -94,16 +94,14 @@ def _count_tensors(file: Path) -> int:
 @torch.no_grad()
 def _act(loaded: LoadedPolicy) -> Tensor:
     config, draws = loaded.config, torch.Generator().manual_seed(0)
-    deltas = history(config)
     extra: dict[str, Any] = {}
     shape = noise_shape(config)
     if shape is not None:
         extra["noise"] = torch.randn(1, *shape, generator=draws).to(config.device)
     if callable(getattr(loaded.policy, "remember", None)):
         extra["memory"] = loaded.policy.remember(loaded.preprocessor(_batch(config, (0,), draws)), None)
-        deltas = ()
     loaded.policy.reset()
-    batch = loaded.preprocessor(_batch(config, deltas, draws))
+    batch = loaded.preprocessor(_batch(config, history(config), draws))
     actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))
     return actions
 
