@@ -1,12 +1,15 @@
-"""The tables of `docs/measuring.md`, computed again by the project's own functions."""
+"""Numbers and sentences of the docs that need no run, made again by the project's own functions."""
 
 import re
 from pathlib import Path
 
+from tests.unit import stored_runs
+from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
 
-PAGE = (Path(__file__).parents[2] / "docs" / "measuring.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
 CHANCES = (1 / 3, 1 / 5, 1 / 9)
 
 
@@ -33,3 +36,16 @@ def test_so_many_episodes_find_a_difference() -> None:
                 episodes_to_settle(difference, discordance, level=LEVEL / n_tests) for n_tests in (1, 10)
             ]
             assert [int(number) for number in re.findall(r"\d+", cell)] == wanted
+
+
+def test_the_readme_quotes_the_audit_that_ships() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    tasks = ("InterceptMedium-v0", "RememberColor3-v0")
+    (note,) = audit_notes(
+        [
+            stored_runs.stored(
+                [record for task in tasks for record in stored_runs.episodes("oracle", "+", task=task)]
+            )
+        ]
+    )
+    assert f"- {note}" in readme
