@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from safetensors.torch import load_file, save_file
 
 from tests.integration import small_checkpoints
@@ -16,7 +17,8 @@ from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, read_config
+from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_empty_policy, read_config
+from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.results.store import read_run
 from vla_eval.specs import EnvSpec
 from vla_eval.training.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
@@ -139,6 +141,34 @@ class TestProcessors:
         file.write_text(file.read_text().replace(str(pi0 / "tokenizer"), "google/paligemma-3b-pt-224"))
         with pytest.raises(CheckpointError, match=r"Name a local folder with `tokenizer`"):
             make_tiny_pi0(context_for(env), checkpoint=str(tmp_path))
+
+
+class TestTypesThatHideFrames:
+    @pytest.mark.parametrize("kind", sorted(CANNOT_BE_ASKED_FOR_CHUNKS))
+    def test_they_are_refused_before_anything_is_loaded(
+        self, act: Path, tmp_path: Path, env: EnvSpec, kind: str
+    ) -> None:
+        file = copied(act, tmp_path) / "config.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "type": kind}))
+        with pytest.raises(CheckpointError, match=rf"'{kind}' cannot be evaluated .*lerobot-eval"):
+            make_lerobot(context_for(env), checkpoint=str(tmp_path))
+
+    @pytest.mark.parametrize(
+        ("kind", "fields"), [("tdmpc", {}), ("vqbet", {"pretrained_backbone_weights": None})]
+    )
+    def test_lerobot_has_no_chunk_for_frames_from_outside(self, kind: str, fields: dict[str, Any]) -> None:
+        config = PreTrainedConfig.get_choice_class(kind)(device="cpu", **fields)
+        config.input_features = {
+            "observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 128, 128)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (10,)),
+        }
+        config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+        frames = {
+            "observation.images.base": torch.zeros(1, 1, 3, 128, 128),
+            "observation.state": torch.zeros(1, 1, 10),
+        }
+        with pytest.raises(RuntimeError, match="non-empty TensorList"):
+            make_empty_policy(config).predict_action_chunk(frames)
 
 
 class TestFolders:

@@ -263,7 +263,7 @@ class TestFramesOfAPluginPolicy:
         policy.reset([start()])
         assert levels(observation(0, 70)) == [70, 70, 70]
 
-    @pytest.mark.parametrize(("deltas", "n_times"), [(None, 0), ([0], 1)])
+    @pytest.mark.parametrize(("deltas", "n_times"), [(None, 0), ([0], 1), ([0, 4, 8], 0)])
     def test_a_single_frame_has_the_axes_that_training_gave_it(
         self,
         counter_config: Any,
@@ -272,7 +272,7 @@ class TestFramesOfAPluginPolicy:
         deltas: list[int] | None,
         n_times: int,
     ) -> None:
-        """lerobot's datasets give (B, 1, …) for `[0]` and (B, …) for None."""
+        """lerobot's datasets give (B, 1, …) for `[0]` and (B, …) for None; frames to come are targets."""
         policy = self.make(counter_config, tmp_path / "m", env, deltas=deltas)
         shapes: list[tuple[int, ...]] = []
 

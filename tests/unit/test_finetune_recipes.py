@@ -1,5 +1,6 @@
 """What a fine-tuning is told: recipes, datasets, bases and options; what cannot be trained is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,12 @@ class TestRefusals:
     def test_a_mistyped_field_of_the_policy_gets_an_answer(self, recorded: Path, tmp_path: Path) -> None:
         with pytest.raises(Exception, match=r"no field 'chunk_sizes'\. Did you mean 'chunk_size'"):
             finetune(act(recorded, tmp_path / "o", policy={"chunk_sizes": 4}))
+
+    def test_a_type_that_could_not_be_evaluated_is_not_trained(self, recorded: Path, tmp_path: Path) -> None:
+        config = act(recorded, tmp_path / "o")
+        with pytest.raises(CheckpointError, match=r"'vqbet' cannot be evaluated"):
+            finetune(replace(config, finetune={**config.finetune, "type": "vqbet"}))
+        assert not (tmp_path / "o").exists()
 
     def test_a_policy_with_nothing_to_train_is_refused(self, recorded: Path) -> None:
         with pytest.raises(RecipeError, match=r"oracle\.yaml has no section `finetune`"):

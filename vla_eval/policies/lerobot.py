@@ -6,7 +6,8 @@ the frames of an episode are kept here, per slot, at control rate, however long 
 
 Three kinds of policies, told apart by their configuration:
 
-- `observation_delta_indices` is None: it reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
+- `observation_delta_indices` is None, or has frames of the future, which only training has (FastWAM): it
+  reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
 - with indices, such as [-1, 0] or [0]: it gets these frames, (B, T, …), as in training (Diffusion
   Policy, SmolVLA); before the first frame of an episode there is the first frame again. One whose
   configuration says `masks_history = True` is told which frames these are, by `FIELD_is_pad` (Octo).
@@ -41,12 +42,11 @@ from vla_eval.policies.lerobot_inputs import (
     input_map,
 )
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
 from vla_eval.specs import PolicySpec
 from vla_eval.tasks.streams import Stream, generator
 
 N_SEED_BITS = 63
-DETERMINISTIC = frozenset({"act"})
-"""Types that draw nothing at inference; a policy of one's own says so by `draws_nothing = True`."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -239,45 +239,6 @@ def choose_device(device: str) -> str:
             f"device is '{device}', but torch finds no GPU here. Run `mikasa-vla doctor`, or use device: cpu."
         )
     return device
-
-
-def chunk_size(config: Any) -> int:
-    """Return how many actions a chunk has from the observed step on; earlier ones are of no use.
-
-    `n_action_steps` of the configuration is set to that where lerobot cuts the chunk by it.
-    """
-    deltas = config.action_delta_indices
-    if not deltas:
-        raise SpecMismatchError(
-            f"a LeRobot policy of type '{config.type}' does not predict chunks of actions "
-            f"(action_delta_indices is {deltas}). This adapter runs policies that do."
-        )
-    n_actions = sum(int(delta) >= 0 for delta in deltas)
-    if config.type == "diffusion":
-        config.n_action_steps = n_actions
-    return n_actions
-
-
-def noise_shape(config: Any) -> tuple[int, int] | None:
-    """Return the shape of one episode's noise for policies that take it from outside; None for others.
-
-    A policy of one's own says it by `noise_shape` of its configuration.
-    """
-    own = getattr(config, "noise_shape", None)
-    if own is not None:
-        return (int(own[0]), int(own[1]))
-    if config.type in ("pi0", "pi05", "smolvla"):
-        return (int(config.chunk_size), int(config.max_action_dim))
-    if config.type == "diffusion" and config.noise_scheduler_type == "DDIM":  # DDPM draws at every step
-        return (int(config.horizon), int(config.action_feature.shape[0]))
-    return None
-
-
-def history(config: Any) -> tuple[int, ...]:
-    """Return which frames it reads in time, 0 being the newest; none: the newest, without an axis of time."""
-    # A policy that keeps its own history may read other frames in training than when it acts.
-    deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices)
-    return tuple(int(delta) for delta in deltas or ())
 
 
 def _seed(slot: _Slot) -> int:

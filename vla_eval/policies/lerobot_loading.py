@@ -44,6 +44,7 @@ from vla_eval.policies.checkpoint import (
     read_json,
 )
 from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
+from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 from vla_eval.policies.weights import check_same, put_weights
 
@@ -129,13 +130,23 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
 
 
 def config_class(kind: str, *, where: str) -> Any:
-    """Return lerobot's configuration class of a type of policy; plugins (`lerobot_policy_*`) included."""
+    """Return lerobot's configuration class of a type of policy; plugins (`lerobot_policy_*`) included.
+
+    Raises:
+        CheckpointError: there is no such type, or one that this loop cannot ask for chunks.
+    """
     register_third_party_plugins()
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
         error = unknown_name("LeRobot policy type", kind, known, where=where)
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
+        )
+    if kind in CANNOT_BE_ASKED_FOR_CHUNKS:
+        raise CheckpointError(
+            f"{where}: a LeRobot policy of type '{kind}' cannot be evaluated in this loop, which asks for "
+            f"whole chunks and hides no frame: {CANNOT_BE_ASKED_FOR_CHUNKS[kind]}. For it there is "
+            "LeRobot's own loop: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
         )
     return PreTrainedConfig.get_choice_class(kind)
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.policies.checkpoint import checkpoint_sha256, weights_file
-from vla_eval.policies.lerobot import chunk_size, history, noise_shape
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.policies.lerobot_types import chunk_size, history, noise_shape
 
 INSTRUCTION = "pick the cube"
 

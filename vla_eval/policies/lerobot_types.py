@@ -1,0 +1,64 @@
+"""What the loop has to know of a type of LeRobot policy, told by its configuration.
+
+Types of lerobot's own that are not understood from their configuration alone stand in the tables here; a
+policy of one's own says the same by attributes of its configuration.
+"""
+
+from typing import Any  # lerobot is untyped
+
+from vla_eval.errors import SpecMismatchError
+
+DETERMINISTIC = frozenset({"act"})
+"""Types that draw nothing at inference; a policy of one's own says so by `draws_nothing = True`."""
+
+COLLECTS_FRAMES = "its `predict_action_chunk` reads the frames that its own `select_action` collected"
+CANNOT_BE_ASKED_FOR_CHUNKS = {
+    "lingbot_va": "it keeps what it has seen and done between chunks to itself, for one episode at a time",
+    "multi_task_dit": COLLECTS_FRAMES,
+    "tdmpc": COLLECTS_FRAMES,
+    "vqbet": COLLECTS_FRAMES,
+}
+"""Types of lerobot 0.6 that cannot be asked for a chunk from frames given from outside, and why."""
+
+
+def chunk_size(config: Any) -> int:
+    """Return how many actions a chunk has from the observed step on; earlier ones are of no use.
+
+    `n_action_steps` of the configuration is set to that where lerobot cuts the chunk by it.
+    """
+    deltas = config.action_delta_indices
+    if not deltas:
+        raise SpecMismatchError(
+            f"a LeRobot policy of type '{config.type}' does not predict chunks of actions "
+            f"(action_delta_indices is {deltas}). This adapter runs policies that do."
+        )
+    n_actions = sum(int(delta) >= 0 for delta in deltas)
+    if config.type == "diffusion":
+        config.n_action_steps = n_actions
+    return n_actions
+
+
+def noise_shape(config: Any) -> tuple[int, int] | None:
+    """Return the shape of one episode's noise for policies that take it from outside; None for others.
+
+    A policy of one's own says it by `noise_shape` of its configuration.
+    """
+    own = getattr(config, "noise_shape", None)
+    if own is not None:
+        return (int(own[0]), int(own[1]))
+    if config.type in ("pi0", "pi05", "smolvla"):
+        return (int(config.chunk_size), int(config.max_action_dim))
+    if config.type == "diffusion" and config.noise_scheduler_type == "DDIM":  # DDPM draws at every step
+        return (int(config.horizon), int(config.action_feature.shape[0]))
+    return None
+
+
+def history(config: Any) -> tuple[int, ...]:
+    """Return which frames it reads in time, 0 being the newest; none: the newest, without an axis of time.
+
+    Of a policy that is trained to foresee (its indices reach beyond 0) that is the newest, as lerobot's
+    own loop gives it.
+    """
+    # A policy that keeps its own history may read other frames in training than when it acts.
+    deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices) or ()
+    return () if any(delta > 0 for delta in deltas) else tuple(int(delta) for delta in deltas)
