@@ -68,7 +68,9 @@ def test_of_the_episodes_that_chose_it_is_told_how_many_chose_right() -> None:
     ]
     row = only_row(build_table([stored(records)]), "p")
     assert (row.n_chose, row.n_chose_right) == (4, 2)
-    # Wilson, 2 of 4: (0.5 ± 1.96 * sqrt(1/16 + 0.96 / 16)) / 1.96 with z² / n = 0.96
+    # Wilson, 2 of 4: 0.5 ± 1.96 * sqrt(1/16 + 0.9604 / 16) / 1.9604, with z² / n = 0.9604
+    assert row.right_if_chose == 0.5
+    assert (row.right_if_chose_low, row.right_if_chose_high) == pytest.approx((0.15, 0.85), abs=1e-3)
     shown = render(build_table([stored(records)]), "markdown", columns=["chose", "right_if_chose"])
     assert [cell.strip() for cell in shown.splitlines()[2].strip("|").split("|")] == [
         "4",
@@ -89,7 +91,7 @@ def test_what_was_chosen_in_several_runs_has_no_interval_over_episodes() -> None
 def test_there_is_no_first_choice_without_candidates() -> None:
     records = episodes("p", "+-", task=INTERCEPT, n_candidates=None, first_choice_success=None)
     row = only_row(build_table([stored(records)]), "p")
-    assert row.first_choice_success is row.n_chose is row.n_chose_right is None
+    assert row.first_choice_success is row.n_chose is row.n_chose_right is row.right_if_chose is None
 
 
 def test_a_run_folder_given_twice_counts_once() -> None:

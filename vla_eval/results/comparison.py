@@ -37,6 +37,8 @@ class Measured:
     first_choice_success: float | None = None
     n_chose: int | None = None
     n_chose_right: int | None = None
+    right_if_chose: float | None = None
+    right_if_chose_interval: Interval | None = None
     mean_success_step: float | None = None
     inferences_per_episode: float | None = None
 
@@ -75,6 +77,7 @@ def measure(group: RowGroup) -> Measured:
     results = group.results
     chose = [record for record in results if record.first_choice is not None]
     has_candidates = any(record.first_choice_success is not None for record in results)
+    n_right = sum(bool(record.first_choice_success) for record in chose)
     return Measured(
         n_runs=len(runs),
         n_success_once=_n_success(results),
@@ -85,7 +88,9 @@ def measure(group: RowGroup) -> Measured:
         success_at_end=_mean_over_runs(runs, lambda record: record.success_at_end),
         first_choice_success=_mean_over_runs(runs, lambda record: record.first_choice_success),
         n_chose=len(chose) if has_candidates else None,
-        n_chose_right=sum(bool(record.first_choice_success) for record in chose) if has_candidates else None,
+        n_chose_right=n_right if has_candidates else None,
+        right_if_chose=n_right / len(chose) if chose else None,
+        right_if_chose_interval=wilson_interval(n_right, len(chose)) if len(runs) == 1 else None,
         mean_success_step=_rate([r for r in results if r.success_once], lambda record: record.success_step),
         inferences_per_episode=_rate(results, lambda record: record.n_inferences),
     )

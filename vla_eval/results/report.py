@@ -79,6 +79,7 @@ def _row(
     comparison: Comparison | None,
 ) -> Row:
     own = measured[group.key]
+    right = own.right_if_chose_interval
     ceiling = ceiling_of(group.key, measured)
     test = comparison.test if comparison else None
     return Row(
@@ -96,6 +97,9 @@ def _row(
         first_choice_success=own.first_choice_success,
         n_chose=own.n_chose,
         n_chose_right=own.n_chose_right,
+        right_if_chose=own.right_if_chose,
+        right_if_chose_low=right.low if right else None,
+        right_if_chose_high=right.high if right else None,
         mean_success_step=own.mean_success_step,
         inferences_per_episode=own.inferences_per_episode,
         baseline=comparison.baseline.policy if comparison else None,

@@ -23,6 +23,8 @@ class Row:
         success_at_end: share that succeeded at the last step.
         first_choice_success: share whose first candidate touched was the right one.
         n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
+        right_if_chose: the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson
+            interval, of one run.
         mean_success_step: control steps until success, over the successes.
         inferences_per_episode: calls of the policy.
         baseline, baseline_n_action_steps: what this row is compared with, on the same episodes.
@@ -51,6 +53,9 @@ class Row:
     first_choice_success: float | None
     n_chose: int | None
     n_chose_right: int | None
+    right_if_chose: float | None
+    right_if_chose_low: float | None
+    right_if_chose_high: float | None
     mean_success_step: float | None
     inferences_per_episode: float | None
     baseline: str | None

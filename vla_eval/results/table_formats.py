@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 from vla_eval.errors import ReportError, check_names
 from vla_eval.results import paper_table
-from vla_eval.results.estimates import CONFIDENCE, wilson_interval
+from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
 from vla_eval.results.table import Row, Table
 
@@ -121,11 +121,8 @@ def _number(value: int | None) -> str:
 
 
 def _right_if_chose(row: Row) -> str:
-    if not row.n_chose or row.n_chose_right is None:
-        return UNDEFINED
-    share = _rate(row.n_chose_right / row.n_chose)
-    interval = wilson_interval(row.n_chose_right, row.n_chose) if row.n_runs == 1 else None
-    return share if interval is None else f"{share} [{_rate(interval.low)}, {_rate(interval.high)}]"
+    share, low, high = row.right_if_chose, row.right_if_chose_low, row.right_if_chose_high
+    return _rate(share) if low is None else f"{_rate(share)} [{_rate(low)}, {_rate(high)}]"
 
 
 def _episodes(row: Row) -> str:
