@@ -1,6 +1,7 @@
 """The command line: fast, lazy, and every mistake one message on stderr with exit code 1."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -127,6 +128,15 @@ class TestShow:
         assert {"n_items", "strict_choice", "cue_steps", "freeze_until_choice"} <= set(names)
         assert len(names) == len(set(names))
         assert "n_items = 5" in out
+        assert "cube_half_size_m = 0.02 " in out  # ManiSkill's 2 cm, which the class names by a constant
+
+    @pytest.mark.parametrize("task", list(TASKS))
+    def test_an_argument_is_shown_with_a_value_and_only_if_one_can_give_it(
+        self, capsys: pytest.CaptureFixture[str], task: str
+    ) -> None:
+        _, out, _ = run(capsys, "show", task)
+
+        assert not re.search(r" = [A-Z][A-Z]|required", out)
 
 
 PROBE = """

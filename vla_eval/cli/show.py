@@ -6,7 +6,8 @@ The task's source is read, not imported: importing it would start a simulator.
 import argparse
 import ast
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ class TaskArgument(NamedTuple):
     """One keyword argument of a task's class, as its source has it."""
 
     name: str
-    default: str
+    default: str | None  # None: it has to be given
     origin: str  # the class that takes it
 
 
@@ -59,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         default = spec.kwargs.get(argument.name, argument.default)
         if argument.name in spec.open_arguments:
             default = "… (must be given)"
+        if default is None:  # given by a class to its base, not by a user
+            continue
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
     return 0
 
@@ -104,21 +107,37 @@ def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
     """Yield the keyword arguments of the task's class and of its bases in this package, nearest first."""
     module_name, _, class_name = spec.entry_point.partition(":")
     seen: set[str] = set(NOT_FOR_USERS)
-    for origin, node in _classes(module_name, class_name):
-        for init in node.body:
+    for source in _classes(module_name, class_name):
+        for init in source.node.body:
             if not isinstance(init, ast.FunctionDef) or init.name != "__init__":
                 continue
             for argument, default in zip(init.args.kwonlyargs, init.args.kw_defaults, strict=True):
                 if argument.arg not in seen:
                     seen.add(argument.arg)
-                    yield TaskArgument(argument.arg, ast.unparse(default) if default else "required", origin)
+                    value = _value(source.module_name, default) if default else None
+                    yield TaskArgument(argument.arg, value, source.class_name)
 
 
-def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:
-    """Yield a class and its bases in this package, from their source."""
-    found = find_spec(module_name)
+class _Source(NamedTuple):
+    """A class, as the module that defines it has it."""
+
+    module_name: str
+    class_name: str
+    node: ast.ClassDef
+
+
+class _Module(NamedTuple):
+    """What a module of this package says."""
+
+    body: Sequence[ast.stmt]
+    imported: dict[str, tuple[str, str]]  # name here -> module, name there
+
+
+@cache
+def _module(name: str) -> _Module:
+    found = find_spec(name) if name.startswith(OWN_PACKAGE) else None
     if found is None or found.origin is None:
-        return
+        return _Module([], {})
     tree = ast.parse(Path(found.origin).read_text(encoding="utf-8"))
     imported = {
         alias.asname or alias.name: (node.module or "", alias.name)
@@ -126,12 +145,30 @@ def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.Class
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    for node in tree.body:
+    return _Module(tree.body, imported)
+
+
+def _classes(module_name: str, class_name: str) -> Iterator[_Source]:
+    """Yield a class and its bases in this package, from their source."""
+    module = _module(module_name)
+    for node in module.body:
         if not isinstance(node, ast.ClassDef) or node.name != class_name:
             continue
-        yield class_name, node
+        yield _Source(module_name, class_name, node)
         for base in node.bases:
             name = ast.unparse(base)
-            base_module, base_name = imported.get(name, (module_name, name))
-            if base_module.startswith(OWN_PACKAGE):
-                yield from _classes(base_module, base_name)
+            yield from _classes(*module.imported.get(name, (module_name, name)))
+
+
+def _value(module_name: str, expression: ast.expr) -> str:
+    """Return an expression's text; for the name of a constant that of its value."""
+    if not isinstance(expression, ast.Name):
+        return ast.unparse(expression)
+    name, module = expression.id, _module(module_name)
+    if name in module.imported:
+        other, name = module.imported[name]
+        return _value(other, ast.Name(name))
+    for node in module.body:
+        if isinstance(node, ast.Assign) and name in (ast.unparse(target) for target in node.targets):
+            return _value(module_name, node.value)
+    return name
