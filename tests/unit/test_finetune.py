@@ -1,6 +1,7 @@
 """Fine-tuning end to end on a tiny dataset, offline: train, kill, go on, load, evaluate."""
 
 import json
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -26,7 +27,7 @@ from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
 from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import make_tiny_pi0, tiny_paligemma, write_tiny_smolvlm
+from vla_eval.training.tiny_models import Family, make_tiny_pi0, tiny_paligemma, write_tiny_smolvlm
 
 pytestmark = pytest.mark.usefixtures("small_act")
 tokenizer = tiny_trainings.tokenizer
@@ -137,6 +138,29 @@ class TestRuns:
         (base / "train").rename(base / "moved")
         with pytest.raises(CheckpointError, match=r"Name its folder with `base_checkpoint`"):
             make_tiny_pi0(context(), checkpoint=str(lora))
+
+    @pytest.mark.parametrize(
+        ("family", "projections"),
+        [
+            ("pi0", {"state_proj", "action_time_mlp_in", "action_time_mlp_out"}),
+            ("pi05", {"time_mlp_in", "time_mlp_out"}),
+        ],
+    )
+    def test_lora_reaches_the_experts_attention_and_all_its_projections(
+        self, recorded: Path, tmp_path: Path, tokenizer: Path, family: Family, projections: set[str]
+    ) -> None:
+        """lerobot 0.6.1 looks for π0.5's projections of time under π0's names, and leaves them frozen."""
+        recipe = recorded.parent / "tiny_pi0.yaml"
+        recipe.write_text(recipe.read_text().replace("type: pi0", f"type: {family}"))
+        base, lora = tmp_path / "base", tmp_path / "lora"
+        with tiny_paligemma(family):
+            finetune(pi0(recorded, base, tokenizer, steps=2))
+            finetune(pi0(recorded, lora, tokenizer, steps=2, base_checkpoint=str(base), lora={"rank": 2}))
+        names = load_file(find_checkpoint(lora) / "adapter_model.safetensors")
+        modules = {name.partition(".lora_")[0].removeprefix("base_model.model.model.") for name in names}
+        attention = {name for name in modules if re.search(r"gemma_expert\..*\.self_attn\.[qv]_proj$", name)}
+        assert attention
+        assert modules - attention == {"action_in_proj", "action_out_proj", *projections}
 
     def test_a_base_that_lacks_a_tensor_is_not_trained_on(
         self, recorded: Path, tmp_path: Path, tokenizer: Path

@@ -14,13 +14,14 @@ from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, write_entry
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.recipes import PolicyRecipe, list_recipes, load_recipe
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.finetune import finetune, load_finetune_recipe
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import TINY_POLICY
+from vla_eval.training.tiny_models import TINY_POLICY, Family, tiny_paligemma
 
 pytestmark = pytest.mark.usefixtures("small_act")
 tokenizer = tiny_trainings.tokenizer
@@ -162,6 +163,19 @@ def test_every_shipped_recipe_is_one_that_lerobot_accepts(recorded: Path, tmp_pa
         assert list(made.image_features) == ["observation.images.base", "observation.images.wrist"]
         checked += 1
     assert checked >= 8
+
+
+@pytest.mark.parametrize("family", ["pi0", "pi05"])
+def test_the_expert_alone_is_trained_and_the_language_model_is_not(recorded: Path, family: Family) -> None:
+    changes = {"base_checkpoint": None, "rename_cameras": {}, "policy": TINY_POLICY}
+    config = FinetuneConfig(policy=f"{family}_expert", dataset=str(recorded), finetune=changes)
+    dataset = training_dataset(recorded, allow_unreplayed=True)
+    with tiny_paligemma(family):
+        model = make_empty_policy(policy_config(load_finetune_recipe(config).value, dataset, device="cpu"))
+    names = dict(model.named_parameters())
+    language_model = {name for name in names if name.startswith("model.paligemma_with_expert.paligemma.")}
+    assert language_model
+    assert {name for name in names if not names[name].requires_grad} == language_model
 
 
 def test_memory_is_weights_gradients_and_two_moments() -> None:

@@ -47,6 +47,12 @@ from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 
 LOCK_FILE = "finetune.lock"
 TOKENIZER_STEP = "TokenizerProcessorStep"
+LORA_TARGETS = {
+    "pi05": r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"
+    r"|model\.(action_in_proj|action_out_proj|time_mlp_in|time_mlp_out))"
+}
+"""By type, where lerobot 0.6.1 chooses wrongly: it looks for π0.5's projections of time under π0's names, and
+leaves them frozen (https://github.com/huggingface/lerobot/pull/4494)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,7 +213,7 @@ def _lora_targets(lora: LoraRecipe, policy: Any) -> tuple[str | None, tuple[str,
     """Return what LoRA is put on and what is trained whole: the recipe's, else the policy's own choice."""
     own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
     return (
-        lora.target_modules or own.get("target_modules"),
+        lora.target_modules or LORA_TARGETS.get(policy.type) or own.get("target_modules"),
         tuple(lora.full_modules or own.get("modules_to_save") or ()),
     )
 
@@ -279,7 +285,7 @@ def _loop_config(
         else PeftConfig(
             r=lora.rank,
             lora_alpha=lora.alpha or lora.rank,
-            target_modules=lora.target_modules,
+            target_modules=lora.target_modules or LORA_TARGETS.get(recipe.type),
             full_training_modules=list(lora.full_modules) or None,
         ),
     )
