@@ -259,7 +259,8 @@ class TestTrainable:
 
 REGISTERED = """
 from lerobot.processor import ProcessorStepRegistry
-from vla_eval.policies.lerobot_loading import config_class, register_steps
+from vla_eval.policies.lerobot_loading import config_class
+from vla_eval.policies.lerobot_processors import register_steps
 for kind in ("mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"):
     register_steps(config_class(kind, where="test"))
 print(*ProcessorStepRegistry.list())

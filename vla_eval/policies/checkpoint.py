@@ -21,7 +21,7 @@ WEIGHTS_FILE = "model.safetensors"
 ADAPTER_WEIGHTS_FILE = "adapter_model.safetensors"
 ADAPTER_CONFIG_FILE = "adapter_config.json"
 PREPROCESSOR_FILE, POSTPROCESSOR_FILE = "policy_preprocessor.json", "policy_postprocessor.json"
-TOKENIZER_FOLDER = "tokenizer"
+TOKENIZER_FOLDER, ACTION_TOKENIZER_FOLDER = "tokenizer", "action_tokenizer"
 FACTS_FILE = "mikasa_training.json"
 MODEL_FOLDER = "pretrained_model"
 # Where a checkpoint may lie below the folder that was named: lerobot's layout, then that of our runs.

@@ -1,12 +1,10 @@
-"""Load a LeRobot checkpoint so that nothing is missing without an error: weights, processors, statistics.
+"""Load a LeRobot checkpoint so that nothing is missing without an error: configuration, weights, processors.
 
 lerobot's own loaders leave out what does not fit (`strict=False`), and those of π0, π0.5 and π0-FAST
 answer a failed load with random weights. Here every parameter is compared with the file afterwards.
 Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
 """
 
-import importlib
-import importlib.util
 import os
 from collections.abc import Sequence
 
@@ -18,10 +16,8 @@ from pathlib import Path
 from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
-from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from torch import Tensor
@@ -30,27 +26,21 @@ import vla_eval.policies.memory.configuration_memory  # importing it registers
 import vla_eval.policies.octo.configuration_octo
 import vla_eval.policies.openvla.configuration_openvla
 import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above
-from vla_eval.errors import CheckpointError, MissingDependencyError, unknown_name
+from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError, unknown_name
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
     ADAPTER_WEIGHTS_FILE,
     CONFIG_FILE,
-    POSTPROCESSOR_FILE,
-    PREPROCESSOR_FILE,
-    TOKENIZER_FOLDER,
     WEIGHTS_FILE,
     adapter_base,
     find_checkpoint,
     read_json,
 )
-from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
+from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
-from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 from vla_eval.policies.weights import check_same, put_weights
 
-TOKENIZER_STEP = "tokenizer_processor"
-PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
-"""Where a processor step that is named by its import path may come from; others are never imported."""
 # Fields that make a constructor fetch weights which the checkpoint is about to replace.
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
 
@@ -96,9 +86,10 @@ def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
     """
     folder = find_checkpoint(path)
     config = read_config(folder, options)
-    policy = load_weights(folder, config, options)
+    with no_foreign_code(config.type):
+        policy = load_weights(folder, config, options)
+        preprocessor, postprocessor = load_processors(folder, config, tokenizer=options.tokenizer)
     policy.eval()
-    preprocessor, postprocessor = load_processors(folder, config, options)
     check_statistics(folder, preprocessor, postprocessor)
     return LoadedPolicy(
         folder=folder, config=config, policy=policy, preprocessor=preprocessor, postprocessor=postprocessor
@@ -118,7 +109,8 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
                 "recipe."
             )
         data["dtype"] = options.dtype
-    data.update({name: value for name, value in NO_DOWNLOADS.items() if name in data})
+    here = {**NO_DOWNLOADS, **own_tokenizers(folder, options.tokenizer)}
+    data.update({name: value for name, value in here.items() if name in data})
     try:
         config = draccus.decode(cls, data)
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
@@ -159,7 +151,11 @@ def make_empty_policy(config: Any, **kwargs: Any) -> Any:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
         ) from exc
-    except OSError as exc:  # what transformers raises for files that are neither there nor cached
+    except (OSError, RuntimeError) as exc:  # transformers' for files that are neither there nor cached
+        if isinstance(exc.__cause__, VlaEvalError):  # lerobot's π0-FAST wraps whatever went wrong
+            raise exc.__cause__ from exc
+        if not isinstance(exc, OSError) and not isinstance(exc.__cause__, OSError):
+            raise
         raise CheckpointError(
             f"a LeRobot policy of type '{config.type}' could not be built without the network: {exc} Give it "
             f"a local folder, or set HF_HUB_OFFLINE=0 once to let it fetch the file."
@@ -261,112 +257,3 @@ def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
     # peft, too, leaves out what does not fit.
     check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))
     return wrapped
-
-
-# ------------------------------------------------------------------------------------------ processors
-
-
-def load_processors(folder: Path, config: Any, options: LoadOptions) -> tuple[Any, Any]:
-    """Return pre- and post-processor as the checkpoint describes them.
-
-    Raises:
-        CheckpointError: one is missing, or names code or a tokenizer that is not there.
-    """
-    register_steps(type(config))
-    described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
-    before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
-    overrides: dict[str, dict[str, Any]] = {}
-    if "device_processor" in before:
-        overrides["device_processor"] = {"device": config.device}
-    if "normalizer_processor" in before:
-        overrides["normalizer_processor"] = {"device": config.device}
-    if TOKENIZER_STEP in before:
-        tokenizer = _tokenizer(folder, options)
-        if tokenizer is not None:
-            overrides[TOKENIZER_STEP] = {"tokenizer_name": tokenizer}
-    elif options.tokenizer is not None:
-        raise CheckpointError(f"{folder}: `tokenizer` is given, but this policy's preprocessor has none.")
-    # The postprocessor ends with a step of the same name that brings actions to the CPU: left alone.
-    after_overrides = (
-        {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
-    )
-    try:
-        return make_pre_post_processors(  # type: ignore[no-any-return]
-            config,
-            pretrained_path=str(folder),
-            preprocessor_overrides=overrides,
-            postprocessor_overrides=after_overrides,
-        )
-    except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
-        raise CheckpointError(
-            f"{folder}: the processors cannot be made: {exc} Name a local folder with `tokenizer` in the "
-            f"recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
-            f"HF_HUB_OFFLINE=0 is set."
-        ) from exc
-
-
-def register_steps(cls: type) -> None:
-    """Import the module in which a policy registers its processors' steps, found as lerobot names it.
-
-    lerobot imports it for a training only: a new process that evaluates a checkpoint would not know them.
-    """
-    module = cls.__module__
-    name = module.replace("configuration_", "processor_")
-    if name != module and importlib.util.find_spec(name) is not None:
-        importlib.import_module(name)
-
-
-def _tokenizer(folder: Path, options: LoadOptions) -> str | None:
-    if options.tokenizer is not None:
-        if not Path(options.tokenizer).is_dir():
-            raise CheckpointError(f"tokenizer: expected a folder, found nothing at {options.tokenizer}.")
-        return options.tokenizer
-    own = folder / TOKENIZER_FOLDER
-    return str(own) if own.is_dir() else None
-
-
-def _checked_steps(path: Path) -> tuple[str, ...]:
-    """Return the names of a processor's steps; refuse code that is no processor's."""
-    steps = read_json(path).get("steps", [])
-    names = []
-    for step in steps:
-        name, imported = step.get("registry_name"), step.get("class")
-        if name is None and not str(imported).startswith(PROCESSOR_PACKAGES):
-            # lerobot would import and call whatever is named here.
-            raise CheckpointError(
-                f"{path}: names the code '{imported}', which is neither lerobot's nor a lerobot plugin's. "
-                f"It is not run. If it is yours, register the step with ProcessorStepRegistry."
-            )
-        names.append(str(name))
-    return tuple(names)
-
-
-def save_tokenizer(preprocessor: Any, folder: Path) -> None:
-    """Keep the tokenizer beside the weights: the name it was loaded by may mean nothing elsewhere."""
-    for step in preprocessor.steps:
-        tokenizer = getattr(step, "input_tokenizer", None)
-        if tokenizer is not None:
-            tokenizer.save_pretrained(str(folder))
-
-
-def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:
-    """Raise `CheckpointError` unless all that is normalised has its statistics.
-
-    lerobot passes on unchanged what it has no statistics of.
-    """
-    missing = []
-    for step in (*preprocessor.steps, *postprocessor.steps):
-        if isinstance(step, EncoderStep | DecoderStep):
-            missing += step.missing_statistics()
-        if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
-            continue
-        for key, feature in step.features.items():
-            mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
-            have = (step.stats or {}).get(key, {})
-            missing += [f"{key}.{name}" for name in NEEDED_STATISTICS.get(mode, ()) if name not in have]
-    if missing:
-        shown = ", ".join(dict.fromkeys(missing))
-        raise CheckpointError(
-            f"{folder}: the checkpoint has no statistics for {shown}; lerobot would skip that normalisation "
-            f"without a word. Fine-tune it on a dataset, or fetch the complete checkpoint."
-        )

@@ -24,7 +24,8 @@ CANNOT_BE_ASKED_FOR_CHUNKS = {
 def chunk_size(config: Any) -> int:
     """Return how many actions a chunk has from the observed step on; earlier ones are of no use.
 
-    `n_action_steps` of the configuration is set to that where lerobot cuts the chunk by it.
+    `n_action_steps` of the configuration is set to that where lerobot cuts the chunk by it: π0-FAST would
+    even read the tokens of a whole chunk as those of a shorter one.
     """
     deltas = config.action_delta_indices
     if not deltas:
@@ -33,7 +34,7 @@ def chunk_size(config: Any) -> int:
             f"(action_delta_indices is {deltas}). This adapter runs policies that do."
         )
     n_actions = sum(int(delta) >= 0 for delta in deltas)
-    if config.type == "diffusion":
+    if config.type in ("diffusion", "pi0_fast"):
         config.n_action_steps = n_actions
     return n_actions
 

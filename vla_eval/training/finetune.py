@@ -23,6 +23,7 @@ from vla_eval.policies.checkpoint import (
     checkpoint_sha256,
     find_checkpoint,
 )
+from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot import choose_device
 from vla_eval.policies.lerobot_loading import config_class
 from vla_eval.policies.steps.trainable import check_lora
@@ -205,7 +206,9 @@ def _train(
         on_checkpoint=evaluate,
     )
     loop_config = _loop_config(recipe, dataset, policy, config.run_seed, out, resume=resume_from is not None)
-    with _tokenizer_from(recipe.tokenizer, recipe.type):
+    if recipe.tokenizer is not None and hasattr(policy, "text_tokenizer_name"):
+        policy.text_tokenizer_name = recipe.tokenizer  # π0-FAST itself loads it, too
+    with _tokenizer_from(recipe.tokenizer, recipe.type), no_foreign_code(recipe.type):
         run_loop(loop_config, hooks, resume_from=resume_from)
 
 

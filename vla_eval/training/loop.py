@@ -42,12 +42,11 @@ from vla_eval.policies.checkpoint import (
     read_json,
     write_facts,
 )
-from vla_eval.policies.lerobot_loading import (
+from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy
+from vla_eval.policies.lerobot_processors import (
     TOKENIZER_STEP,
-    LoadOptions,
-    begin_from,
-    fill_policy,
-    save_tokenizer,
+    action_tokenizer_overrides,
+    save_tokenizers,
 )
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.micro_batches import InMicroBatches
@@ -164,6 +163,9 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
             overrides = {**kwargs["preprocessor_overrides"], TOKENIZER_STEP: {"tokenizer_name": tokenizer}}
             kwargs["preprocessor_overrides"] = overrides
         if pretrained_path:
+            steps = _step_names(Path(pretrained_path) / PREPROCESSOR_FILE)
+            of_actions = action_tokenizer_overrides(policy_cfg, steps)
+            kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **of_actions}
             _override_our_steps(Path(pretrained_path), policy_cfg, kwargs)
         return originals["make_pre_post_processors"](policy_cfg, pretrained_path=pretrained_path, **kwargs)
 
@@ -193,7 +195,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         partial = checkpoint_dir.with_name(f"{PARTIAL_PREFIX}{checkpoint_dir.name}")
         originals["save_checkpoint"](checkpoint_dir=partial, **kwargs)
         write_facts(partial / MODEL_FOLDER, hooks.facts)
-        save_tokenizer(kwargs["preprocessor"], partial / MODEL_FOLDER / TOKENIZER_FOLDER)
+        save_tokenizers(kwargs["preprocessor"], partial / MODEL_FOLDER)
         _sync(partial)
         os.replace(partial, checkpoint_dir)
         hooks.on_checkpoint(checkpoint_dir)
@@ -254,8 +256,11 @@ def _tokenizer_of(folder: Path, named: str | None) -> str | None:
     """Return the tokenizer for processors that are loaded from a folder; None if they need none of ours."""
     own = folder / TOKENIZER_FOLDER
     found = named or (str(own) if own.is_dir() else None)
-    steps = read_json(folder / PREPROCESSOR_FILE).get("steps", [])
-    return found if any(step.get("registry_name") == TOKENIZER_STEP for step in steps) else None
+    return found if TOKENIZER_STEP in _step_names(folder / PREPROCESSOR_FILE) else None
+
+
+def _step_names(file: Path) -> list[str | None]:
+    return [step.get("registry_name") for step in read_json(file).get("steps", [])]
 
 
 def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> None:
@@ -267,7 +272,7 @@ def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> No
         ("preprocessor_overrides", PREPROCESSOR_FILE, "normalizer_processor", ENCODER_STEP),
         ("postprocessor_overrides", POSTPROCESSOR_FILE, "unnormalizer_processor", DECODER_STEP),
     ):
-        names = [step.get("registry_name") for step in read_json(folder / file).get("steps", [])]
+        names = _step_names(folder / file)
         overrides = dict(kwargs.get(overrides_name) or {})
         if ours not in names or lerobots not in overrides:
             continue

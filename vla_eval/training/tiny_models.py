@@ -1,4 +1,4 @@
-"""π0, π0.5, SmolVLA and ACT with few random weights, for tests: the whole way without network or GPU.
+"""The π0 family, SmolVLA and ACT with few random weights, for tests: the whole way without network or GPU.
 
 lerobot 0.6.1 builds these models in full size only, so some names of its modules are replaced while a
 model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
@@ -16,7 +16,7 @@ from vla_eval.episode_worker import SharedStage, worker_main
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 
-Family = Literal["pi0", "pi05"]
+Family = Literal["pi0", "pi05", "pi0_fast"]
 VOCABULARY = 512
 CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
 SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
@@ -44,7 +44,7 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
     vlm = modeling.GemmaConfig(width=64, mlp_dim=128, **sizes)
     expert = modeling.GemmaConfig(width=32, mlp_dim=64, **sizes)
     full_vlm = modeling.PaliGemmaForConditionalGenerationWithPiGemma
-    full_expert = modeling.PiGemmaForCausalLM
+    full_expert: Any = getattr(modeling, "PiGemmaForCausalLM", None)  # π0-FAST has no expert
 
     def make_vlm(config: Any) -> Any:
         config._vocab_size = config.text_config.vocab_size = VOCABULARY
@@ -53,6 +53,7 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
         vision = config.vision_config
         vision.hidden_size, vision.intermediate_size, vision.patch_size = 32, 64, 14
         vision.num_hidden_layers, vision.num_attention_heads = 2, 2
+        vision.image_size = TINY_POLICY["image_resolution"][0]  # π0-FAST leaves it as it is
         return full_vlm(config=config)
 
     def make_expert(config: Any) -> Any:
@@ -62,7 +63,7 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
     with (
         patch.object(modeling, "get_gemma_config", {"gemma_2b": vlm, "gemma_300m": expert}.__getitem__),
         patch.object(modeling, "PaliGemmaForConditionalGenerationWithPiGemma", make_vlm),
-        patch.object(modeling, "PiGemmaForCausalLM", make_expert),
+        patch.object(modeling, "PiGemmaForCausalLM", make_expert, create=full_expert is None),
     ):
         yield
 
@@ -84,6 +85,15 @@ def tiny_resnet() -> Iterator[None]:
 def write_tiny_tokenizer(folder: Path) -> Path:
     """Train a tokenizer on three sentences, save it, and return its folder."""
     _tokenizer({}).save_pretrained(str(folder))
+    return folder
+
+
+def write_tiny_fast_tokenizer(folder: Path) -> Path:
+    """Make an action tokenizer in which each byte is a token, save it, and return its folder."""
+    from vla_eval.policies.fast_tokens import FastActionTokenizer
+
+    folder.mkdir()
+    FastActionTokenizer(_tokenizer({}), scale=10.0, min_token=-60).save_pretrained(folder)
     return folder
 
 

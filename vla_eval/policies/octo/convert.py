@@ -8,9 +8,9 @@ from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
-from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
 from vla_eval.policies.conversion import check_free, folder_when_whole
-from vla_eval.policies.lerobot_loading import make_empty_policy, save_tokenizer
+from vla_eval.policies.lerobot_loading import make_empty_policy
+from vla_eval.policies.lerobot_processors import save_tokenizers
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
 from vla_eval.policies.octo.flax_names import from_flax
 from vla_eval.policies.octo.original import read_parameters, read_statistics
@@ -56,7 +56,7 @@ def convert(
         policy.save_pretrained(partial)
         before.save_pretrained(partial)
         after.save_pretrained(partial)
-        save_tokenizer(before, partial / TOKENIZER_FOLDER)
+        save_tokenizers(before, partial)
     return out
 
 

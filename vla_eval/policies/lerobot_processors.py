@@ -1,0 +1,166 @@
+"""What stands before and behind a LeRobot policy: its processors, their tokenizers and statistics."""
+
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+from lerobot.configs import NormalizationMode
+from lerobot.policies import make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+
+from vla_eval.errors import CheckpointError
+from vla_eval.policies.checkpoint import (
+    ACTION_TOKENIZER_FOLDER,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    TOKENIZER_FOLDER,
+    read_json,
+)
+from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
+from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
+
+TOKENIZER_STEP, ACTION_TOKENIZER_STEP = "tokenizer_processor", "action_tokenizer_processor"
+PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
+"""Where a processor step that is named by its import path may come from; others are never imported."""
+
+
+def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tuple[Any, Any]:
+    """Return pre- and post-processor as the checkpoint describes them.
+
+    Args:
+        folder: of the checkpoint.
+        config: of the policy.
+        tokenizer: folder of the tokenizer; None: the one in the checkpoint, else the one it names.
+
+    Raises:
+        CheckpointError: one is missing, or names code or a tokenizer that is not there.
+    """
+    register_steps(type(config))
+    described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
+    before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
+    overrides: dict[str, dict[str, Any]] = {}
+    if "device_processor" in before:
+        overrides["device_processor"] = {"device": config.device}
+    if "normalizer_processor" in before:
+        overrides["normalizer_processor"] = {"device": config.device}
+    if TOKENIZER_STEP in before:
+        own = _tokenizer(folder, tokenizer)
+        if own is not None:
+            overrides[TOKENIZER_STEP] = {"tokenizer_name": own}
+    elif tokenizer is not None:
+        raise CheckpointError(f"{folder}: `tokenizer` is given, but this policy's preprocessor has none.")
+    overrides.update(action_tokenizer_overrides(config, before))
+    # The postprocessor ends with a step of the same name that brings actions to the CPU: left alone.
+    after_overrides = (
+        {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
+    )
+    try:
+        return make_pre_post_processors(  # type: ignore[no-any-return]
+            config,
+            pretrained_path=str(folder),
+            preprocessor_overrides=overrides,
+            postprocessor_overrides=after_overrides,
+        )
+    except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
+        raise CheckpointError(
+            f"{folder}: the processors cannot be made: {exc} Name a local folder with `tokenizer` in the "
+            f"recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
+            f"HF_HUB_OFFLINE=0 is set."
+        ) from exc
+
+
+def register_steps(cls: type) -> None:
+    """Import the module in which a policy registers its processors' steps, found as lerobot names it.
+
+    lerobot imports it for a training only: a new process that evaluates a checkpoint would not know them.
+    """
+    module = cls.__module__
+    name = module.replace("configuration_", "processor_")
+    if name != module and importlib.util.find_spec(name) is not None:
+        importlib.import_module(name)
+
+
+def action_tokenizer_overrides(config: Any, steps: Sequence[str | None]) -> dict[str, dict[str, Any]]:
+    """Return what the step that makes tokens of actions is to be told; nothing where there is no such step.
+
+    lerobot saves neither the text tokenizer nor `fast_skip_tokens` with it.
+    """
+    if ACTION_TOKENIZER_STEP not in steps:
+        return {}
+    settings = {
+        "action_tokenizer_name": config.action_tokenizer_name,
+        "paligemma_tokenizer_name": config.text_tokenizer_name,
+        "fast_skip_tokens": config.fast_skip_tokens,
+        "max_action_tokens": config.max_action_tokens,
+    }
+    return {ACTION_TOKENIZER_STEP: settings}
+
+
+def own_tokenizers(folder: Path, tokenizer: str | None) -> dict[str, str]:
+    """Return the tokenizers that a policy itself loads (π0-FAST), by its configuration's fields."""
+    found = {"text_tokenizer_name": _tokenizer(folder, tokenizer)}
+    actions = folder / ACTION_TOKENIZER_FOLDER
+    if actions.is_dir():
+        found["action_tokenizer_name"] = str(actions)
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _tokenizer(folder: Path, named: str | None) -> str | None:
+    if named is not None:
+        if not Path(named).is_dir():
+            raise CheckpointError(f"tokenizer: expected a folder, found nothing at {named}.")
+        return named
+    own = folder / TOKENIZER_FOLDER
+    return str(own) if own.is_dir() else None
+
+
+def _checked_steps(path: Path) -> tuple[str, ...]:
+    """Return the names of a processor's steps; refuse code that is no processor's."""
+    steps = read_json(path).get("steps", [])
+    names = []
+    for step in steps:
+        name, imported = step.get("registry_name"), step.get("class")
+        if name is None and not str(imported).startswith(PROCESSOR_PACKAGES):
+            # lerobot would import and call whatever is named here.
+            raise CheckpointError(
+                f"{path}: names the code '{imported}', which is neither lerobot's nor a lerobot plugin's. "
+                f"It is not run. If it is yours, register the step with ProcessorStepRegistry."
+            )
+        names.append(str(name))
+    return tuple(names)
+
+
+def save_tokenizers(preprocessor: Any, folder: Path) -> None:
+    """Keep the tokenizers beside the weights: the names they were loaded by may mean nothing elsewhere."""
+    for step in preprocessor.steps:
+        tokenizer = getattr(step, "input_tokenizer", None)
+        if tokenizer is not None:
+            tokenizer.save_pretrained(str(folder / TOKENIZER_FOLDER))
+        action_tokenizer = getattr(step, "action_tokenizer", None)
+        if action_tokenizer is not None:
+            action_tokenizer.save_pretrained(folder / ACTION_TOKENIZER_FOLDER)
+
+
+def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:
+    """Raise `CheckpointError` unless all that is normalised has its statistics.
+
+    lerobot passes on unchanged what it has no statistics of.
+    """
+    missing = []
+    for step in (*preprocessor.steps, *postprocessor.steps):
+        if isinstance(step, EncoderStep | DecoderStep):
+            missing += step.missing_statistics()
+        if not isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
+            continue
+        for key, feature in step.features.items():
+            mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
+            have = (step.stats or {}).get(key, {})
+            missing += [f"{key}.{name}" for name in NEEDED_STATISTICS.get(mode, ()) if name not in have]
+    if missing:
+        shown = ", ".join(dict.fromkeys(missing))
+        raise CheckpointError(
+            f"{folder}: the checkpoint has no statistics for {shown}; lerobot would skip that normalisation "
+            f"without a word. Fine-tune it on a dataset, or fetch the complete checkpoint."
+        )
