@@ -1,6 +1,7 @@
 """π0-FAST: its action tokens are read as data, its chunks are whole, and a tiny one goes the whole way."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.training.finetune import finetune
 from vla_eval.training.recipe import FinetuneConfig
 from vla_eval.training.tiny_models import (
+    TINY_POLICY,
     VOCABULARY,
+    Family,
     make_tiny_pi0,
     tiny_paligemma,
     write_tiny_fast_tokenizer,
@@ -91,36 +94,58 @@ def test_code_that_comes_with_a_tokenizer_is_not_run(tmp_path: Path, monkeypatch
     assert trace.exists()  # so much for the test
 
 
+@pytest.mark.parametrize(
+    ("family", "missing", "message"),
+    [
+        ("pi0", "tokenizer", r"(?s)'pi0' could not be built.*local folder"),
+        ("pi0_fast", "tokenizer", r"(?s)'pi0_fast' could not be built.*local folder"),
+        ("pi0_fast", "action_tokenizer_name", r"action tokenizer 'lerobot/.*' cannot be read"),
+    ],
+)
+def test_a_training_without_a_tokenizer_says_which_one_is_missing(
+    recorded: Path, tmp_path: Path, tokenizer: Path, family: Family, missing: str, message: str
+) -> None:
+    config = tiny(recorded, tmp_path, tokenizer, family)
+    section = dict(config.finetune)
+    section["policy"] = {**section["policy"]}
+    del (section if missing == "tokenizer" else section["policy"])[missing]
+    with tiny_paligemma(family), pytest.raises(CheckpointError, match=message):
+        finetune(replace(config, finetune=section))
+
+
+def tiny(recorded: Path, folder: Path, tokenizer: Path, family: Family) -> FinetuneConfig:
+    """Return a training of four steps, with both tokenizers."""
+    recipe = folder / f"tiny_{family}.yaml"
+    recipe.write_text(f"version: 1\ndescription: tiny\nadapter: lerobot\nfinetune: {{type: {family}}}\n")
+    policy = {**TINY_POLICY, "scheduler_decay_steps": 4}
+    if family == "pi0_fast":
+        actions = write_tiny_fast_tokenizer(folder / "fast")
+        policy = {**TINY_FAST, "action_tokenizer_name": str(actions)}
+    return FinetuneConfig(
+        policy=str(recipe),
+        dataset=str(recorded),
+        out=str(folder / "run"),
+        finetune={**SHORT, "tokenizer": str(tokenizer), "policy": policy},
+        device="cpu",
+        allow_unreplayed=True,
+    )
+
+
 class TestTraining:
     @pytest.fixture
     def run(self, recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt) -> Path:
         """Train, be killed, go on; then both tokenizers are gone from where they were."""
-        (recorded.parent / "tiny_fast.yaml").write_text(
-            "version: 1\ndescription: tiny\nadapter: lerobot\nfinetune: {type: pi0_fast}\n"
-        )
-        actions = write_tiny_fast_tokenizer(tmp_path / "fast")
         read: Any = AutoTokenizer
         text = read.from_pretrained(str(tokenizer))  # random weights answer with any of these
         text.add_tokens([f"<{index}>" for index in range(VOCABULARY - len(text))])
         text.save_pretrained(str(tokenizer))
-        config = FinetuneConfig(
-            policy=str(recorded.parent / "tiny_fast.yaml"),
-            dataset=str(recorded),
-            out=str(tmp_path / "run"),
-            finetune={
-                **SHORT,
-                "tokenizer": str(tokenizer),
-                "policy": {**TINY_FAST, "action_tokenizer_name": str(actions)},
-            },
-            device="cpu",
-            allow_unreplayed=True,
-        )
+        config = tiny(recorded, tmp_path, tokenizer, "pi0_fast")
         with tiny_paligemma("pi0_fast"):
             with killed_at(3):
                 finetune(config)
             finetune(config)
         tokenizer.rename(tmp_path / "gone")  # the checkpoint has its own
-        actions.rename(tmp_path / "gone, too")
+        (tmp_path / "fast").rename(tmp_path / "gone, too")
         return tmp_path / "run"
 
     def test_a_tiny_one_goes_the_whole_way(self, run: Path) -> None:

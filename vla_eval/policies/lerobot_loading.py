@@ -13,7 +13,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
+from typing import Any, NoReturn  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
 from lerobot.configs import PreTrainedConfig
@@ -151,15 +151,28 @@ def make_empty_policy(config: Any, **kwargs: Any) -> Any:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
         ) from exc
-    except (OSError, RuntimeError) as exc:  # transformers' for files that are neither there nor cached
-        if isinstance(exc.__cause__, VlaEvalError):  # lerobot's π0-FAST wraps whatever went wrong
-            raise exc.__cause__ from exc
-        if not isinstance(exc, OSError) and not isinstance(exc.__cause__, OSError):
-            raise
-        raise CheckpointError(
-            f"a LeRobot policy of type '{config.type}' could not be built without the network: {exc} Give it "
-            f"a local folder, or set HF_HUB_OFFLINE=0 once to let it fetch the file."
-        ) from exc
+    except (OSError, RuntimeError) as exc:
+        raise_plainly(exc, config.type)
+
+
+def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
+    """Say which file is missing, if that is what ended the making of a policy or of its processors.
+
+    Raises:
+        CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
+        OSError, RuntimeError: as given, if it was something else.
+    """
+    cause = exc.__cause__  # lerobot's π0-FAST wraps whatever went wrong
+    if isinstance(cause, VlaEvalError):
+        raise cause
+    if not isinstance(exc, OSError) and not isinstance(cause, OSError):
+        raise exc
+    missing = exc if isinstance(exc, OSError) else cause
+    raise CheckpointError(
+        f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
+        "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
+        "fetch the file."
+    ) from exc
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:

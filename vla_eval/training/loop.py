@@ -42,7 +42,7 @@ from vla_eval.policies.checkpoint import (
     read_json,
     write_facts,
 )
-from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy
+from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy, raise_plainly
 from vla_eval.policies.lerobot_processors import (
     TOKENIZER_STEP,
     action_tokenizer_overrides,
@@ -147,6 +147,8 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
                 f"the policy asks for weights that are not on this machine, and they could not be downloaded "
                 f"({exc.reason}). Without them: --set policy.pretrained_backbone_weights=null"
             ) from exc
+        except (OSError, RuntimeError) as exc:
+            raise_plainly(exc, cfg.type)
         cfg.pretrained_path, cfg.use_peft = path, peft
         if hooks.weights is None:
             return policy
@@ -167,7 +169,11 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
             of_actions = action_tokenizer_overrides(policy_cfg, steps)
             kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **of_actions}
             _override_our_steps(Path(pretrained_path), policy_cfg, kwargs)
-        return originals["make_pre_post_processors"](policy_cfg, pretrained_path=pretrained_path, **kwargs)
+        make = originals["make_pre_post_processors"]
+        try:
+            return make(policy_cfg, pretrained_path=pretrained_path, **kwargs)
+        except OSError as exc:
+            raise_plainly(exc, policy_cfg.type)
 
     def make_optimizer_and_scheduler(cfg: Any, policy: Any) -> Any:
         hooks.on_model(policy)
