@@ -171,6 +171,19 @@ class TestTraining:
         # A coefficient is rounded to 0.1: each of four is off by at most 0.05, and they are orthonormal.
         np.testing.assert_allclose(seen[0], chunk, atol=0.05 * 2)
 
+    def test_a_checkpoint_is_a_base_with_tokenizers_of_its_own(
+        self, run: Path, recorded: Path, tmp_path: Path, tokenizer: Path
+    ) -> None:
+        config = tiny(recorded, tmp_path, tokenizer, "pi0_fast")
+        own = {**SHORT, "steps": 2, "base_checkpoint": str(run), "policy": {"scheduler_decay_steps": 2}}
+        (tmp_path / "fast").rename(tmp_path / "gone again")
+        with tiny_paligemma("pi0_fast"):
+            finetune(replace(config, out=str(tmp_path / "next"), finetune=own))
+        made = json.loads((find_checkpoint(tmp_path / "next") / "config.json").read_text())
+        folder = find_checkpoint(run)
+        assert made["text_tokenizer_name"] == str(folder / "tokenizer")
+        assert made["action_tokenizer_name"] == str(folder / "action_tokenizer")
+
     def test_its_weights_change(self, run: Path) -> None:
         first, last = (weights(run / f"train/checkpoints/00000{step}") for step in (2, 4))
         assert any(not torch.equal(first[name], last[name]) for name in first)

@@ -138,8 +138,8 @@ def save_tokenizers(preprocessor: Any, folder: Path) -> None:
         tokenizer = getattr(step, "input_tokenizer", None)
         if tokenizer is not None:
             tokenizer.save_pretrained(str(folder / TOKENIZER_FOLDER))
-        action_tokenizer = getattr(step, "action_tokenizer", None)
-        if action_tokenizer is not None:
+        action_tokenizer: Any = getattr(step, "action_tokenizer", None)
+        if hasattr(action_tokenizer, "save_pretrained"):
             action_tokenizer.save_pretrained(folder / ACTION_TOKENIZER_FOLDER)
 
 

@@ -23,6 +23,7 @@ from vla_eval.errors import (
 )
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
+from vla_eval.policies.lerobot_processors import own_tokenizers
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.recipe import FinetuneRecipe
 
@@ -131,14 +132,16 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
 
 def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
     assert recipe.base_checkpoint is not None
-    data = read_json(find_checkpoint(Path(recipe.base_checkpoint)) / CONFIG_FILE)
+    folder = find_checkpoint(Path(recipe.base_checkpoint))
+    data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
     if kind != recipe.type:
         raise RecipeError(
             f"finetune.base_checkpoint: {recipe.base_checkpoint} holds a '{kind}', expected a "
             f"'{recipe.type}'."
         )
-    data.update({name: value for name, value in NO_DOWNLOADS.items() if name in data})
+    here = {**NO_DOWNLOADS, **own_tokenizers(folder, recipe.tokenizer)}
+    data.update({name: value for name, value in here.items() if name in data})
     return {**data, "use_peft": False, "pretrained_path": None}
 
 
