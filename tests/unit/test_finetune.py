@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from tests.unit import tiny_trainings
 from tests.unit.tiny_trainings import SHORT, TASK, act, context, pi0
 from vla_eval.core import EpisodeStart
+from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, TrainingError
@@ -33,6 +34,7 @@ pytestmark = pytest.mark.usefixtures("small_act")
 tokenizer = tiny_trainings.tokenizer
 offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own
 
+DARK = {"type": "ColorJitter", "kwargs": {"brightness": [0.0, 0.0]}}
 KilledAt = Callable[[int], AbstractContextManager[None]]
 
 
@@ -97,6 +99,28 @@ class TestRuns:
         assert again.checkpoint == find_checkpoint(straight)
         with pytest.raises(TrainingError, match=r"finetune\.batch_size: 2 -> 3"):
             finetune(act(recorded, straight, batch_size=3))
+
+    @pytest.mark.parametrize("transforms", [None, {"tfs": {"dark": DARK}}])
+    def test_pictures_are_changed_as_the_recipe_says(
+        self,
+        recorded: Path,
+        tmp_path: Path,
+        transforms: dict[str, Any] | None,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        brightest: list[float] = []
+        served = MemoryDataset.__getitem__
+
+        def watched(dataset: Any, index: int) -> Any:
+            sample = served(dataset, index)
+            brightest.append(float(sample["observation.images.base"].max()))
+            return sample
+
+        monkeypatch.setattr(MemoryDataset, "__getitem__", watched)
+        monkeypatch.delattr(MemoryDataset, "__getitems__", raising=False)
+        finetune(act(recorded, tmp_path / "run", image_transforms=transforms))
+        assert brightest
+        assert (max(brightest) == 0) == (transforms is not None)
 
     def test_a_tiny_pi0_goes_the_whole_way_and_resumes_exactly(
         self, recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt

@@ -104,6 +104,23 @@ class TestRefusals:
         with pytest.raises(Exception, match=r"no field 'chunk_sizes'\. Did you mean 'chunk_size'"):
             finetune(act(recorded, tmp_path / "o", policy={"chunk_sizes": 4}))
 
+    @pytest.mark.parametrize(
+        ("transforms", "message"),
+        [
+            (
+                {"tfs": {"hue": {"type": "ColourJitter"}}},
+                r"image_transforms: Transform 'ColourJitter'",
+            ),
+            ({"max_transforms": 1}, r"image_transforms: .*max_transforms"),
+        ],
+    )
+    def test_image_transforms_that_lerobot_does_not_have_are_refused(
+        self, recorded: Path, tmp_path: Path, transforms: dict[str, Any], message: str
+    ) -> None:
+        with pytest.raises(RecipeError, match=f"(?s){message}"):
+            finetune(act(recorded, tmp_path / "o", image_transforms=transforms))
+        assert not (tmp_path / "o").exists()
+
     def test_a_type_that_could_not_be_evaluated_is_not_trained(self, recorded: Path, tmp_path: Path) -> None:
         config = act(recorded, tmp_path / "o")
         with pytest.raises(CheckpointError, match=r"'vqbet' cannot be evaluated"):

@@ -35,7 +35,7 @@ from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut, check_held_out
 from vla_eval.training.loop import LoopHooks, append_metrics, run_loop
-from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
+from vla_eval.training.policy_config import image_transforms, masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, LoraRecipe, merge_fields
 from vla_eval.training.run_folder import (
     LOG_FILE,
@@ -120,6 +120,7 @@ def finetune(
         keep_freed_memory()
     _check_lora_is_told(recipe.value)
     policy = policy_config(recipe.value, dataset, device=device)
+    image_transforms(recipe.value)  # refused before the run has a folder
     frames = used_frames(policy, dataset)
     out = Path(config.out) if config.out is not None else default_out(config)
     say(
@@ -269,6 +270,7 @@ def _loop_config(
             repo_id=f"local/{dataset.name}",
             root=str(dataset.root),
             use_imagenet_stats=recipe.imagenet_statistics,
+            image_transforms=image_transforms(recipe),
             video_backend=video_decoder(),
         ),
         policy=policy,

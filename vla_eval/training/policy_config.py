@@ -10,6 +10,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 import draccus
 import numpy as np
 import torch
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
@@ -67,6 +68,22 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)
+    return config
+
+
+def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
+    """Return lerobot's configuration of how pictures are changed at random in training.
+
+    Raises:
+        RecipeError: a field or a transform that lerobot does not have.
+    """
+    if recipe.image_transforms is None:
+        return ImageTransformsConfig()
+    try:
+        config = draccus.decode(ImageTransformsConfig, {**recipe.image_transforms, "enable": True})
+        ImageTransforms(config)
+    except Exception as exc:  # draccus, lerobot and torchvision raise what they like
+        raise RecipeError(f"finetune.image_transforms: {exc}") from exc
     return config
 
 

@@ -57,6 +57,8 @@ class FinetuneRecipe:
         save_every_steps, log_every_steps: when checkpoints and metrics are written.
         num_workers: processes that load samples, at most; no more than there are cores.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
+        image_transforms: augmentation, fields of lerobot's `ImageTransformsConfig` (`max_num_transforms`,
+            `random_order`, `tfs`); {}: its own six; None: pictures as they are.
         imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
         wandb_project, trackio_project: log there, too.
     """
@@ -74,6 +76,7 @@ class FinetuneRecipe:
     log_every_steps: int = 100
     num_workers: int = 4
     decode_ahead: bool = True
+    image_transforms: dict[str, Any] | None = None  # Any: lerobot checks its own fields
     imagenet_statistics: bool = False
     wandb_project: str | None = None
     trackio_project: str | None = None
