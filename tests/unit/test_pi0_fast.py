@@ -75,7 +75,7 @@ class TestTokens:
             load_fast_tokenizer(str(tmp_path / "nothing"))
 
 
-def test_code_that_comes_with_a_tokenizer_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_comes_with_a_tokenizer_is_not_run(tmp_path: Path) -> None:
     trace, folder = tmp_path / "it-ran", tmp_path / "foreign"
     folder.mkdir()
     (folder / "theirs.py").write_text(
@@ -87,10 +87,10 @@ def test_code_that_comes_with_a_tokenizer_is_not_run(tmp_path: Path, monkeypatch
     (folder / "tokenizer_config.json").write_text(json.dumps(settings))
     make: Any = AutoTokenizer
     with no_foreign_code("pi0_fast"), pytest.raises(CheckpointError, match=r"'Theirs' is in .*It is not run"):
-        make.from_pretrained(str(folder), trust_remote_code=True)
+        make.from_pretrained(str(folder), trust_remote_code=True)  # as lerobot asks; it must be in vain
     assert not trace.exists()
     with pytest.raises(Exception):  # noqa: B017  it has no vocabulary: what matters is that it came so far
-        make.from_pretrained(str(folder), trust_remote_code=True)
+        make.from_pretrained(str(folder), trust_remote_code=True)  # the code written above, nobody else's
     assert trace.exists()  # so much for the test
 
 

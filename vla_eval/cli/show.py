@@ -107,23 +107,15 @@ def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
     """Yield the keyword arguments of the task's class and of its bases in this package, nearest first."""
     module_name, _, class_name = spec.entry_point.partition(":")
     seen: set[str] = set(NOT_FOR_USERS)
-    for source in _classes(module_name, class_name):
-        for init in source.node.body:
+    for origin, node in _classes(module_name, class_name):
+        for init in node.body:
             if not isinstance(init, ast.FunctionDef) or init.name != "__init__":
                 continue
             for argument, default in zip(init.args.kwonlyargs, init.args.kw_defaults, strict=True):
                 if argument.arg not in seen:
                     seen.add(argument.arg)
-                    value = _value(source.module_name, default) if default else None
-                    yield TaskArgument(argument.arg, value, source.class_name)
-
-
-class _Source(NamedTuple):
-    """A class, as the module that defines it has it."""
-
-    module_name: str
-    class_name: str
-    node: ast.ClassDef
+                    value = _value(origin, default) if default else None
+                    yield TaskArgument(argument.arg, value, node.name)
 
 
 class _Module(NamedTuple):
@@ -148,13 +140,13 @@ def _module(name: str) -> _Module:
     return _Module(tree.body, imported)
 
 
-def _classes(module_name: str, class_name: str) -> Iterator[_Source]:
-    """Yield a class and its bases in this package, from their source."""
+def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:
+    """Yield a class and its bases in this package, each with its module's name, from their source."""
     module = _module(module_name)
     for node in module.body:
         if not isinstance(node, ast.ClassDef) or node.name != class_name:
             continue
-        yield _Source(module_name, class_name, node)
+        yield module_name, node
         for base in node.bases:
             name = ast.unparse(base)
             yield from _classes(*module.imported.get(name, (module_name, name)))

@@ -109,8 +109,7 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
                 "recipe."
             )
         data["dtype"] = options.dtype
-    here = {**NO_DOWNLOADS, **own_tokenizers(folder, options.tokenizer)}
-    data.update({name: value for name, value in here.items() if name in data})
+    data = with_local_files(data, folder, tokenizer=options.tokenizer)
     try:
         config = draccus.decode(cls, data)
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
@@ -119,6 +118,18 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
             f"{exc}"
         ) from exc
     return config
+
+
+def with_local_files(data: dict[str, Any], folder: Path, *, tokenizer: str | None) -> dict[str, Any]:
+    """Return a configuration that asks for no download, and for the tokenizers of this checkpoint.
+
+    Args:
+        data: of the checkpoint.
+        folder: of the checkpoint.
+        tokenizer: see `LoadOptions`.
+    """
+    here = {**NO_DOWNLOADS, **own_tokenizers(folder, tokenizer)}
+    return {**data, **{name: value for name, value in here.items() if name in data}}
 
 
 def config_class(kind: str, *, where: str) -> Any:

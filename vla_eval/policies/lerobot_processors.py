@@ -45,13 +45,9 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
         overrides["device_processor"] = {"device": config.device}
     if "normalizer_processor" in before:
         overrides["normalizer_processor"] = {"device": config.device}
-    if TOKENIZER_STEP in before:
-        own = _tokenizer(folder, tokenizer)
-        if own is not None:
-            overrides[TOKENIZER_STEP] = {"tokenizer_name": own}
-    elif tokenizer is not None:
+    if tokenizer is not None and TOKENIZER_STEP not in before:
         raise CheckpointError(f"{folder}: `tokenizer` is given, but this policy's preprocessor has none.")
-    overrides.update(action_tokenizer_overrides(config, before))
+    overrides.update(tokenizer_overrides(folder, config, before, tokenizer=tokenizer))
     # The postprocessor ends with a step of the same name that brings actions to the CPU: left alone.
     after_overrides = (
         {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
@@ -82,20 +78,29 @@ def register_steps(cls: type) -> None:
         importlib.import_module(name)
 
 
-def action_tokenizer_overrides(config: Any, steps: Sequence[str | None]) -> dict[str, dict[str, Any]]:
-    """Return what the step that makes tokens of actions is to be told; nothing where there is no such step.
+def tokenizer_overrides(
+    folder: Path, config: Any, steps: Sequence[str], *, tokenizer: str | None
+) -> dict[str, dict[str, Any]]:
+    """Return what the steps of a saved preprocessor that make tokens are to be told, by their names.
 
-    lerobot saves neither the text tokenizer nor `fast_skip_tokens` with it.
+    Args:
+        folder: of the checkpoint.
+        config: of the policy.
+        steps: names of the preprocessor's steps.
+        tokenizer: see `load_processors`.
     """
-    if ACTION_TOKENIZER_STEP not in steps:
-        return {}
-    settings = {
-        "action_tokenizer_name": config.action_tokenizer_name,
-        "paligemma_tokenizer_name": config.text_tokenizer_name,
-        "fast_skip_tokens": config.fast_skip_tokens,
-        "max_action_tokens": config.max_action_tokens,
-    }
-    return {ACTION_TOKENIZER_STEP: settings}
+    overrides: dict[str, dict[str, Any]] = {}
+    own = _tokenizer(folder, tokenizer)
+    if TOKENIZER_STEP in steps and own is not None:
+        overrides[TOKENIZER_STEP] = {"tokenizer_name": own}
+    if ACTION_TOKENIZER_STEP in steps:  # lerobot saves neither the text tokenizer nor the skipped tokens
+        overrides[ACTION_TOKENIZER_STEP] = {
+            "action_tokenizer_name": config.action_tokenizer_name,
+            "paligemma_tokenizer_name": config.text_tokenizer_name,
+            "fast_skip_tokens": config.fast_skip_tokens,
+            "max_action_tokens": config.max_action_tokens,
+        }
+    return overrides
 
 
 def own_tokenizers(folder: Path, tokenizer: str | None) -> dict[str, str]:

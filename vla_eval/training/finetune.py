@@ -207,8 +207,6 @@ def _train(
         on_checkpoint=evaluate,
     )
     loop_config = _loop_config(recipe, dataset, policy, config.run_seed, out, resume=resume_from is not None)
-    if recipe.tokenizer is not None and hasattr(policy, "text_tokenizer_name"):
-        policy.text_tokenizer_name = recipe.tokenizer  # π0-FAST itself loads it, too
     with _tokenizer_from(recipe.tokenizer, recipe.type), no_foreign_code(recipe.type):
         run_loop(loop_config, hooks, resume_from=resume_from)
 

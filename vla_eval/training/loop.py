@@ -37,17 +37,12 @@ from vla_eval.policies.checkpoint import (
     MODEL_FOLDER,
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
-    TOKENIZER_FOLDER,
     TrainingFacts,
     read_json,
     write_facts,
 )
 from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy, raise_plainly
-from vla_eval.policies.lerobot_processors import (
-    TOKENIZER_STEP,
-    action_tokenizer_overrides,
-    save_tokenizers,
-)
+from vla_eval.policies.lerobot_processors import save_tokenizers, tokenizer_overrides
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.micro_batches import InMicroBatches
 
@@ -160,15 +155,12 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         return filled.to(cfg.device)
 
     def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
-        tokenizer = _tokenizer_of(Path(pretrained_path), hooks.tokenizer) if pretrained_path else None
-        if tokenizer is not None:
-            overrides = {**kwargs["preprocessor_overrides"], TOKENIZER_STEP: {"tokenizer_name": tokenizer}}
-            kwargs["preprocessor_overrides"] = overrides
         if pretrained_path:
-            steps = _step_names(Path(pretrained_path) / PREPROCESSOR_FILE)
-            of_actions = action_tokenizer_overrides(policy_cfg, steps)
-            kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **of_actions}
-            _override_our_steps(Path(pretrained_path), policy_cfg, kwargs)
+            folder = Path(pretrained_path)
+            steps = _step_names(folder / PREPROCESSOR_FILE)
+            found = tokenizer_overrides(folder, policy_cfg, steps, tokenizer=hooks.tokenizer)
+            kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **found}
+            _override_our_steps(folder, policy_cfg, kwargs)
         make = originals["make_pre_post_processors"]
         try:
             return make(policy_cfg, pretrained_path=pretrained_path, **kwargs)
@@ -258,15 +250,8 @@ def append_metrics(file: Path, line: Mapping[str, float | str]) -> None:
         lines.write(f"{json.dumps(dict(line))}\n")
 
 
-def _tokenizer_of(folder: Path, named: str | None) -> str | None:
-    """Return the tokenizer for processors that are loaded from a folder; None if they need none of ours."""
-    own = folder / TOKENIZER_FOLDER
-    found = named or (str(own) if own.is_dir() else None)
-    return found if TOKENIZER_STEP in _step_names(folder / PREPROCESSOR_FILE) else None
-
-
-def _step_names(file: Path) -> list[str | None]:
-    return [step.get("registry_name") for step in read_json(file).get("steps", [])]
+def _step_names(file: Path) -> list[str]:
+    return [str(step.get("registry_name")) for step in read_json(file).get("steps", [])]
 
 
 def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> None:

@@ -23,8 +23,7 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
-from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
-from vla_eval.policies.lerobot_processors import own_tokenizers
+from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.recipe import FinetuneRecipe
 
@@ -53,6 +52,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     data: dict[str, Any] = {}
     if recipe.base_checkpoint is not None:
         data = _base_config(recipe)
+    if recipe.tokenizer is not None and "text_tokenizer_name" in known:
+        data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
     try:
         config = draccus.decode(cls, data)
@@ -157,8 +158,7 @@ def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
             f"finetune.base_checkpoint: {recipe.base_checkpoint} holds a '{kind}', expected a "
             f"'{recipe.type}'."
         )
-    here = {**NO_DOWNLOADS, **own_tokenizers(folder, recipe.tokenizer)}
-    data.update({name: value for name, value in here.items() if name in data})
+    data = with_local_files(data, folder, tokenizer=recipe.tokenizer)
     return {**data, "use_peft": False, "pretrained_path": None}
 
 
