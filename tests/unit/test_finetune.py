@@ -186,6 +186,20 @@ class TestRuns:
         assert attention
         assert modules - attention == {"action_in_proj", "action_out_proj", *projections}
 
+    def test_code_that_a_base_names_as_a_processor_is_not_run(
+        self, recorded: Path, tmp_path: Path, tokenizer: Path
+    ) -> None:
+        base, trace = tmp_path / "base", tmp_path / "it-ran"
+        with tiny_paligemma():
+            finetune(pi0(recorded, base, tokenizer, steps=2))
+            file = find_checkpoint(base) / "policy_preprocessor.json"
+            data = json.loads(file.read_text())
+            data["steps"].append({"class": "os.system", "config": {"command": f"touch {trace}"}})
+            file.write_text(json.dumps(data))
+            with pytest.raises(CheckpointError, match=r"names the code 'os\.system'"):
+                finetune(pi0(recorded, tmp_path / "next", tokenizer, base_checkpoint=str(base)))
+        assert not trace.exists()
+
     def test_a_base_that_lacks_a_tensor_is_not_trained_on(
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:

@@ -38,7 +38,7 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
         CheckpointError: one is missing, or names code or a tokenizer that is not there.
     """
     register_steps(type(config))
-    described = {name: _checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
+    described = {name: checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
     before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
     overrides: dict[str, dict[str, Any]] = {}
     if "device_processor" in before:
@@ -121,8 +121,12 @@ def _tokenizer(folder: Path, named: str | None) -> str | None:
     return str(own) if own.is_dir() else None
 
 
-def _checked_steps(path: Path) -> tuple[str, ...]:
-    """Return the names of a processor's steps; refuse code that is no processor's."""
+def checked_steps(path: Path) -> tuple[str, ...]:
+    """Return the names of a saved processor's steps.
+
+    Raises:
+        CheckpointError: the file is missing, or names code that is no processor's.
+    """
     steps = read_json(path).get("steps", [])
     names = []
     for step in steps:

@@ -38,11 +38,10 @@ from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     TrainingFacts,
-    read_json,
     write_facts,
 )
 from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy, raise_plainly
-from vla_eval.policies.lerobot_processors import save_tokenizers, tokenizer_overrides
+from vla_eval.policies.lerobot_processors import checked_steps, save_tokenizers, tokenizer_overrides
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.micro_batches import InMicroBatches
 
@@ -157,7 +156,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
     def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
         if pretrained_path:
             folder = Path(pretrained_path)
-            steps = _step_names(folder / PREPROCESSOR_FILE)
+            steps = checked_steps(folder / PREPROCESSOR_FILE)
             found = tokenizer_overrides(folder, policy_cfg, steps, tokenizer=hooks.tokenizer)
             kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **found}
             _override_our_steps(folder, policy_cfg, kwargs)
@@ -250,10 +249,6 @@ def append_metrics(file: Path, line: Mapping[str, float | str]) -> None:
         lines.write(f"{json.dumps(dict(line))}\n")
 
 
-def _step_names(file: Path) -> list[str]:
-    return [str(step.get("registry_name")) for step in read_json(file).get("steps", [])]
-
-
 def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> None:
     """Give our own normaliser what lerobot addresses to its own by name.
 
@@ -263,7 +258,7 @@ def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> No
         ("preprocessor_overrides", PREPROCESSOR_FILE, "normalizer_processor", ENCODER_STEP),
         ("postprocessor_overrides", POSTPROCESSOR_FILE, "unnormalizer_processor", DECODER_STEP),
     ):
-        names = _step_names(folder / file)
+        names = checked_steps(folder / file)
         overrides = dict(kwargs.get(overrides_name) or {})
         if ours not in names or lerobots not in overrides:
             continue
