@@ -58,8 +58,6 @@ CHEAP = (
     "cli.record",
     "cli.replay",
     "cli.dataset",
-    "cli.train_expert",
-    "training.ppo_settings",
     "page.build",
     "cli.view",
     "viz.recorder",

@@ -12,7 +12,6 @@ from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     checkpoint_sha256,
-    file_sha256,
     find_checkpoint,
     read_facts,
     read_json,
@@ -22,9 +21,6 @@ from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATI
 
 LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
-PPO_EXPERT = "ppo_expert"
-PPO_FILES = ("config.json", "expert.safetensors")
-"""What the actions of a learned expert depend on; the rest of its folder is for people."""
 
 NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
     "MEAN_STD": ("mean", "std"),
@@ -54,13 +50,7 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
         CheckpointError: the weights are not there.
     """
     checkpoint = args.get("checkpoint")
-    if not isinstance(checkpoint, str):
-        return {}
-    if adapter == PPO_EXPERT:
-        return {
-            f"checkpoints/{policy}/{name}": _expert_file_sha256(Path(checkpoint) / name) for name in PPO_FILES
-        }
-    if adapter not in LEROBOT_CHECKPOINTS:
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
         return {}
     folder = find_checkpoint(Path(checkpoint))
     hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
@@ -146,9 +136,3 @@ def _numbers(file: Path) -> dict[str, list[float]]:
             f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
         ) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}
-
-
-def _expert_file_sha256(path: Path) -> str:
-    if not path.is_file():
-        raise CheckpointError(f"{path}: expected a file of `mikasa-vla train-expert`, found none.")
-    return file_sha256(path)
