@@ -33,6 +33,7 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
         UnknownNameError: there is no such baseline.
     """
     material = gather(runs, baseline=baseline)
+    chunks = rates.chunk_plots(material)
     return (
         _templates()
         .get_template(TEMPLATE)
@@ -43,8 +44,8 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
             material=material,
             results=rates.results_table(material),
             success=rates.success_plots(material),
-            chunks=rates.chunk_plots(material),
-            sweep=rates.chunk_sweep(material),
+            chunks=chunks,
+            sweep=rates.chunk_sweep(material) if chunks.charts else None,
             paired=rates.paired_table(material),
             steps=rates.steps_plots(material),
             choices=choice_sections.choices(material),

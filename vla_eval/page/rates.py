@@ -46,7 +46,7 @@ class Plots:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """The table of `mikasa-vla compare`; without one, `refusal` says why."""
+    """The table of `mikasa-vla compare`; where there is none, `refusal` says why."""
 
     table: PageTable | None
     notes: tuple[str, ...] = ()
@@ -127,6 +127,8 @@ def chunk_sweep(material: Material) -> Sweep:
 
 def paired_table(material: Material) -> PageTable | None:
     """Return the counts of each policy against the baseline; None if none is compared."""
+    if not material.pairs:
+        return None
     rows = []
     for row in material.table.rows:
         pairs = material.pairs.get(key_of(row))
@@ -144,8 +146,6 @@ def paired_table(material: Material) -> PageTable | None:
             ]
         )
     counted = ("pairs", "both", "only it", "only the baseline", "neither")
-    if not material.pairs:
-        return None
     return page_table(rows, text=("policy", "against"), numbers=(*counted, "difference", "p", "p (Holm)"))
 
 

@@ -118,7 +118,7 @@ def _parts(
 
 
 def _drawn(node: ElementTree.Element, tag: str) -> ElementTree.Element:
-    kept = {name: _rounded(node.attrib[name]) for name in ("d", "x", "y") if name in node.attrib}
+    kept = {name: _rounded(value) for name, value in node.attrib.items() if name in ("d", "x", "y")}
     element = ElementTree.Element(tag, {**kept, "style": _style(node)})
     element.text = node.text
     return element
