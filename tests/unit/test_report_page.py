@@ -228,8 +228,8 @@ def test_a_rate_lies_where_it_belongs_and_no_result_is_said_in_words() -> None:
     whisker = re.search(r'<g class="whisker"><path d="M ([\d.]+) [\d.]+ L ([\d.]+) ', drawn)
     marker = re.search(r'<g class="marker"><path [^>]*translate\(([\d.]+) ', drawn)
     assert whisker and marker
-    assert float(marker[1]) - float(whisker[1]) == pytest.approx(100, abs=0.02)  # a quarter of 400 px
-    assert float(whisker[2]) - float(marker[1]) == pytest.approx(100, abs=0.02)
+    assert float(marker[1]) - float(whisker[1]) == pytest.approx(80, abs=0.02)  # a quarter of 320 px
+    assert float(whisker[2]) - float(marker[1]) == pytest.approx(80, abs=0.02)
     assert "no result" in drawn
 
 

@@ -18,14 +18,14 @@ from vla_eval.page.svg import PALETTE, inline_svg, own_style, text_width_px
 
 COLORS = tuple(PALETTE[name] for name in ("c0", "c1", "c2", "c3", "c4", "c5", "ink"))
 MARKERS = (("o", 8), ("s", 7.5), ("^", 9), ("D", 7), ("X", 9), ("v", 9), ("P", 9))  # with their sizes, px
-DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (1, 2), (10, 4), (4, 2, 1, 2))  # px on, px off
+DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (8, 3, 2, 3, 2, 3), (10, 4), (4, 2, 1, 2))  # px on, px off
 REFERENCES: Mapping[str, tuple[str, tuple[float, ...]]] = MappingProxyType(
     {"chance": (PALETTE["muted"], (5, 3)), "ceiling": (PALETTE["ink"], (1.5, 3))}
 )
 RATE_TICKS = (0, 0.25, 0.5, 0.75, 1)
 PX = 1 / 72  # inches, as matplotlib counts
 ROW_HEIGHT_PX = 24
-FOREST_WIDTH_PX = 400
+FOREST_WIDTH_PX = 320  # with its labels it is still legible on a phone
 CURVES_SIZE_PX = (320, 180)
 SIGN_SIZE_PX = (26, 16)
 
