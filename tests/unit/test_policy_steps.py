@@ -24,6 +24,7 @@ from vla_eval.policies.steps.images import (
     centre_crop,
     crop_and_resize,
     resize_and_centre_crop,
+    resize_bicubic,
     resize_lanczos3,
 )
 from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
@@ -218,6 +219,28 @@ class TestImages:
     def test_no_saturation_is_grey(self) -> None:
         grey = augment(torch.rand(1, 1, 3, 4, 4) * 255, Augmentation(saturation=(0.0, 0.0)))
         torch.testing.assert_close(grey[:, :, 0], grey[:, :, 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda images: resize_lanczos3(images, Size(7, 5)),
+        lambda images: resize_bicubic(images, Size(7, 5)),
+        lambda images: resize_and_centre_crop(images, Size(7, 5), 0.9),
+        lambda images: centre_crop(images, 0.9),
+        lambda images: augment(images, Augmentation(crop_area=(0.5, 0.6), contrast=(0.8, 1.2), hue=0.1)),
+        lambda images: crop_and_resize(images, Boxes(*(torch.full((2,), 0.3) for _ in range(4)))),
+    ],
+)
+def test_images_are_changed_in_float32_whatever_the_network_is_run_in(change: Any) -> None:
+    images = torch.rand(2, 1, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round()
+    torch.manual_seed(1)
+    wanted = change(images)
+    for given in (images, images.bfloat16()):  # whole levels up to 255 are exact in bfloat16
+        torch.manual_seed(1)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            found = change(given)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
 
 
 class Tiny(nn.Module):

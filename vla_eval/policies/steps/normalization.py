@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.policies.steps.precision import in_float32
 from vla_eval.policies.steps.step_names import STATISTICS, NormalizationKind
 
 EPSILON = 1e-8
@@ -88,6 +89,7 @@ class Normalizer:
         first, second = STATISTICS[self.spec.kind]
         return {first: self._first.clone(), second: self._second.clone()}
 
+    @in_float32
     def normalize(self, values: Tensor) -> Tensor:
         """Return values (…, D), normalised; for training targets and for the state."""
         affine = self._affine(values)
@@ -96,6 +98,7 @@ class Normalizer:
             scaled = scaled.clamp(-1, 1)
         return torch.where(affine.mask, scaled, values)
 
+    @in_float32
     def unnormalize(self, values: Tensor) -> Tensor:
         """Return normalised values (…, D) in the unit of the data; for predicted actions."""
         affine = self._affine(values)
