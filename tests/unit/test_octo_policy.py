@@ -132,6 +132,26 @@ class TestTraining:
         assert len(kernels["params"]) + len(others["params"]) == len(named)
         assert others["weight_decay"] == 0.0 and all(x.ndim > 1 for x in kernels["params"])
 
+    def test_decay_is_for_just_the_kernels_of_the_original(self) -> None:
+        """The original's rule is `"kernel" in path`; norms have scales there, positions are embeddings."""
+        policy = tiny_policy(trained="all")
+        stem = (*(f"convolutions.{index}" for index in range(4)), "embedding")
+        trunk = [
+            *(f"stems.{camera}.{part}" for camera in ("primary", "wrist") for part in stem),
+            *("projections.primary", "projections.wrist", "language_projection"),
+            *(f"blocks.0.{part}" for part in ("query", "key", "value", "out", "fc1", "fc2")),
+        ]
+        head = ["time_fc1", "time_fc2", "first", "last", "blocks.0.fc1", "blocks.0.fc2"]
+        expected = {
+            "network.head.frequencies",  # `time_preprocess.kernel`
+            *(f"network.transformer.{name}.weight" for name in trunk),
+            *(f"network.head.{name}.weight" for name in head),
+        }
+        kernels, others = policy.get_optim_params()
+        names = {id(x): name for name, x in policy.named_parameters()}
+        assert {names[id(x)] for x in kernels["params"]} == expected
+        assert "weight_decay" not in kernels and others["weight_decay"] == 0.0
+
     def test_remembered_readouts_are_computed_once_and_are_the_same(self) -> None:
         policy = tiny_policy(remember_readouts=True, augment=False)
         policy.train()
