@@ -30,6 +30,7 @@ class StoredFrames:
             self._env.spec,
             cameras=tuple(replace(c, height_px=edges[c.name], width_px=edges[c.name]) for c in cameras),
         )
+        self.asked: list[FloatArray] = []
         self.executed: list[FloatArray] = []
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
@@ -37,6 +38,7 @@ class StoredFrames:
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         results = self._env.step(actions, render=render)
+        self.asked += actions.values()
         self.executed += [result.executed_action for result in results.values()]
         return {slot: self._shown(result) for slot, result in results.items()}
 

@@ -105,6 +105,10 @@ class TestInference:
 
     def test_two_pictures(self) -> None:
         inputs, values = golden.inputs([[0, 1]], golden.prompts(1)), golden.values()
+        ids = values["infer_img2.input_ids"][0]
+        n_patches = 2 * SIZES.n_patches  # of the one picture, then of the other, before the prompt
+        assert bool((ids[:n_patches] == SIZES.image_token).all())
+        assert torch.equal(ids[n_patches:], inputs.prompts.ids[0])
         with torch.no_grad():
             told = generated_tokens(made(), inputs, chunk=CHUNK, attention="bidirectional")
         assert torch.equal(told.tokens, values["infer_img2.generated_ids"])
@@ -141,8 +145,14 @@ class TestTraining:
         inputs = golden.inputs(pictures, golden.training_prompts(name))
         actions = values["in.actions"][: len(pictures)]
         ids = to_tokens(actions, golden.grid(), network.sizes).flatten(1)
+        close(
+            inputs.intrinsics, values[f"{name}.intrinsic"].reshape(-1, 1, 3, 3).expand_as(inputs.intrinsics)
+        )
         sequence = network.sequence(inputs, ids)
         logits = network.logits(network.hidden(sequence, attention))
+        places = torch.arange(logits.shape[1])
+        is_told = (places >= sequence.first_action[:, None]) & (places < sequence.lengths[:, None])
+        assert torch.equal(is_told, values[f"{name}.token_type_ids"].bool())
         is_real = values[f"{name}.attention_mask"].bool()
         compared = is_real if attention == "causal" else torch.ones_like(is_real)
         expected = values[f"{name}.{regime}.logits"]

@@ -24,6 +24,11 @@ from vla_eval.policies.spatialvla.sizes import NetworkSizes, network_sizes
 from vla_eval.policies.steps.gripper import Gripper
 
 SIZES = golden.SIZES
+GRIDS = [
+    ("uniform", "act.uniform_bins"),
+    ("gaussian", "act.gaussian_bins"),
+    ("adapted_gaussian", "adapt.bins"),
+]
 TRANSLATIONS = slice(0, SIZES.n_translations)
 ROTATIONS = slice(SIZES.n_translations, SIZES.n_translations + SIZES.n_rotations)
 
@@ -33,14 +38,7 @@ def grid_of(name: str) -> ActionGrid:
 
 
 class TestGrid:
-    @pytest.mark.parametrize(
-        ("name", "prefix"),
-        [
-            ("uniform", "act.uniform_bins"),
-            ("gaussian", "act.gaussian_bins"),
-            ("adapted_gaussian", "adapt.bins"),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "prefix"), GRIDS)
     def test_edges_are_the_originals(self, name: str, prefix: str) -> None:
         for axis, edges in zip(AXES, grid_of(name).edges, strict=True):
             expected = golden.values()[f"{prefix}.{axis}_bins"].numpy()
