@@ -51,7 +51,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     check_names("field", recipe.policy, known, where=f"finetune.policy ({recipe.type})")
     data: dict[str, Any] = {}
     if recipe.base_checkpoint is not None:
-        data = _base_config(recipe)
+        of_this_base_alone = getattr(cls, "not_of_base", ())
+        data = {key: value for key, value in _base_config(recipe).items() if key not in of_this_base_alone}
     if recipe.tokenizer is not None and "text_tokenizer_name" in known:
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
