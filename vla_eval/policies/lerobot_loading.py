@@ -161,9 +161,10 @@ def config_class(kind: str, *, where: str) -> Any:
 
 
 def make_empty_policy(config: Any, **kwargs: Any) -> Any:
-    """Return a policy with the weights that its constructor gives it."""
+    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer."""
     try:
-        return get_policy_class(config.type)(config, **kwargs)
+        with no_foreign_code(config.type):
+            return get_policy_class(config.type)(config, **kwargs)
     except ImportError as exc:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"

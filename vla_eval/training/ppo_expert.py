@@ -22,6 +22,7 @@ from torch import Tensor
 from vla_eval.decoding import decode
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.policies.checkpoint_json import parse_json, read_json
 from vla_eval.results.durable import LineFile, replace_file
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.lockstep import LockstepEnvs
@@ -266,9 +267,13 @@ class _Learner:
             groups = self.optimizer.state_dict()["param_groups"]
             self.optimizer.load_state_dict({"state": state, "param_groups": groups})
         self.rng.set_state(tensors["rng"])
-        found = json.loads(metadata["state"])
-        self.n_steps, self.n_iterations = found["n_steps"], found["n_iterations"]
-        self.progress = PpoProgress(**found["progress"])
+        where = f"{out / WEIGHTS_FILE}, its metadata"
+        found = parse_json(metadata.get("state", "").encode(), where=where)
+        try:
+            self.n_steps, self.n_iterations = found["n_steps"], found["n_iterations"]
+            self.progress = PpoProgress(**found["progress"])
+        except (KeyError, TypeError) as exc:
+            raise CheckpointError(f"{where}: no state of a training ({exc!r:.200}). Train it again.") from exc
 
 
 def advantages_of(rewards_TN: Tensor, values_TN: Tensor, *, discount: float, gae_lambda: float) -> Tensor:
@@ -297,10 +302,10 @@ def read_settings(out: Path) -> PpoSettings:
     """
     path = out / CONFIG_FILE
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))  # Any: JSON
+        data = read_json(path)
         if data.pop("format_version") == FORMAT_VERSION:
             return decode(PpoSettings, data, where=str(path))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecipeError) as exc:
+    except (CheckpointError, KeyError, RecipeError) as exc:
         raise CheckpointError(
             f"{path}: no training of an expert ({exc!r:.200}). `mikasa-vla train-expert --out` makes one."
         ) from exc
