@@ -37,7 +37,8 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
     for path in _files(meta):
         if path.is_absolute() or ".." in path.parts:
             raise DatasetError(
-                f"{root}: meta/info.json says that a file lies at {path!s:.200}; expected a path inside of the "
+                f"{root}: meta/info.json says that a file lies at {path!s:.200}; expected a path inside of "
+                "the "
                 "dataset. It is not read. Fetch the dataset again, from where you trust it."
             )
         if not (root / path).is_file():
