@@ -38,8 +38,7 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
         if path.is_absolute() or ".." in path.parts:
             raise DatasetError(
                 f"{root}: meta/info.json says that a file lies at {path!s:.200}; expected a path inside of "
-                "the "
-                "dataset. It is not read. Fetch the dataset again, from where you trust it."
+                "the dataset. It is not read. Fetch the dataset again, from where you trust it."
             )
         if not (root / path).is_file():
             raise DatasetError(

@@ -57,8 +57,7 @@ def read_adapter_config(path: Path) -> Any:
         if value not in (None, known.get(name), {}, [], False):
             raise CheckpointError(
                 f"{path}: '{name}': expected peft's default, found {shown(value)}. Only plain LoRA is "
-                "loaded. "
-                "Merge the adapter into its base with the program that made it (docs/security.md)."
+                "loaded. Merge the adapter into its base with the program that made it (docs/security.md)."
             )
     return LoraConfig(**fields)
 

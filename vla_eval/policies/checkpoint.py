@@ -163,10 +163,9 @@ def adapter_bases(folder: Path, *, base_checkpoint: str | None = None) -> list[P
         found = find_checkpoint(base)
         if found.resolve() in [part.resolve() for part in chain]:
             raise CheckpointError(
-                f"{chain[-1] / ADAPTER_CONFIG_FILE}: expected the base of the adapter, found {found}, "
-                "which is "
-                "the adapter itself or stands on it. Name the base's folder with `base_checkpoint` in the "
-                "recipe's args."
+                f"{chain[-1] / ADAPTER_CONFIG_FILE}: expected the base of the adapter, found {found}, which "
+                "is the adapter itself or stands on it. Name the base's folder with `base_checkpoint` in "
+                "the recipe's args."
             )
         chain.append(found)
         base = adapter_base(found)

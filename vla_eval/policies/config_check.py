@@ -58,8 +58,7 @@ def check_features(config: Any, *, where: str) -> None:
             if any(type(size) is not int or size < 1 for size in shape) or math.prod(shape) > MAX_VALUES:
                 raise CheckpointError(
                     f"{where}: '{name}.{key:.100}': expected a shape of at most {MAX_VALUES:,} numbers, "
-                    "found "
-                    f"{shape!s:.100}. {FETCH_AGAIN}"
+                    f"found {shape!s:.100}. {FETCH_AGAIN}"
                 )
     action = getattr(config, "action_feature", None)
     if action is None or len(action.shape) != 1:

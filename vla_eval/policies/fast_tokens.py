@@ -81,8 +81,7 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
     if not isinstance(scale, int | float) or not isinstance(min_token, int):
         raise CheckpointError(
             f"{file}: expected numbers 'scale' and 'min_token', found {scale!r:.60} and {min_token!r:.60}. "
-            "Fetch "
-            "the action tokenizer again."
+            "Fetch the action tokenizer again."
         )
     return FastActionTokenizer(loaded, scale=float(scale), min_token=min_token)
 

@@ -79,9 +79,8 @@ def _only_data(look_up: Callable[[str], Any]) -> Callable[[str], Any]:
         found = look_up(class_name)
         if found is not None and not _reads_data(found):
             raise CheckpointError(
-                f"a file names '{class_name}' of transformers as its tokenizer or processor, which is "
-                "none. It is "
-                "not called. Fetch the checkpoint again, from where you trust it."
+                f"a file names '{class_name}' of transformers as its tokenizer or processor, which is none. "
+                "It is not called. Fetch the checkpoint again, from where you trust it."
             )
         return found
 

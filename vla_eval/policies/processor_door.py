@@ -142,9 +142,8 @@ def _imported(step: SavedStep) -> Any:
         loaded = importlib.import_module(module)
     except ImportError as exc:
         raise CheckpointError(
-            f"{step.where}: the code '{step.imported}' cannot be imported: {exc}. Install what it needs, "
-            "or the "
-            "version of lerobot that wrote the checkpoint."
+            f"{step.where}: the code '{step.imported}' cannot be imported: {exc}. Install what it needs, or "
+            "the version of lerobot that wrote the checkpoint."
         ) from exc
     found = vars(loaded).get(name)
     if _is_step(found) and not found.__module__.startswith(f"{module.partition('.')[0]}."):
@@ -167,11 +166,9 @@ def _is_installed(package: str) -> bool:
 def _refused(step: SavedStep, why: str) -> CheckpointError:
     named = step.registry_name or step.imported
     return CheckpointError(
-        f"{step.where}: names the code '{named:.100}', {why}. It is not run. Expected a processor step "
-        "that is "
-        "registered, or one of lerobot's or of an installed plugin's (`lerobot_policy_…`) processor "
-        "modules. If "
-        "it is yours, register it with ProcessorStepRegistry (docs/security.md)."
+        f"{step.where}: names the code '{named:.100}', {why}. It is not run. Expected a processor step that "
+        "is registered, or one of lerobot's or of an installed plugin's (`lerobot_policy_…`) processor "
+        "modules. If it is yours, register it with ProcessorStepRegistry (docs/security.md)."
     )
 
 
@@ -203,9 +200,8 @@ def _made(step: SavedStep, cls: type[Any], overrides: Mapping[str, Any]) -> Any:
     except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
         raise CheckpointError(
             f"{step.where}: the step '{step.name}' cannot be made: {exc} Name a local folder with "
-            "`tokenizer` in "
-            "the recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
-            "HF_HUB_OFFLINE=0 is set."
+            "`tokenizer` in the recipe's args if it is the tokenizer that is missing; nothing is "
+            "downloaded unless HF_HUB_OFFLINE=0 is set."
         ) from exc
 
 

@@ -129,8 +129,7 @@ def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> Non
             raise CheckpointError(
                 f"{step.where}: '{step.name}' is to be given {key} = {shown(value)}, a path outside of the "
                 f"checkpoint. A step may only read {folder}. Put what it needs there; a tokenizer's folder "
-                "can "
-                "be named with `tokenizer` in the recipe's args."
+                "can be named with `tokenizer` in the recipe's args."
             )
 
 
