@@ -50,7 +50,7 @@ def resolve_step(step: SavedStep) -> type[Any]:
         if found is None:
             raise CheckpointError(
                 f"{step.where}: expected a processor step that is registered, found "
-                f"'{step.registry_name:.100}'. "
+                f"{step.registry_name!r:.100}. "
                 "Install the package that it is from (`lerobot_policy_…`), or the lerobot that wrote the "
                 "checkpoint."
             )
@@ -142,7 +142,8 @@ def _imported(step: SavedStep) -> Any:
         loaded = importlib.import_module(module)
     except ImportError as exc:
         raise CheckpointError(
-            f"{step.where}: the code '{step.imported}' cannot be imported: {exc}. Install what it needs, or "
+            f"{step.where}: the code {step.imported!r:.100} cannot be imported: {exc}. Install what it "
+            "needs, or "
             "the version of lerobot that wrote the checkpoint."
         ) from exc
     found = vars(loaded).get(name)
@@ -166,7 +167,7 @@ def _is_installed(package: str) -> bool:
 def _refused(step: SavedStep, why: str) -> CheckpointError:
     named = step.registry_name or step.imported
     return CheckpointError(
-        f"{step.where}: names the code '{named:.100}', {why}. It is not run. Expected a processor step that "
+        f"{step.where}: names the code {named!r:.100}, {why}. It is not run. Expected a processor step that "
         "is registered, or one of lerobot's or of an installed plugin's (`lerobot_policy_…`) processor "
         "modules. If it is yours, register it with ProcessorStepRegistry (docs/security.md)."
     )
@@ -199,7 +200,8 @@ def _made(step: SavedStep, cls: type[Any], overrides: Mapping[str, Any]) -> Any:
         raise
     except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
         raise CheckpointError(
-            f"{step.where}: the step '{step.name}' cannot be made: {exc} Name a local folder with "
+            f"{step.where}: the step {step.name!r:.100} cannot be made: {exc!s:.1000} Name a local folder "
+            "with "
             "`tokenizer` in the recipe's args if it is the tokenizer that is missing; nothing is "
             "downloaded unless HF_HUB_OFFLINE=0 is set."
         ) from exc
@@ -212,5 +214,5 @@ def _give(step: SavedStep, instance: Any, state: Mapping[str, Any]) -> None:
         raise
     except Exception as exc:  # as above
         raise CheckpointError(
-            f"{step.state_file}: does not fit the step '{step.name}': {exc!r:.200}. {FETCH_AGAIN}"
+            f"{step.state_file}: does not fit the step {step.name!r:.100}: {exc!r:.200}. {FETCH_AGAIN}"
         ) from exc

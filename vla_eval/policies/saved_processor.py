@@ -127,7 +127,8 @@ def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> Non
     for key, value in _texts(config):
         if leads_out(value, folder):
             raise CheckpointError(
-                f"{step.where}: '{step.name}' is to be given {key} = {shown(value)}, a path outside of the "
+                f"{step.where}: {step.name!r:.100} is to be given {key:.100} = {shown(value)}, a path "
+                "outside of the "
                 f"checkpoint. A step may only read {folder}. Put what it needs there; a tokenizer's folder "
                 "can be named with `tokenizer` in the recipe's args."
             )
