@@ -82,8 +82,8 @@ def load_processor(
         CheckpointError: the file is damaged, or names code, files or settings that it may not.
     """
     saved = read_saved_processor(path)
-    _check_overrides(saved, overrides)
     classes = [resolve_step(step) for step in saved.steps]  # all of them, before the first is called
+    _check_overrides(saved, overrides)
     for step in saved.steps:
         own = overrides.get(step.name, {})
         kept = {key: value for key, value in step.config.items() if key not in own}
