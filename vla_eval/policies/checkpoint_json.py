@@ -120,7 +120,7 @@ def wrong_type(where: str, key: str, expected: str, value: object) -> Checkpoint
     """Return the error for a field of another type."""
     kind = WORDS.get(type(value), type(value).__name__)
     return CheckpointError(
-        f"{where}: '{key}': expected {expected}, found {shown(value)} ({kind}). {FETCH_AGAIN}"
+        f"{where}: {key!r:.100}: expected {expected}, found {shown(value)} ({kind}). {FETCH_AGAIN}"
     )
 
 
@@ -148,11 +148,11 @@ def _content(path: Path) -> bytes:
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    data = dict(pairs)
-    if len(data) != len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the field {shown(twice)} twice")
+    data: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in data:
+            raise ValueError(f"the field {shown(name)} twice")
+        data[name] = value
     return data
 
 
