@@ -78,7 +78,8 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
             "here as data. Code that comes with a tokenizer is not run."
         )
     scale, min_token = settings.get("scale"), settings.get("min_token")
-    if not isinstance(scale, int | float) or not isinstance(min_token, int):
+    has_truth_value = isinstance(scale, bool) or isinstance(min_token, bool)
+    if has_truth_value or not isinstance(scale, int | float) or not isinstance(min_token, int):
         raise CheckpointError(
             f"{file}: expected numbers 'scale' and 'min_token', found {scale!r:.60} and {min_token!r:.60}. "
             "Fetch the action tokenizer again."

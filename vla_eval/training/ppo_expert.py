@@ -305,7 +305,7 @@ def read_settings(out: Path) -> PpoSettings:
         data = read_json(path)
         if data.pop("format_version") == FORMAT_VERSION:
             return decode(PpoSettings, data, where=str(path))
-    except (CheckpointError, KeyError, RecipeError) as exc:
+    except (CheckpointError, ValueError, KeyError, TypeError, RecipeError) as exc:
         raise CheckpointError(
             f"{path}: no training of an expert ({exc!r:.200}). `mikasa-vla train-expert --out` makes one."
         ) from exc
