@@ -109,6 +109,7 @@ def processors_through_the_door() -> Iterator[None]:
 
     def from_pretrained(
         cls: type[Any],
+        /,
         pretrained_model_name_or_path: str | Path,
         config_filename: str,
         *,
