@@ -23,6 +23,7 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.policies.config_check import check_config
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.recipe import FinetuneRecipe
@@ -160,6 +161,7 @@ def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
             f"'{recipe.type}'."
         )
     data = with_local_files(data, folder, tokenizer=recipe.tokenizer)
+    check_config(config_class(recipe.type, where="finetune.type"), data, where=str(folder / CONFIG_FILE))
     return {**data, "use_peft": False, "pretrained_path": None}
 
 
