@@ -17,7 +17,8 @@ from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.sizes import TOKENS_PER_ACTION, Attention, NetworkSizes
 from vla_eval.policies.spatialvla.weight_names import to_original, to_ours
 
-ALL = [[0], [1], [2], [3]]
+N_PROMPTS = len(golden.config()["prompts"])
+ALL = [[index] for index in range(len(golden.values()["in.images"]))]
 TRAININGS: list[tuple[str, list[list[int]]]] = [("train.img1", [[0], [1]]), ("train.img2", [[0, 1]])]
 REGIMES: list[tuple[str, Attention]] = [
     ("causal", "causal"),
@@ -42,7 +43,7 @@ def prefill(network: SpatialVLANetwork, inputs: Inputs, attention: Attention = "
 
 
 def one(index: int = 0) -> Inputs:
-    return golden.inputs([[index % 4]], golden.prompts(index))
+    return golden.inputs([[index % len(ALL)]], golden.prompts(index))
 
 
 class TestVision:
@@ -84,10 +85,10 @@ class TestVision:
 
 
 class TestInference:
-    @pytest.mark.parametrize("index", range(4))
+    @pytest.mark.parametrize("index", range(N_PROMPTS))
     def test_logits_tokens_and_actions(self, index: int) -> None:
         values, inputs = golden.values(), one(index)
-        assert int(values[f"infer{index}.image_index"]) == index
+        assert int(values[f"infer{index}.image_index"]) == index % len(ALL)
         logits = prefill(made(), inputs)
         close(logits[:, -1:], values[f"infer{index}.prefill_logits"], atol=LOGITS)
         if index == 0:  # stored for this one alone
@@ -118,10 +119,10 @@ class TestInference:
     def test_a_batch_of_prompts_of_several_lengths_gives_each_what_it_gets_alone(
         self, attention: Attention
     ) -> None:
-        together = golden.inputs(ALL, golden.prompts(0, 1, 2, 3))
+        together = golden.inputs(ALL, golden.prompts(*range(len(ALL))))
         with torch.no_grad():
             told = generated_tokens(made(), together, chunk=CHUNK, attention=attention)
-            for index in range(4):
+            for index in range(len(ALL)):
                 alone = generated_tokens(made(), one(index), chunk=CHUNK, attention=attention)
                 assert torch.equal(told.tokens[index], alone.tokens[0])
                 close(told.logits[index], alone.logits[0], atol=LOGITS)
