@@ -46,8 +46,12 @@ def test_decoding_all_at_once_is_the_originals() -> None:
         told = parallel_actions(
             made("parallel_tokens"), Inputs(golden.pictures(2)[:1], golden.prompts("prompt1"))
         )
-    expected = golden.values()["infer.img2.prompt1.discrete.actions_normalized"]
-    torch.testing.assert_close(told[0], expected, atol=golden.TOLERANCE, rtol=0)
+    values, case = golden.values(), "infer.img2.prompt1.discrete"
+    torch.testing.assert_close(told[0], values[f"{case}.actions_normalized"], atol=golden.TOLERANCE, rtol=0)
+    back = golden.action_normalizer().unnormalize(told[0])
+    torch.testing.assert_close(back, values[f"{case}.actions"].float(), atol=golden.TOLERANCE, rtol=0)
+    # The head makes no difference to the states that it is given.
+    assert torch.equal(values[f"{case}.hidden"], values["infer.img2.prompt1.hidden"])
 
 
 def test_the_loss_of_tokens_all_at_once_is_the_originals_with_the_stop_token() -> None:
