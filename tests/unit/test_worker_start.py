@@ -18,8 +18,9 @@ code = "from pathlib import Path; import os, time, vla_eval.episode_worker as in
 code += "inside.detach(Path(os.devnull)); there.send(os.getpid()); time.sleep(600)"
 context = worker_context()
 here, there = context.Pipe()
+their_lifeline, lifeline = context.Pipe(duplex=False)
 with worker_environment() as environment:
-    context.Process(target=begin, args=(environment, exec, code, {"there": there})).start()
+    context.Process(target=begin, args=(environment, their_lifeline, exec, code, {"there": there})).start()
 print(here.recv(), flush=True)
 time.sleep(600)
 """
@@ -29,15 +30,17 @@ def ask(*names: str) -> dict[str, str | None]:
     """Return variables of the environment that a new worker sees."""
     context = worker_context()
     here, there = context.Pipe()
+    their_lifeline, lifeline = context.Pipe(duplex=False)
     code = "import os; there.send({name: os.environ.get(name) for name in names})"
     with worker_environment() as environment:
         process = context.Process(
-            target=begin, args=(environment, exec, code, {"there": there, "names": names})
+            target=begin, args=(environment, their_lifeline, exec, code, {"there": there, "names": names})
         )
         process.start()
     there.close()
     found: dict[str, str | None] = here.recv()
     process.join()
+    lifeline.close()
     return found
 
 
