@@ -12,10 +12,10 @@ import numpy as np
 
 
 def seed_global_generators(*purpose: str | int) -> None:
-    """Seed the generators of `random`, numpy and, if it is imported, torch by what they are about to be for."""
+    """Seed `random`, numpy's and, if it is imported, torch's generators by what they are about to be for."""
     digest = hashlib.sha256(repr(purpose).encode()).digest()
-    random.seed(digest)
-    np.random.seed(np.frombuffer(digest, dtype="<u4"))
+    random.seed(digest)  # noqa: TID251  # for the draws of others
+    np.random.seed(np.frombuffer(digest, dtype="<u4"))  # noqa: TID251
     torch = sys.modules.get("torch")  # not imported for this: that takes seconds
     if torch is not None:
         torch.manual_seed(int.from_bytes(digest[:8], "little") >> 1)

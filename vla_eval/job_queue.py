@@ -30,8 +30,8 @@ class JobQueue:
 
     The first batch of each group that has no result yet comes before all others: what is wrong with
     the last policy of the list shows in the first minutes, not at the end of the night. After that a
-    worker stays with the group that its process has loaded: another one costs a process. The order moves no result, nor does it matter which
-    episodes are in a batch: an episode's slot is the plan's.
+    worker stays with the group that its process has loaded: another one costs a process. The order moves
+    no result, nor does it matter which episodes are in a batch: an episode's slot is the plan's.
     """
 
     def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:

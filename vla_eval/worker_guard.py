@@ -43,7 +43,7 @@ def fork_guarded(lifeline: Connection) -> None:
     guard = os.getpid()
     worker = os.fork()
     if worker:
-        _guard(worker, lifeline.fileno(), woken)
+        _guard(worker, lifeline.fileno(), woken, wake)
     signal.set_wakeup_fd(before_fd)
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -55,11 +55,11 @@ def fork_guarded(lifeline: Connection) -> None:
         os._exit(1)
 
 
-def _guard(worker: int, lifeline: int, woken: int) -> None:
+def _guard(worker: int, lifeline: int, woken: int, wake: int) -> None:
     """Wait for the worker or the parent to end, end all descendants, and end as the worker did."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        _close_all_but(lifeline, woken)
+        _close_all_but(lifeline, woken, wake)
         status = _wait(worker, lifeline, woken)
         end_descendants()
         _end_as(status)

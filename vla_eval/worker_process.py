@@ -189,6 +189,7 @@ class WorkerProcess:
                 except (EOFError, ConnectionError):
                     if self._is_abandoned or attempt + 1 == START_ATTEMPTS:
                         raise
+                    end_server()  # it is dying; another one is started once it is gone
         finally:
             self._their_connection.close()  # else its end would not be seen as an end of file
             self._their_lifeline.close()

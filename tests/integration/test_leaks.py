@@ -106,7 +106,7 @@ def test_thirty_kinds_of_leak_change_no_other_policy_s_records(
 ) -> None:
     (bench.folder / "leaking_policy.py").write_text(LEAKING_MODULE)
     leaking = [write_recipe(bench.folder, name, "leaking_policy:make", leak=LEAKS[name]) for name in LEAKS]
-    # The first episode of each policy comes before all others: a victim that is named first has one after them.
+    # First episodes come before all others: a victim that is named first has its second one after the leaks.
     order, episodes = ([*VICTIMS, *leaking], 2) if victims_first else ([*leaking, *VICTIMS], 1)
     bench.run("clean", policies=VICTIMS, episodes=episodes, env={})
 
