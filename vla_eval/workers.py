@@ -168,7 +168,7 @@ class WorkerPool[J: Job, A]:
                     continue
                 if worker.job is None or not isinstance(message, self._answers):
                     raise BrokenMessageError(
-                        f"expected an answer, found {type(message).__name__} {message!r:.80}"
+                        f"expected an answer, found one of type {type(message).__name__}"
                     )
                 worker.job = None
                 if isinstance(message, Failed):
