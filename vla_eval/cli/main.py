@@ -25,7 +25,6 @@ VERBS = (
     "dataset",
     "finetune",
     "checkpoint",
-    "train-expert",
     "list",
     "show",
     "doctor",
