@@ -8,10 +8,9 @@ native library or a GPU context may be left in a state that no rebuilding within
 import ctypes
 import dataclasses
 import faulthandler
-import fcntl
+import functools
 import inspect
 import logging
-import multiprocessing
 import os
 import signal
 import sys
@@ -27,17 +26,20 @@ from vla_eval.core import EpisodeStart, Policy, SimEnv, Stage
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
+from vla_eval.global_generators import seed_global_generators
 from vla_eval.job_queue import EpisodeBatch
-from vla_eval.plan import EpisodeJob, Group, GroupKey
+from vla_eval.plan import EpisodeJob, Group
 from vla_eval.policies.context import PolicyContext
 from vla_eval.registry import policy_factory
 from vla_eval.results.records import EpisodeError, EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.viz.recorder import Recorder
+from vla_eval.worker_messages import send_message
 
 STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
-MAX_DETAILS = 20_000  # characters of a traceback; the log has it all
+MAX_DETAILS = 20_000  # characters of a traceback or a message; the log has it all
+MAX_KIND = 200  # characters of an exception's class
 
 logger = logging.getLogger(__name__)
 
@@ -146,7 +148,7 @@ class Runner(Protocol):
 
 
 class EpisodeRunner:
-    """Runs episodes, keeping environment and policy between those of one group."""
+    """Runs episodes of one group, keeping environment and policy."""
 
     def __init__(
         self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None], recorder: Recorder | None = None
@@ -158,8 +160,6 @@ class EpisodeRunner:
         self._env: SimEnv | None = None
         self._env_settings: EnvSettings | None = None
         self._policy: Policy | None = None
-        self._loaded: GroupKey | None = None
-        self._facts: dict[str, EnvFacts] = {}  # by task: all else is the same in one run
 
     def answer(self, job: EpisodeBatch) -> Finished | Failed:
         """Run the episodes; whatever goes wrong becomes a `Failed`."""
@@ -181,7 +181,7 @@ class EpisodeRunner:
         """Release the simulator."""
         if self._env is not None:
             self._env.close()
-        self._env = self._env_settings = self._policy = self._loaded = None
+        self._env = self._env_settings = self._policy = None
 
     def _run(self, env: SimEnv, policy: Policy, batch: EpisodeBatch) -> Finished:
         group = batch.group
@@ -196,6 +196,8 @@ class EpisodeRunner:
             )
             for job in batch.jobs
         ]
+        # Not by the batch: what of it has a result already is not in it. Of these all begin in slot 0.
+        seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
         tapes = self._recorder.tapes(batch.jobs) if self._recorder else None
         observers = [tapes] if tapes else []
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
@@ -209,8 +211,7 @@ class EpisodeRunner:
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
-        if self._loaded != group.key or self._env is None or self._policy is None:
-            self._loaded = self._policy = None  # first, so that two policies are never loaded at once
+        if self._env is None or self._policy is None:
             facts = self._describe_env(job)
             self._heartbeat("setup")
             if self._recorder is not None:
@@ -220,7 +221,7 @@ class EpisodeRunner:
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
             env = self._make_env(self._settings_for(group, policy, facts))
-            self._policy, self._loaded = policy, group.key
+            self._policy = policy
             return env, policy
         return self._env, self._policy
 
@@ -239,14 +240,11 @@ class EpisodeRunner:
 
     def _describe_env(self, job: EpisodeJob) -> EnvFacts:
         """Return what the policy has to know of an environment whose cameras it then decides on."""
-        task = job.group.key.task
-        if task not in self._facts:
-            # Privileged, as scripted controls need it: theirs is then already made.
-            env = self._make_env(dataclasses.replace(job.group.env, privileged=True))
-            self._heartbeat("reset")
-            status = env.reset({job.slot: job.seed}, render=False)[job.slot].status
-            self._facts[task] = EnvFacts(env.spec, status.n_candidates)
-        return self._facts[task]
+        # Privileged, as scripted controls need it: theirs is then already made.
+        env = self._make_env(dataclasses.replace(job.group.env, privileged=True))
+        self._heartbeat("reset")
+        status = env.reset({job.slot: job.seed}, render=False)[job.slot].status
+        return EnvFacts(env.spec, status.n_candidates)
 
     def _make_env(self, settings: EnvSettings) -> SimEnv:
         if self._env is None or self._env_settings != settings:
@@ -275,6 +273,7 @@ def make_policy(group: Group, facts: EnvFacts) -> Policy:
         n_candidates=facts.n_candidates,
         n_slots=group.env.n_slots,
     )
+    seed_global_generators("policy", group.key.policy)
     try:
         inspect.signature(factory).bind(context, **group.args)
     except TypeError as exc:
@@ -286,11 +285,17 @@ def make_policy(group: Group, facts: EnvFacts) -> Policy:
 
 
 def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
-    """Return what is told of an exception."""
+    """Return what is recorded of an exception."""
+    try:
+        message = str(exc)
+    except Exception as in_turn:  # a policy's exception may have a mistake of its own
+        message = f"its message cannot be read ({type(in_turn).__name__})"
+    if len(message) > MAX_DETAILS:
+        message = f"{message[:MAX_DETAILS]} … ({len(message) - MAX_DETAILS:,} characters left out)"
     return EpisodeError(
-        kind=type(exc).__name__,
+        kind=type(exc).__name__[:MAX_KIND],
         stage=stage,
-        message=str(exc) or f"{type(exc).__name__} without a message",
+        message=message or f"{type(exc).__name__[:MAX_KIND]} without a message",
         details="".join(traceback.format_exception(exc))[-MAX_DETAILS:],
     )
 
@@ -301,47 +306,30 @@ def worker_main(
     log: Path,
     recorder: Recorder | None = None,
 ) -> None:
-    """Run episodes for the parent until it closes the pipe; the entry point of the worker process."""
+    """Run episodes for the parent until it has no more; the entry point of the worker process."""
     detach(log)
-    runner = EpisodeRunner(Heartbeat(shared), connection.send, recorder)
-    serve(connection, runner)
+    tell = functools.partial(send_message, connection)
+    serve(connection, EpisodeRunner(Heartbeat(shared), tell, recorder))
 
 
 def serve(connection: Connection, runner: Runner) -> None:
-    """Answer one job after the other until the parent closes the pipe."""
+    """Answer one job after the other until the parent sends None or closes the pipe."""
     try:
-        while True:
-            connection.send(runner.answer(connection.recv()))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        runner.close()  # the parent is done with us, or gone
+        while (job := connection.recv()) is not None:
+            send_message(connection, runner.answer(job))
+    except (EOFError, BrokenPipeError, ConnectionResetError) as exc:
+        logger.warning("the parent is gone: %r", exc)
+    runner.close()
 
 
 def detach(log: Path) -> None:
-    """Send all output to the log, die with the parent, and leave its signals to the parent."""
+    """Send all output to the log, and leave the terminal's signals to the parent."""
     os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     os.dup2(descriptor, sys.__stdout__.fileno() if sys.__stdout__ else 1)
     os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
     os.close(descriptor)
-    faulthandler.enable(all_threads=True)
-    faulthandler.register(signal.SIGUSR1, all_threads=True)  # the watchdog asks where it hangs
+    faulthandler.enable(file=2, all_threads=True)
+    faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it hangs
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    _end_with_parent()
-
-
-def _end_with_parent() -> None:
-    """Have the kernel kill this process when its parent is gone: after `kill -9` nobody else can.
-
-    The parent holds the writing end of the pipe that is its sentinel, and writes no more to it. `prctl` would
-    not do: a worker that was forked from a server is the server's child.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is None:  # no worker: called by a test
-        return
-    descriptor = int(parent.sentinel)
-    fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | fcntl.FASYNC)
-    if not parent.is_alive():  # it died before the line above
-        os._exit(1)

@@ -178,7 +178,14 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Se
             config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
         )
         main = functools.partial(worker_main, recorder=recorder)
-    with new_pool(main, size=n_workers, timeouts=config.timeouts, logs=logs, preload=preload) as pool:
+    with new_pool(
+        main,
+        answers=(Finished,),
+        size=n_workers,
+        timeouts=config.timeouts,
+        logs=logs,
+        preload=preload,
+    ) as pool:
         for event in pool.run(queue):
             if isinstance(event, Answered):
                 bookkeeper.take(event)

@@ -26,12 +26,12 @@ class EpisodeBatch:
 
 
 class JobQueue:
-    """Hands out episodes so that mistakes show early and workers seldom have to rebuild.
+    """Hands out episodes so that mistakes show early and few processes have to be started.
 
     The first batch of each group that has no result yet comes before all others: what is wrong with
     the last policy of the list shows in the first minutes, not at the end of the night. After that a
-    worker stays with the group that it has loaded. The order moves no result, nor does it matter which
-    episodes are in a batch: an episode's slot is the plan's.
+    worker stays with the group that its process has loaded: another one costs a process. The order moves
+    no result, nor does it matter which episodes are in a batch: an episode's slot is the plan's.
     """
 
     def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
@@ -62,8 +62,11 @@ class JobQueue:
             loaded: the group whose environment and policy the worker has at hand.
             taken: groups that other workers have at hand; avoided while there are others.
         """
-        if self._heads:
-            return self._heads.popleft()
+        if self._heads:  # of several of one group, as `put_back_alone` leaves them, the worker keeps on
+            index = next((i for i, batch in enumerate(self._heads) if batch.setup_key == loaded), 0)
+            head = self._heads[index]
+            del self._heads[index]
+            return head
         waiting = [key for key, batches in self._rest.items() if batches]
         if not waiting:
             return None

@@ -8,11 +8,16 @@ worker starts from nothing: a CUDA context does not survive a fork, and an impor
 import contextlib
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext
 
 from vla_eval.envs.settings import Simulator
 from vla_eval.provenance import nvidia_driver_version
+from vla_eval.worker_guard import fork_guarded
 from vla_eval.worker_server import IMPORTS_VARIABLE
 
 SERVER_MODULE = "vla_eval.worker_server"
@@ -21,6 +26,7 @@ SERVER_MODULE = "vla_eval.worker_server"
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 
 _preloaded: dict[str, None] = {}
+_environment_lock = threading.Lock()  # several workers may be starting at once
 
 
 def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
@@ -43,25 +49,41 @@ def simulator_modules(simulator: Simulator) -> tuple[str, ...]:
     return ("vla_eval.envs.maniskill",) if simulator == "maniskill" else ()
 
 
-def begin(environment: Mapping[str, str], main: Callable[..., None], *args: object) -> None:
-    """Run `main` in a worker as if the process had been started with this environment.
+def begin(
+    environment: Mapping[str, str], lifeline: Connection, main: Callable[..., None], *args: object
+) -> None:
+    """Run `main` in a guarded worker as if the process had been started with this environment.
 
     The server keeps the environment of its own start, which may be of an earlier pool.
     """
+    fork_guarded(lifeline)
     os.environ.clear()
     os.environ.update(environment)
     main(*args)
 
 
+def end_server() -> None:
+    """Kill the process that workers are forked from: it does not answer. The next worker starts another one.
+
+    Workers are not touched; the kernel keeps the dead process until `multiprocessing` sees that it is gone.
+    """
+    pid: int | None = getattr(forkserver._forkserver, "_forkserver_pid", None)  # there is no public name
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            os.kill(pid, signal.SIGKILL)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
 @contextlib.contextmanager
 def worker_environment() -> Iterator[Mapping[str, str]]:
     """Set the environment variables that a new process reads when it starts, unless the user has set them."""
-    added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        environment = dict(os.environ)
-        os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
-        yield environment
-    finally:
-        for name in (*added, IMPORTS_VARIABLE):
-            os.environ.pop(name, None)
+    with _environment_lock:
+        added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
+        os.environ.update(added)
+        try:
+            environment = dict(os.environ)
+            os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
+            yield environment
+        finally:
+            for name in (*added, IMPORTS_VARIABLE):
+                os.environ.pop(name, None)

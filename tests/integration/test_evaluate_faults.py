@@ -127,12 +127,33 @@ class TestFaults:
 
 
 class TestMistakes:
-    """What every episode would repeat ends the run at once, with the error itself and no records."""
+    """What every episode would repeat ends the run at once, with the error itself and nothing left behind."""
 
     def check(self, bench: Bench, error: type[Exception], match: str, **fields: Any) -> None:
         with pytest.raises(error, match=match):
             bench.run("out", **fields)
-        assert not (bench.folder / "out").exists() or not bench.records("out")
+        assert not (bench.folder / "out").exists()
+
+    def test_more_action_steps_than_a_chunk_has(self, bench: Bench) -> None:
+        (bench.folder / "short_policy.py").write_text(
+            "import night_policy\n"
+            "class Short:\n    min_chunk_size = 2\n"
+            "class Context:\n    chunking = Short\n"
+            "make = lambda context: night_policy.make(Context)\n"
+        )
+        bench.write_policy("short_policy:make")
+        self.check(bench, Exception, "chunk", n_action_steps=[5])
+
+    def test_a_folder_that_was_there_stays_as_it_was(self, bench: Bench) -> None:
+        bench.write_policy(cameras=["wrist"])
+        (bench.folder / "out").mkdir()
+        with pytest.raises(SpecMismatchError):
+            bench.run("out")
+        with pytest.raises(SpecMismatchError):
+            bench.run("deep/down")
+
+        assert not list((bench.folder / "out").iterdir())
+        assert not (bench.folder / "deep").exists()
 
     def test_a_camera_that_is_not_there(self, bench: Bench) -> None:
         bench.write_policy(cameras=["wrist"])

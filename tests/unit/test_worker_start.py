@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -18,8 +19,9 @@ code = "from pathlib import Path; import os, time, vla_eval.episode_worker as in
 code += "inside.detach(Path(os.devnull)); there.send(os.getpid()); time.sleep(600)"
 context = worker_context()
 here, there = context.Pipe()
+their_lifeline, lifeline = context.Pipe(duplex=False)
 with worker_environment() as environment:
-    context.Process(target=begin, args=(environment, exec, code, {"there": there})).start()
+    context.Process(target=begin, args=(environment, their_lifeline, exec, code, {"there": there})).start()
 print(here.recv(), flush=True)
 time.sleep(600)
 """
@@ -29,15 +31,17 @@ def ask(*names: str) -> dict[str, str | None]:
     """Return variables of the environment that a new worker sees."""
     context = worker_context()
     here, there = context.Pipe()
+    their_lifeline, lifeline = context.Pipe(duplex=False)
     code = "import os; there.send({name: os.environ.get(name) for name in names})"
     with worker_environment() as environment:
         process = context.Process(
-            target=begin, args=(environment, exec, code, {"there": there, "names": names})
+            target=begin, args=(environment, their_lifeline, exec, code, {"there": there, "names": names})
         )
         process.start()
     there.close()
     found: dict[str, str | None] = here.recv()
     process.join()
+    lifeline.close()
     return found
 
 
@@ -78,3 +82,28 @@ def test_a_worker_ends_with_a_command_that_is_killed() -> None:
             return
         time.sleep(0.05)
     pytest.fail(f"worker {worker} outlived its parent")
+
+
+def test_a_guard_sleeps_while_its_worker_works() -> None:
+    context = worker_context()
+    here, there = context.Pipe()
+    their_lifeline, lifeline = context.Pipe(duplex=False)
+    code = "import os, time; there.send(os.getppid()); time.sleep(600)"
+    with worker_environment() as environment:
+        process = context.Process(
+            target=begin, args=(environment, their_lifeline, exec, code, {"there": there})
+        )
+        process.start()
+    guard = here.recv()
+
+    def cpu_ticks() -> int:
+        fields = Path(f"/proc/{guard}/stat").read_text().rpartition(")")[2].split()
+        return int(fields[11]) + int(fields[12])  # of 0.01 s, user and system
+
+    before = cpu_ticks()
+    time.sleep(1.0)
+    assert guard == process.pid
+    assert cpu_ticks() - before <= 2
+    lifeline.close()
+    process.join(60)
+    assert process.exitcode == 0

@@ -4,14 +4,13 @@ Each verb is a module with `add_parser(subparsers)` and `run(args) -> int`, impo
 """
 
 import argparse
-import contextlib
 import importlib
-import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn, Protocol, cast
 
 from vla_eval import __version__
+from vla_eval.cli.streams import standard_streams
 from vla_eval.errors import VlaEvalError, did_you_mean
 
 PROGRAM = "mikasa-vla"
@@ -59,7 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the arguments without the program's name; by default those of the process.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    with standard_streams():
+        return _run(list(sys.argv[1:] if argv is None else argv))
+
+
+def _run(arguments: list[str]) -> int:
     first = arguments[0] if arguments else ""
     if first and not first.startswith("-") and first not in VERBS:
         return _fail(f"there is no verb '{first}'.{did_you_mean(first, VERBS)} Known: {', '.join(VERBS)}.")
@@ -75,10 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(exc))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # The reader of our output has gone (`| head`). Python would complain again on exit.
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of our output has gone (`| head`)
         return 0
     return code
 

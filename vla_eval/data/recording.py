@@ -5,6 +5,7 @@ means, the same call goes on where it stopped; what comes of it does not depend 
 of workers.
 """
 
+import functools
 import importlib
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,10 +21,12 @@ from vla_eval.data.recipe import DatasetRecipe, content_of, fingerprint, options
 from vla_eval.data.recording_folder import RecordingFolder
 from vla_eval.data.recording_jobs import (
     AttemptJob,
+    DatasetWritten,
     JoinJob,
     RecordingAnswer,
     RecordingJob,
     ShardJob,
+    ShardWritten,
     TaskPlan,
 )
 from vla_eval.data.recording_plan import RecordingPlan, plan_recording
@@ -33,6 +36,7 @@ from vla_eval.errors import RecordingError
 from vla_eval.evaluate import as_exception, available_cores
 from vla_eval.provenance import collect_environment
 from vla_eval.results.run_file import RunDescription
+from vla_eval.worker_messages import send_message
 from vla_eval.worker_start import simulator_modules
 from vla_eval.workers import WorkerPool
 
@@ -99,7 +103,7 @@ def recording_main(connection: Connection, shared: SharedStage, log: Path) -> No
     detach(log)
     # Imported by the worker alone: lerobot costs the parent 5 s, in which a mistake can long be told.
     runner = importlib.import_module(WORKER_MODULE).RecordingRunner
-    serve(connection, runner(Heartbeat(shared), connection.send))
+    serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
 
 
 class _Stopped(Exception):
@@ -175,6 +179,7 @@ def run_plan(
         RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder,
         RecordingPool(
             recording_main,
+            answers=(Attempt, ShardWritten, DatasetWritten),
             size=n_workers,
             timeouts=recipe.timeouts,
             logs=folder.logs(),

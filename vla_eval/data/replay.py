@@ -5,6 +5,7 @@ was recorded, its actions would no longer lead to its states and to success. The
 the dataset, so that training can refuse one that fails.
 """
 
+import functools
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from vla_eval.evaluate import as_exception, available_cores
 from vla_eval.provenance import collect_environment
 from vla_eval.recipes import TimeoutConfig
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.worker_messages import send_message
 from vla_eval.worker_start import simulator_modules
 from vla_eval.workers import Answered, WorkerPool
 
@@ -103,7 +105,7 @@ def replay_main(connection: Connection, shared: SharedStage, log: Path) -> None:
     """Replay for the parent until it closes the pipe; the entry point of a worker process."""
     detach(log)
     runner = importlib.import_module(WORKER_MODULE).ReplayRunner  # lerobot is imported by the worker alone
-    serve(connection, runner(Heartbeat(shared), connection.send))
+    serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
 
 
 def find_datasets(path: Path) -> tuple[Path, ...]:
@@ -159,7 +161,14 @@ def replay(
     replayed: list[EpisodeReplayed] = []
     pool = WorkerPool[ReplayJob, EpisodeReplayed]
     preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
-    with pool(replay_main, size=size, timeouts=TimeoutConfig(), logs=logs, preload=preload) as running:
+    with pool(
+        replay_main,
+        answers=(EpisodeReplayed,),
+        size=size,
+        timeouts=TimeoutConfig(),
+        logs=logs,
+        preload=preload,
+    ) as running:
         for event in running.run(JobList(jobs)):
             if isinstance(event, Answered):
                 done = _episode_of(event)

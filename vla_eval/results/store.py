@@ -25,6 +25,7 @@ from vla_eval.results.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, mak
 from vla_eval.results.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.results.run_file import (
     DEVICE,
+    RUN_FILE,
     Change,
     JsonValue,
     RunDescription,
@@ -33,11 +34,13 @@ from vla_eval.results.run_file import (
     environment_changed,
     find_changes,
 )
+from vla_eval.results.unstarted import FolderStart
 
 __all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "read_run"]
 
 logger = logging.getLogger(__name__)
 
+_OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", EPISODES_FILE, TIMINGS_FILE, LOCK_FILE)
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
@@ -69,9 +72,11 @@ class RunFolder:
         self.path = path
         self._allow_environment_change = allow_environment_change
         self._lock: FolderLock | None = None
+        self._start: FolderStart | None = None
         self._run_file = self._load(description)
         records = repair_records(path / EPISODES_FILE)
         self._finished = {key for key, record in records.items() if record.outcome != "error"}
+        self._has_lines = bool(records)
         cut_tail(path / TIMINGS_FILE)
         # run.json comes first: episodes without it would be nobody's.
         self._run_file.save(path)
@@ -94,11 +99,13 @@ class RunFolder:
             StorageFullError: the disk is full.
         """
         try:
+            start = FolderStart(path, own=_OWN_FILES)
             make_folder(path)
             lock = FolderLock(path / LOCK_FILE)
             try:
                 folder = cls(path, description, allow_environment_change=allow_environment_change)
             except BaseException:
+                start.undo()
                 lock.release()
                 raise
         except OSError as exc:
@@ -108,6 +115,7 @@ class RunFolder:
                 f"{path}: cannot be used as a run folder ({exc.strerror or exc}). Use another --out."
             ) from exc
         folder._lock = lock
+        folder._start = start
         return folder
 
     def __enter__(self) -> Self:
@@ -116,6 +124,9 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Close the folder; a new one is removed if an error came before its first episode."""
+        if isinstance(exc, Exception) and self._start is not None and not self._has_lines:
+            self._start.undo()
         self.close()
 
     def finished_keys(self) -> frozenset[EpisodeKey]:
@@ -140,6 +151,7 @@ class RunFolder:
                 f"{self.path}: {shown_key(record.key)} has a result already; a second one would be counted "
                 f"twice. Skip the keys in finished_keys()."
             )
+        self._has_lines = True  # also if the line could not be written as a whole
         self._episodes.append(record.to_json())
         if record.outcome != "error":
             self._finished.add(record.key)
