@@ -5,13 +5,10 @@ Here and not at the end of the other tests: those run in several processes, and 
 
 from safetensors.torch import load_file
 
-from tests.unit import openvla_golden, spatialvla_golden
+from tests.unit import spatialvla_golden
 from tests.unit import test_octo_parity as octo
 from tests.unit import test_octo_policy as octo_policy
 from tests.unit import test_octo_whole_path as octo_whole_path
-from tests.unit import test_openvla_network as openvla
-from tests.unit import test_openvla_tokens as openvla_tokens
-from tests.unit import test_openvla_whole_path as openvla_path
 from tests.unit import test_policy_steps as steps
 from tests.unit import test_spatialvla_network as network
 from tests.unit import test_spatialvla_policy as policy
@@ -19,12 +16,6 @@ from tests.unit import test_spatialvla_tokens as tokens
 from tests.unit.golden_values import GoldenValues
 
 OF_CONVERSION = {"unnorm.ids", "unnorm.actions"}  # read in test_spatialvla_convert, from a converted folder
-# Read in test_openvla_whole_path, from a converted folder, and in test_openvla_paper_compat.
-OPENVLA_ELSEWHERE = {
-    *(f"infer.{case}.actions" for case, *_ in openvla_path.CASES),
-    "in.proprio_raw",
-    "data.image",
-}
 # Of robots with fewer dimensions, whose other ones the original fills with noise: ours fill all.
 NOT_IMPLEMENTED = "sample.w2_ead5."
 
@@ -79,22 +70,3 @@ def test_every_value_of_spatialvla_is_compared() -> None:
     policy.TestPictures().test_the_originals_are_the_same()
     steps.TestNormalizer().test_q01_q99_is_that_of_the_original_and_back_what_was_not_cut()
     assert spatialvla_golden.values().unread() == OF_CONVERSION
-
-
-def test_every_value_of_openvla_is_compared() -> None:
-    openvla_golden.values.cache_clear()
-    inference, training = openvla.TestInference(), openvla.TestTraining()
-    for n_cameras in (1, 2):
-        inference.test_features_and_tokens_of_the_pictures(n_cameras)
-    inference.test_the_pictures_are_normalised_for_either_eye()
-    for case in openvla.CASES:
-        inference.test_hidden_states_and_actions(*case)
-    for name, n_cameras, proprio in openvla.TRAININGS:
-        training.test_loss_and_gradients_of_a_padded_batch(name, n_cameras, proprio)
-    training.test_the_head_is_given_the_states_at_the_originals_positions()
-    openvla_path.test_predictions_are_brought_back_as_by_the_original()
-    openvla_tokens.test_decoding_all_at_once_is_the_originals()
-    openvla_path.test_images_are_resized_and_cropped_as_in_the_originals_evaluation()
-    for what, prefix in (("actions", ""), ("proprio", "proprio_")):
-        openvla_path.test_training_targets_are_normalised_as_by_the_original(what, prefix)
-    assert openvla_golden.values().unread() == OPENVLA_ELSEWHERE

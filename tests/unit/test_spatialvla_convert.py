@@ -36,7 +36,7 @@ from vla_eval.training.recipe import FinetuneRecipe
 
 SMALL = {**golden.SMALL, **golden.DEPTH}
 (UNNORM_KEY,) = golden.config()["statistics"]
-OPTIONS = ConvertOptions(gripper="unit_open", sizes=SMALL, dtype="float32", unnorm_key=UNNORM_KEY)
+OPTIONS = ConvertOptions(sizes=SMALL, dtype="float32", unnorm_key=UNNORM_KEY)
 
 
 @pytest.fixture(scope="module")

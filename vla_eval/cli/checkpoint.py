@@ -33,7 +33,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     convert.add_argument("--size", choices=("small", "base"), required=True, help="which Octo it is")
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
     convert.add_argument("--dataset-name", metavar="NAME", help="whose statistics, where there are several")
-    checkpoint_openvla.add_gripper_argument(convert)
     checkpoint_openvla.add_parsers(actions)
     checkpoint_spatialvla.add_parsers(actions)
     for sub in (verify, convert):
@@ -69,7 +68,6 @@ def _convert(args: argparse.Namespace) -> list[str]:
     out = convert(
         Path(args.path),
         Path(args.out),
-        gripper=args.gripper,
         fields=SIZES[args.size],
         dataset=args.dataset_name,
         tokenizer=args.tokenizer,

@@ -9,11 +9,6 @@ from vla_eval.policies.openvla.sizes import Head
 CONVERT, MERGE = "convert-openvla", "merge"
 
 
-def add_gripper_argument(convert: Any) -> None:  # Any: the parser class is main's
-    """Declare `--gripper`, which every conversion needs."""
-    convert.add_argument("--gripper", metavar="NAME", help="its encoding in the training data, see the docs")
-
-
 def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
     convert = actions.add_parser(CONVERT, help="make a LeRobot checkpoint of it", allow_abbrev=False)
@@ -22,10 +17,7 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     convert.add_argument("--head", choices=get_args(Head), default="tokens", help="tokens: a plain OpenVLA")
     convert.add_argument("--chunk", type=int, default=1, metavar="K", help="actions of a chunk (1)")
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
-    add_gripper_argument(convert)
-    convert.add_argument(
-        "--image-aug", choices=("yes", "no"), help="trained with --image_aug True: crop to 0.9"
-    )
+    convert.add_argument("--gripper", default="maniskill", metavar="NAME", help="its encoding (maniskill)")
     convert.add_argument("--proprio", type=int, default=0, metavar="N", help="numbers of proprioception (0)")
     convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="fields of the pictures, in order")
     convert.add_argument("--allow-pickled", action="store_true", help="read heads that are pickled tensors")
@@ -51,7 +43,6 @@ def run(args: argparse.Namespace) -> list[str]:
         chunk_size=args.chunk,
         unnorm_key=args.unnorm_key,
         gripper=args.gripper,
-        image_augmentation=None if args.image_aug is None else args.image_aug == "yes",
         proprio=args.proprio,
         allow_pickled=args.allow_pickled,
         **named,

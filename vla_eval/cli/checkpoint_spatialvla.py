@@ -4,8 +4,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.checkpoint_openvla import add_gripper_argument
-
 CONVERT = "convert-spatialvla"
 
 
@@ -14,7 +12,6 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     convert = actions.add_parser(CONVERT, help="make a LeRobot checkpoint of it", allow_abbrev=False)
     convert.add_argument("path", metavar="PATH", help="folder of the published checkpoint")
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
-    add_gripper_argument(convert)
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
     convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="pictures that are read (the base's)")
     convert.add_argument(
@@ -28,5 +25,5 @@ def run(args: argparse.Namespace) -> list[str]:
     from vla_eval.policies.spatialvla.convert import ConvertOptions, convert_spatialvla
 
     named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
-    options = ConvertOptions(gripper=args.gripper, unnorm_key=args.unnorm_key, head=args.head, **named)
+    options = ConvertOptions(unnorm_key=args.unnorm_key, head=args.head, **named)
     return [str(convert_spatialvla(Path(args.path), Path(args.out), options))]

@@ -7,7 +7,7 @@ import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_args  # Any: JSON, lerobot and transformers
+from typing import Any  # JSON, lerobot and transformers
 
 from torch import Tensor
 
@@ -15,15 +15,8 @@ from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import read_weights
-from vla_eval.policies.steps.gripper import GripperEncoding
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
-
-GRIPPER_ENCODINGS: tuple[GripperEncoding, ...] = get_args(GripperEncoding)
-_ENCODINGS_OF_BOUNDS: dict[tuple[float | None, ...], tuple[GripperEncoding, ...]] = {
-    (0.0, 1.0): ("unit_open", "unit_closed"),
-    (-1.0, 1.0): ("maniskill", "negated"),
-}
 
 Statistics = dict[str, dict[str, Any]]
 """Field -> statistic -> one number per dimension."""
@@ -92,43 +85,6 @@ def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | 
             f"{', '.join(known) or 'none'}."
         )
     return known[unnorm_key]
-
-
-def checked_gripper(
-    source: Path, named: str | None, action: Mapping[str, Any] | None = None
-) -> GripperEncoding:
-    """Return how the training data encode the gripper, which no file of a checkpoint says.
-
-    Args:
-        source: the checkpoint, for messages.
-        named: what the user says.
-        action: statistics of the actions, where there are; the gripper is their last dimension.
-
-    Raises:
-        CheckpointError: nothing is named, or no encoding, or one that the statistics contradict.
-    """
-    if named not in GRIPPER_ENCODINGS:
-        found = "none" if named is None else f"'{named}'"
-        raise CheckpointError(
-            f"{source}: expected the encoding of the gripper in the training data, found {found}. Name it "
-            f"with --gripper: maniskill (-1 closed, +1 open), unit_open (0 closed, 1 open: the published "
-            f"OpenVLA, Octo and SpatialVLA), unit_closed (0 open, 1 closed) or negated (-1 open, +1 closed: "
-            f"LIBERO). With the wrong one the gripper opens where it has to close."
-        )
-    encoding: GripperEncoding = named
-    bounds = tuple(_last(action or {}, name) for name in ("min", "max"))
-    possible = _ENCODINGS_OF_BOUNDS.get(bounds, GRIPPER_ENCODINGS)
-    if encoding not in possible:
-        raise CheckpointError(
-            f"{source}: --gripper {encoding} is contradicted by the statistics, in which the gripper goes "
-            f"from {bounds[0]} to {bounds[1]}: expected {' or '.join(possible)}."
-        )
-    return encoding
-
-
-def _last(statistics: Mapping[str, Any], name: str) -> float | None:
-    values = statistics.get(name)
-    return float(values[-1]) if isinstance(values, list) and values else None
 
 
 def check_mask(source: Path, what: str, statistics: Mapping[str, Any], expected: tuple[bool, ...]) -> None:

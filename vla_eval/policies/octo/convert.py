@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
-from vla_eval.policies.conversion import check_free, checked_gripper, folder_when_whole
+from vla_eval.policies.conversion import check_free, folder_when_whole
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.policies.lerobot_processors import save_tokenizers
@@ -30,7 +30,6 @@ def convert(
     source: Path,
     out: Path,
     *,
-    gripper: str | None,
     fields: dict[str, Any],
     dataset: str | None = None,
     tokenizer: str | None = None,
@@ -40,7 +39,6 @@ def convert(
     Args:
         source: the original's folder: parameters and `dataset_statistics.json`.
         out: a folder that is not there yet.
-        gripper: how the training data encode it, see `checked_gripper`.
         fields: of `MikasaOctoConfig`, such as `SIZES["small"]`.
         dataset: which statistics, where there are several.
         tokenizer: folder of T5's tokenizer; None: the one that the configuration names, from the cache.
@@ -50,10 +48,8 @@ def convert(
     """
     check_free(out)
     named = {"tokenizer_name": tokenizer} if tokenizer is not None else {}
+    config = octo_config({**fields, **named})
     statistics = read_statistics(source if source.is_dir() else source.parent, dataset=dataset)
-    config = octo_config(
-        {**fields, **named, "gripper_encoding": checked_gripper(source, gripper, statistics)}
-    )
     policy = make_empty_policy(config)
     put_weights(policy, _with_shared(policy, from_flax(read_parameters(source))), where=str(source))
     with no_foreign_code(config.type):

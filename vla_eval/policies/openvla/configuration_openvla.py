@@ -9,7 +9,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.data.features import ACTION_KEY, STATE_KEY
-from vla_eval.errors import CheckpointError, RecipeError, check_names, unknown_name
+from vla_eval.errors import RecipeError, check_names, unknown_name
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, network_sizes
 from vla_eval.policies.steps.gripper import Gripper
@@ -63,9 +63,7 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         sizes: sizes that differ from the published model's, see `NetworkSizes`.
         dtype: of eyes, projector and Llama: `float32`, `bfloat16`. The continuous head is always float32.
         gradient_checkpointing: recompute activations in the backward pass.
-        image_augmentation: change training images at random and crop those of an evaluation alike.
-        action_mask, state_mask: which dimensions are normalised; empty: all, but of actions not the gripper.
-            A converted checkpoint has those of its statistics.
+        image_augmentation: change training pictures at random and crop those of an evaluation alike.
         gripper: how the gripper is encoded.
         do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False, as the
             original: no chunk begins so late that it has any.
@@ -86,8 +84,6 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
     dtype: str = "bfloat16"
     gradient_checkpointing: bool = False
     image_augmentation: bool = True
-    action_mask: list[bool] = field(default_factory=list)
-    state_mask: list[bool] = field(default_factory=list)
     gripper: str = "maniskill"
     do_mask_loss_for_padding: bool = False
     drop_n_last_frames: int = 0
@@ -162,19 +158,15 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
 
         Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
-        prismatic/vla/datasets/rlds/utils/data_utils.py#L52-L90; experiments/robot/openvla_utils.py#L649-L680
-        for the proprioception, of which its evaluation also cuts what the mask leaves alone.
-
-        Raises:
-            CheckpointError: a mask has another number of dimensions than its field.
+        prismatic/vla/datasets/rlds/utils/data_utils.py#L52-L90.
         """
         n_dims = int(self.action_feature.shape[0])
-        mask = _mask("action_mask", self.action_mask, mask_all_but(n_dims, left_alone=(-1,)))
-        fields = {ACTION_KEY: Normalization(kind="q01_q99", mask=mask, clip=True)}
+        fields = {
+            ACTION_KEY: Normalization(kind="q01_q99", mask=mask_all_but(n_dims, left_alone=(-1,)), clip=True)
+        }
         if self.use_proprio:
             n_state = int(self.robot_state_feature.shape[0])
-            mask = _mask("state_mask", self.state_mask, mask_all_but(n_state))
-            fields[STATE_KEY] = Normalization(kind="q01_q99", mask=mask, clip=True, clip_unmasked=True)
+            fields[STATE_KEY] = Normalization(kind="q01_q99", mask=mask_all_but(n_state), clip=True)
         return fields
 
     @property
@@ -222,12 +214,3 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         return StepDecaySchedulerConfig(
             num_decay_steps=self.scheduler_decay_steps, num_warmup_steps=self.scheduler_warmup_steps
         )
-
-
-def _mask(name: str, given: list[bool], default: tuple[bool, ...]) -> tuple[bool, ...]:
-    if given and len(given) != len(default):
-        raise CheckpointError(
-            f"{TYPE}: {name}: expected {len(default)} values, one per dimension, found {len(given)}. "
-            f"Leave it empty for all dimensions, or name each."
-        )
-    return tuple(given) or default

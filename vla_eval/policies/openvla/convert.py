@@ -21,7 +21,7 @@ from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
 from vla_eval.policies.conversion import (
     Statistics,
     check_free,
-    checked_gripper,
+    check_mask,
     chosen_statistics,
     read_safetensors,
     write_checkpoint,
@@ -52,9 +52,7 @@ class ConvertOptions:
         picture_px: edge of the pictures as a camera gives them.
         proprio: numbers of the proprioception; 0: the model has none.
         allow_pickled: read heads that are pickled tensors.
-        gripper: how the training data encode it, see `checked_gripper`; the published one's is `unit_open`.
-        image_augmentation: whether it was trained with `--image_aug True`: then images are cropped to 0.9 of
-            their area, as the original's `--center_crop True` does. No file says so.
+        gripper: how the training data encode it; the published OpenVLA's is `unit_open`.
         sizes: sizes that differ from the published ones.
         dtype: of the result.
     """
@@ -66,8 +64,7 @@ class ConvertOptions:
     picture_px: int = 128
     proprio: int = 0
     allow_pickled: bool = False
-    gripper: str | None = None
-    image_augmentation: bool | None = None
+    gripper: str = "maniskill"
     sizes: dict[str, int] = field(default_factory=dict)
     dtype: str = "bfloat16"
 
@@ -87,12 +84,12 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
         _check_backbones(source, described)
-    statistics = read_statistics(source, described, options)
-    config = _config(source, options, statistics or {})
+    config = _config(options)
     policy = MikasaOpenVLAPolicy(config)
     weights = read_original(source, options, config.network_sizes())
     where = str(source)
     put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)
+    statistics = read_statistics(source, described, config, options.unnorm_key)
 
     def check_tokenizer(tokenizer: Any) -> None:
         if not options.sizes:
@@ -123,41 +120,34 @@ def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) ->
     return to_ours(original, sizes)
 
 
-def read_statistics(source: Path, described: Mapping[str, Any], options: ConvertOptions) -> Statistics | None:
+def read_statistics(
+    source: Path, described: Mapping[str, Any], config: MikasaOpenVLAConfig, unnorm_key: str | None
+) -> Statistics | None:
     """Return field -> statistics of the training data; None if there are several and none is chosen.
 
     Raises:
-        CheckpointError: they are missing, or not of that name.
+        CheckpointError: they are missing, not of that name, or normalised otherwise than ours.
     """
     file = source / STATISTICS_FILE
     known = read_json(file) if file.is_file() else dict(described.get("norm_stats") or {})
-    chosen = chosen_statistics(source, known, options.unnorm_key)
+    chosen = chosen_statistics(source, known, unnorm_key)
     if chosen is None:
         return None
-    wanted = {ACTION_KEY: "action", **({STATE_KEY: "proprio"} if options.proprio else {})}
+    wanted = {ACTION_KEY: "action", **({STATE_KEY: "proprio"} if config.use_proprio else {})}
+    for ours, theirs in wanted.items():
+        check_mask(source, theirs, chosen.get(theirs) or {}, config.normalizations()[ours].mask)
     return {ours: chosen[theirs] for ours, theirs in wanted.items() if theirs in chosen}
 
 
-def _config(source: Path, options: ConvertOptions, statistics: Statistics) -> MikasaOpenVLAConfig:
+def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
     shape = (3, options.picture_px, options.picture_px)
-    action, state = statistics.get(ACTION_KEY, {}), statistics.get(STATE_KEY, {})
-    if options.image_augmentation is None:
-        raise CheckpointError(
-            f"{source}: expected whether this model was trained with image augmentation, which no file says. "
-            f"Name it: --image-aug yes for a training with --image_aug True (OpenVLA-OFT's and the paper's: "
-            f"images are then cropped to 0.9 of their area at inference), no for one without (the published "
-            f"openvla-7b)."
-        )
     make: Any = MikasaOpenVLAConfig  # lerobot, whose fields it has, is untyped
     config: MikasaOpenVLAConfig = make(
         head=options.head,
         chunk_size=options.chunk_size,
         n_action_steps=options.chunk_size,
         use_proprio=options.proprio > 0,
-        gripper=checked_gripper(source, options.gripper, action),
-        image_augmentation=options.image_augmentation,
-        action_mask=list(action.get("mask") or ()),
-        state_mask=list(state.get("mask") or ()),
+        gripper=options.gripper,
         sizes=options.sizes,
         dtype=options.dtype,
         device="cpu",

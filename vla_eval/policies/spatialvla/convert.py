@@ -22,7 +22,6 @@ from vla_eval.policies.conversion import (
     Statistics,
     check_free,
     check_mask,
-    checked_gripper,
     chosen_statistics,
     read_safetensors,
     write_checkpoint,
@@ -49,7 +48,6 @@ class ConvertOptions:
     """What the files do not say of themselves.
 
     Attributes:
-        gripper: how the training data encode it, see `checked_gripper`.
         unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
         cameras: fields of the pictures that the policy expects; `pictures` says which of them are read.
         pictures: see `MikasaSpatialVLAConfig`.
@@ -60,7 +58,6 @@ class ConvertOptions:
         dtype: of the result.
     """
 
-    gripper: str | None = None
     unnorm_key: str | None = None
     cameras: tuple[str, ...] = tuple(CAMERA_KEYS.values())
     pictures: tuple[str, ...] = (CAMERA_KEYS["base_camera"],)
@@ -90,7 +87,7 @@ def convert_spatialvla(source: Path, out: Path, options: ConvertOptions) -> Path
     policy = MikasaSpatialVLAPolicy(config)
     named = {f"network.{name}": value for name, value in to_ours(weights).items()}
     put_weights(policy, named, where=str(source), cast=True)
-    statistics = read_statistics(source, processor, config, options)
+    statistics = read_statistics(source, processor, config, options.unnorm_key)
     return write_checkpoint(
         source,
         out,
@@ -101,22 +98,18 @@ def convert_spatialvla(source: Path, out: Path, options: ConvertOptions) -> Path
 
 
 def read_statistics(
-    source: Path, processor: Mapping[str, Any], config: MikasaSpatialVLAConfig, options: ConvertOptions
+    source: Path, processor: Mapping[str, Any], config: MikasaSpatialVLAConfig, unnorm_key: str | None
 ) -> Statistics | None:
     """Return field -> statistics of the training data; None if there are several and none is chosen.
 
     Raises:
         CheckpointError: they are not of that name, or normalised otherwise than ours.
     """
-    chosen = _chosen(source, processor, options)
+    chosen = chosen_statistics(source, processor.get("statistics") or {}, unnorm_key)
     if chosen is None:
         return None
     check_mask(source, "action", chosen["action"], config.normalizations()[ACTION_KEY].mask)
     return {ACTION_KEY: chosen["action"]}
-
-
-def _chosen(source: Path, processor: Mapping[str, Any], options: ConvertOptions) -> Any:
-    return chosen_statistics(source, processor.get("statistics") or {}, options.unnorm_key)
 
 
 def read_grid(source: Path, processor: Mapping[str, Any]) -> list[list[float]]:
@@ -174,9 +167,6 @@ def _config(
         chunk_size=chunk,
         n_action_steps=chunk,
         inference_attention=ORIGINALS_INFERENCE,
-        gripper=checked_gripper(
-            source, options.gripper, (_chosen(source, processor, options) or {}).get("action")
-        ),
         pictures=list(options.pictures),
         grid=read_grid(source, processor),
         sizes={**options.sizes, "llm_own_head": int(has_own_head)},

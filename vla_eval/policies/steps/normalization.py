@@ -34,13 +34,11 @@ class Normalization:
         kind: `mean_std`: (x - mean) / std. `q01_q99`: the range between these quantiles becomes [-1, 1].
         mask: for each dimension whether it is normalised; others are left as they are.
         clip: cut to [-1, 1] after normalising; only with `q01_q99`.
-        clip_unmasked: cut what the mask leaves alone, too.
     """
 
     kind: NormalizationKind
     mask: tuple[bool, ...]
     clip: bool = False
-    clip_unmasked: bool = False
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
@@ -90,8 +88,7 @@ class Normalizer:
         if self.spec.clip:
             scaled = scaled.clamp(-1, 1)
         scaled = torch.where(self._is_constant().to(values.device), 0.0, scaled)
-        left_alone = values.clamp(-1, 1) if self.spec.clip_unmasked else values
-        return torch.where(mask, scaled, left_alone)
+        return torch.where(mask, scaled, values)
 
     @in_float32
     def unnormalize(self, values: Tensor) -> Tensor:
