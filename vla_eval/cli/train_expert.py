@@ -1,10 +1,13 @@
 """`mikasa-vla train-expert`: learn an expert by PPO on the true state, on a processor."""
 
 import argparse
+import math
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vla_eval.bounds import MAX_PROCESSES, MAX_SLOTS, MAX_TRAINING_STEPS, check_bounds, check_seeds
 
 if TYPE_CHECKING:
     from vla_eval.training.ppo_expert import PpoProgress
@@ -44,9 +47,11 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.errors import RecipeError
     from vla_eval.tasks.catalog import task_spec
 
-    for name in ("steps", "envs", "workers"):
-        if getattr(args, name) < 1:
-            raise RecipeError(f"--{name} is {getattr(args, name)}, expected a number ≥ 1.")
+    bounds = {"steps": (1, MAX_TRAINING_STEPS), "envs": (1, MAX_SLOTS), "workers": (1, MAX_PROCESSES)}
+    check_bounds(args, bounds, prefix="--")
+    check_seeds(args.seed, name="--seed")
+    if not math.isfinite(args.gripper):
+        raise RecipeError(f"--gripper is {args.gripper}, expected a finite number.")
     task = task_spec(args.task).id
     from vla_eval.training.ppo_expert import POLICY_FILE, train_expert
     from vla_eval.training.ppo_settings import PpoSettings
