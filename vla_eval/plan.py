@@ -15,7 +15,7 @@ from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
 from vla_eval.policies.recipe import load_policy_recipe
-from vla_eval.prompts import instruction_for, load_prompts
+from vla_eval.prompts import load_prompts, sentences_of
 from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
 from vla_eval.registry import check_adapter
 from vla_eval.results.records import EpisodeKey
@@ -121,7 +121,7 @@ def make_plan(config: EvalConfig) -> Plan:
     left_out: list[str] = []
     for task in tasks:
         check_arguments(task, config.env, TASKS.values())
-        instruction = instruction_for(task, config.prompt_set)
+        instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and task.candidates is None:

@@ -7,6 +7,7 @@ package. Knows nothing of tasks, policies or simulators: whether a named task ex
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -225,7 +226,8 @@ def find_recipe(folder: Folder, name: str) -> Path:
         UnknownNameError: there is no such file; the message names what there is.
     """
     as_path = Path(name)
-    if as_path.suffix in (".yaml", ".yml") and as_path.is_file():
+    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    if as_path.suffix in (".yaml", ".yml") and os.path.isfile(as_path):
         return as_path
     known = list_recipes(folder)
     stem = name.removeprefix(f"{folder}/").removesuffix(".yaml")

@@ -385,19 +385,18 @@ class TestBounds:
         with pytest.raises(RecipeError, match=r"make 2000000 episodes, expected at most 1000000"):
             make_plan(config(policies=["random", "hold"], runs=1000, episodes=1000))
 
-    @pytest.mark.parametrize("value", [float("nan"), float("inf"), 10**400])
     @pytest.mark.parametrize(
         ("path", "fields"),
         [
-            ("chunking.ensemble_decay", lambda value: {"chunking": {"ensemble_decay": value}}),
-            ("env.range[1]", lambda value: {"env": {"range": [0.1, value]}}),
+            ("chunking.ensemble_decay", {"chunking": {"ensemble_decay": float("nan")}}),
+            ("chunking.ensemble_decay", {"chunking": {"ensemble_decay": 10**400}}),
+            ("timeouts.step_seconds", {"timeouts": {"step_seconds": float("inf")}}),
+            ("env.range[1]", {"env": {"range": [0.1, float("-inf")]}}),
         ],
     )
-    def test_a_number_that_is_not_finite_is_refused(self, value: float, path: str, fields: Any) -> None:
-        if isinstance(value, int) and path.startswith("env"):
-            pytest.skip("a whole number stays one where any value is taken")
+    def test_a_number_that_is_not_finite_is_refused(self, path: str, fields: dict[str, Any]) -> None:
         with pytest.raises(RecipeError, match="expected a finite number") as caught:
-            config(**fields(value))
+            config(**fields)
         assert f"'{path}'" in str(caught.value)
 
     def test_what_is_nested_without_end_is_refused(self) -> None:

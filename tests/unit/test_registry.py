@@ -77,7 +77,7 @@ def test_half_a_target_is_refused(adapter: str) -> None:
         "builtins:exec",
         "subprocess:run",
         "sys:exit",
-        "_thread:exit",
+        "_io:open",
     ],
 )
 def test_python_itself_holds_no_adapter(adapter: str) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from vla_eval.bounds import MAX_STEPS, check_bounds
 from vla_eval.core import ActionChunk, FloatArray
-from vla_eval.errors import SpecMismatchError
+from vla_eval.errors import RecipeError, SpecMismatchError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,11 +41,10 @@ class ChunkingSpec:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        bounds = {
-            "n_action_steps": (1, MAX_STEPS),
-            "delay_steps": (0, MAX_STEPS),
-            "ensemble_decay": (0, math.inf),
-        }
+        for name, least in (("n_action_steps", 1), ("delay_steps", 0), ("ensemble_decay", 0)):
+            if getattr(self, name) < least:
+                raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ {least}.")
+        bounds = {"n_action_steps": (1, MAX_STEPS), "delay_steps": (0, MAX_STEPS)}
         check_bounds(self, bounds, prefix="chunking.")
 
     @property
