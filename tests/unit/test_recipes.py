@@ -8,7 +8,7 @@ import pytest
 
 from vla_eval import shipped
 from vla_eval.decoding import decode, load_yaml
-from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
+from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError, VlaEvalError
 from vla_eval.job_queue import JobQueue
 from vla_eval.model_table import is_model_table, load_model_table
 from vla_eval.plan import fingerprint, make_plan, results_config
@@ -406,6 +406,28 @@ class TestBounds:
 
         with pytest.raises(RecipeError, match="nested more than 50 deep"):
             config(env={"a": nested})
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ("{checkpoint: 5}", r"policy 'own': args\.checkpoint is 5, expected the path of a folder"),
+        ("{checkpoint: x, base_checkpoint: [a]}", r"policy 'own': args\.base_checkpoint is \['a'\]"),
+        (f"{{checkpoint: {'x' * 5000}}}", "xxx: expected a LeRobot checkpoint .* found no such folder"),
+    ],
+)
+def test_a_checkpoint_that_can_be_no_folder_is_refused(tmp_path: Path, args: str, message: str) -> None:
+    recipe = tmp_path / "own.yaml"
+    recipe.write_text(f"version: 1\ndescription: d\nadapter: lerobot\nargs: {args}\n")
+
+    with pytest.raises(VlaEvalError, match=message):
+        make_plan(config(policies=[str(recipe)]))
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 5000 + ".yaml", "a\0b", "a\0b.yaml"])
+def test_what_can_be_no_path_is_an_unknown_policy(name: str) -> None:
+    with pytest.raises(UnknownNameError, match="there is no policies"):
+        make_plan(config(policies=[name]))
 
 
 class TestNames:
