@@ -8,6 +8,8 @@ and what to do next.
 import difflib
 from collections.abc import Collection, Iterable
 
+MAX_SHOWN = 200  # characters of what the user wrote that a message repeats
+
 
 class VlaEvalError(Exception):
     """Root of all errors of this package."""
@@ -105,7 +107,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         known: the names that exist. Upper and lower case are not told apart when comparing.
     """
     by_folded = {candidate.lower(): candidate for candidate in known}
-    close = difflib.get_close_matches(name.lower(), list(by_folded), n=1, cutoff=0.5)
+    # Longer names are no slip of the pen, and comparing takes time that grows with the square of the length.
+    close = difflib.get_close_matches(name[:MAX_SHOWN].lower(), list(by_folded), n=1, cutoff=0.5)
     return f" Did you mean '{by_folded[close[0]]}'?" if close else ""
 
 
@@ -113,9 +116,8 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "")
     """Build the error for a name that does not exist: what it was, what exists, and a suggestion."""
     names = sorted(known)
     prefix = f"{where}: " if where else ""
-    return UnknownNameError(
-        f"{prefix}there is no {kind} '{name}'.{did_you_mean(name, names)} Known: {', '.join(names)}."
-    )
+    problem = f"{prefix}there is no {kind} '{name:.{MAX_SHOWN}}'."
+    return UnknownNameError(f"{problem}{did_you_mean(name, names)} Known: {', '.join(names)}.")
 
 
 def check_names(kind: str, names: Iterable[str], known: Collection[str], *, where: str = "") -> None:

@@ -12,6 +12,14 @@ from typing import Any, Literal, NamedTuple
 
 import yaml
 
+from vla_eval.bounds import (
+    MAX_EPISODES,
+    MAX_SLOTS,
+    MAX_STEPS,
+    MAX_TRAINING_STEPS,
+    check_bounds,
+    check_seeds,
+)
 from vla_eval.envs.settings import RenderSettings, Simulator
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
@@ -83,10 +91,8 @@ class TableRow:
             raise RecipeError(
                 f"row {self.name}: n_action_steps is {list(steps)}, expected numbers ≥ 1, none of them twice."
             )
-        if self.slots_per_worker < 1:
-            raise RecipeError(
-                f"row {self.name}: slots_per_worker is {self.slots_per_worker}, expected a number ≥ 1."
-            )
+        bounds = {"n_action_steps": (1, MAX_STEPS), "slots_per_worker": (1, MAX_SLOTS)}
+        check_bounds(self, bounds, prefix=f"row {self.name}: ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,9 +131,10 @@ class ModelTable:
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
         check_run_name(self.name)
-        for name, value in (("steps", self.steps), ("episodes", self.episodes)):
-            if value is not None and value < 1:
-                raise RecipeError(f"{name} is {value}, expected a number ≥ 1.")
+        check_bounds(self, {"steps": (1, MAX_TRAINING_STEPS), "episodes": (1, MAX_EPISODES)})
+        check_seeds(self.seed_start, self.episodes)
+        for run_seed in self.run_seeds:
+            check_seeds(run_seed, name="run_seeds")
         for name, values in (
             ("tasks", self.tasks),
             ("rows", [row.name for row in self.rows]),

@@ -10,11 +10,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from vla_eval.bounds import MAX_EPISODES
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
 from vla_eval.policies.recipe import load_policy_recipe
-from vla_eval.prompts import instruction_for, load_prompts
+from vla_eval.prompts import load_prompts, sentences_of
 from vla_eval.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
 from vla_eval.registry import check_adapter
 from vla_eval.results.records import EpisodeKey
@@ -104,7 +105,7 @@ def make_plan(config: EvalConfig) -> Plan:
 
     Raises:
         UnknownNameError: a task, policy, adapter or prompt set does not exist.
-        RecipeError: a recipe is wrong, or two policies have the same name.
+        RecipeError: a recipe is wrong, two policies have the same name, or there are too many episodes.
         MissingInstructionError: a task has no instruction in the prompt set.
         TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
             tasks with candidates, and one of the tasks has none.
@@ -120,7 +121,7 @@ def make_plan(config: EvalConfig) -> Plan:
     left_out: list[str] = []
     for task in tasks:
         check_arguments(task, config.env, TASKS.values())
-        instruction = instruction_for(task, config.prompt_set)
+        instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and task.candidates is None:
@@ -129,6 +130,7 @@ def make_plan(config: EvalConfig) -> Plan:
             groups.extend(_groups(config, task, policy, instruction))
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
+    _refuse_too_many(config, n_groups=len(groups))
     limits = [policy.value.max_workers for policy in policies if policy.value.max_workers is not None]
     return Plan(
         jobs=tuple(
@@ -187,6 +189,16 @@ def _refuse_instruction(config: EvalConfig) -> None:
         raise RecipeError(
             "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
             "./prompts/ and name that file in prompt_set."
+        )
+
+
+def _refuse_too_many(config: EvalConfig, *, n_groups: int) -> None:
+    n_episodes = n_groups * config.runs * config.episodes
+    if n_episodes > MAX_EPISODES:
+        raise RecipeError(
+            f"{config.name}: {n_groups} groups (task, policy, n_action_steps), {config.runs} runs and "
+            f"{config.episodes} episodes make {n_episodes} episodes, expected at most {MAX_EPISODES} in one "
+            f"run folder. Use fewer, or several configurations."
         )
 
 

@@ -13,12 +13,16 @@ def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
 
 
 def instructions_for(spec: TaskSpec, prompt_set: str = DEFAULT_PROMPT_SET) -> tuple[str, ...]:
-    """Return the sentence of a task and then its paraphrases.
+    """Return the sentence of a task and then its paraphrases; errors as `load_prompts` and `sentences_of`."""
+    return sentences_of(load_prompts(prompt_set), spec)
+
+
+def sentences_of(prompts: Recipe[PromptRecipe], spec: TaskSpec) -> tuple[str, ...]:
+    """Return what a set says for a task: the sentence, then its paraphrases.
 
     Raises:
         MissingInstructionError: the set has no sentence for this task, or an empty one.
     """
-    prompts = load_prompts(prompt_set)
     sentences = prompts.value.instructions.get(spec.instruction_key, ())
     if not sentences or not all(sentence.strip() for sentence in sentences):
         known = sorted(prompts.value.instructions)

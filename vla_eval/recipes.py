@@ -7,18 +7,29 @@ package. Knows nothing of tasks, policies or simulators: whether a named task ex
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from vla_eval.decoding import decode, find_field, load_yaml
+from vla_eval.bounds import (
+    MAX_EPISODES,
+    MAX_PROCESSES,
+    MAX_SECONDS,
+    MAX_SLOTS,
+    MAX_STEPS,
+    check_bounds,
+    check_seeds,
+)
+from vla_eval.decoding import decode, set_field
 from vla_eval.envs.settings import RenderSettings, SimBackend, Simulator
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import MAX_SHOWN, RecipeError, unknown_name
 from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.shipped import search_folders
 from vla_eval.training.recipe import FinetuneRecipe
 from vla_eval.viz.settings import RecordingConfig
+from vla_eval.yaml_data import MAX_CHARACTERS, load_yaml
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
 
@@ -66,10 +77,7 @@ class PolicyRecipe:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        _require(
-            self.default_n_action_steps >= 1, "default_n_action_steps", self.default_n_action_steps, "≥ 1"
-        )
-        _require(self.max_workers is None or self.max_workers >= 1, "max_workers", self.max_workers, "≥ 1")
+        check_bounds(self, {"default_n_action_steps": (1, MAX_STEPS), "max_workers": (1, MAX_PROCESSES)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +120,11 @@ class TimeoutConfig:
     step_seconds: float = 120.0
     inference_seconds: float = 300.0
 
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        least_and_most = (0.001, MAX_SECONDS)
+        check_bounds(self, {f.name: least_and_most for f in dataclasses.fields(self)}, prefix="timeouts.")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvalConfig:
@@ -146,21 +159,23 @@ class EvalConfig:
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
         check_run_name(self.name)
-        for name in ("episodes", "runs", "slots_per_worker", "max_consecutive_errors"):
-            _require(getattr(self, name) >= 1, name, getattr(self, name), "a number ≥ 1")
-        _require(self.seed_start >= 0, "seed_start", self.seed_start, "a seed ≥ 0")
-        _require(
-            self.workers == "auto" or self.workers >= 1, "workers", self.workers, "'auto' or a number ≥ 1"
+        check_bounds(
+            self,
+            {
+                "episodes": (1, MAX_EPISODES),
+                "runs": (1, MAX_EPISODES),
+                "slots_per_worker": (1, MAX_SLOTS),
+                "max_consecutive_errors": (1, MAX_EPISODES),
+                "workers": (1, MAX_PROCESSES),
+            },
         )
+        check_seeds(self.seed_start, self.episodes)
         for name in ("tasks", "policies", "n_action_steps"):
             values = getattr(self, name)
             _require(values is None or len(values) > 0, name, values, "at least one")
             _require(
                 values is None or len(set(values)) == len(values), name, list(values or ()), "no doubles"
             )
-        for name in ("setup_seconds", "reset_seconds", "step_seconds", "inference_seconds"):
-            seconds = getattr(self.timeouts, name)
-            _require(seconds > 0, f"timeouts.{name}", seconds, "a number of seconds > 0")
         for n_action_steps in self.n_action_steps or (1,):
             self.chunking.spec(n_action_steps)  # checks the ranges
 
@@ -171,13 +186,22 @@ OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_
 
 def _require(condition: bool, name: str, found: object, expected: str) -> None:
     if not condition:
-        raise RecipeError(f"{name} is {found}, expected {expected}.")
+        raise RecipeError(f"{name} is {found!s:.200}, expected {expected}.")
 
 
 def check_run_name(name: str) -> None:
     """Raise `RecipeError` unless the name can be the name of a folder on any machine."""
     allowed = name and name[0].isalnum() and all(c.isalnum() or c in "._-" for c in name) and name.isascii()
     _require(bool(allowed), "name", repr(name), "letters, digits, '.', '_' and '-', a letter or digit first")
+
+
+def check_recorded_name(name: str, *, kind: str) -> None:
+    """Raise `RecipeError` unless tables, paths and spreadsheets can hold a recipe's name as it is."""
+    if not (name.isprintable() and (name[:1].isalnum() or name[:1] == "_")):
+        raise RecipeError(
+            f"{kind}: the file is called {name!r:.200}, expected a name that begins with a letter, a digit "
+            f"or '_' and has no line breaks or other control characters. Rename the file."
+        )
 
 
 # ------------------------------------------------------------------------------------------ finding
@@ -202,7 +226,8 @@ def find_recipe(folder: Folder, name: str) -> Path:
         UnknownNameError: there is no such file; the message names what there is.
     """
     as_path = Path(name)
-    if as_path.suffix in (".yaml", ".yml") and as_path.is_file():
+    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    if as_path.suffix in (".yaml", ".yml") and os.path.isfile(as_path):
         return as_path
     known = list_recipes(folder)
     stem = name.removeprefix(f"{folder}/").removesuffix(".yaml")
@@ -261,9 +286,11 @@ class _File(NamedTuple):
 
 def _read(folder: Folder, name: str) -> _File:
     path = find_recipe(folder, name)
+    check_recorded_name(path.stem, kind=folder)
     where = f"{folder}/{path.name}" if path.parent in search_folders(folder) else str(path)
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(MAX_CHARACTERS * 4 + 1)  # one more than UTF-8 needs: refused as too large
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as exc:
         raise RecipeError(f"{where}: cannot be read as a text file in UTF-8 ({exc}).") from exc
@@ -281,19 +308,10 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str], *, cls: type
     """
     for override in overrides:
         path, equals, text = override.partition("=")
-        if not equals or not path:
-            raise RecipeError(
-                f"--set {override}: expected FIELD=VALUE, for example --set chunking.delay_steps=2."
-            )
-        find_field(cls, path, where=f"--set {override}")
-        *parents, last = path.split(".")
-        target = data
-        for parent in parents:
-            child = target.setdefault(parent, {})
-            if not isinstance(child, dict):
-                raise RecipeError(f"--set {override}: '{parent}' is {child!r}, which has no fields.")
-            target = child
-        target[last] = load_yaml(text, where=f"--set {override}")
+        where = f"--set {override:.{MAX_SHOWN}}"
+        if not equals or not all(path.split(".")):
+            raise RecipeError(f"{where}: expected FIELD=VALUE, for example --set chunking.delay_steps=2.")
+        set_field(cls, data, path, load_yaml(text, where=where), where=where)
 
 
 def to_data(value: Any) -> Any:  # Any: plain data of whatever the recipe holds

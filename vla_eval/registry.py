@@ -2,16 +2,24 @@
 
 A name is looked up among ours, then among installed packages that declare the entry point group
 `vla_eval.policies`; a name with a colon is `module:attr`. Nothing is imported before it is asked for.
+
+Whoever writes `module:attr` into a recipe trusts that module: it is imported. A recipe from elsewhere must
+not reach Python's own functions that way, so modules of the standard library and `__main__` hold no adapter;
+and what is found is called only if it is a function or a class that takes a context.
 """
 
+import functools
 import importlib
+import inspect
+import re
+import sys
 from collections.abc import Callable, Iterable
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import Any
 
 from vla_eval.core import Policy
-from vla_eval.errors import MissingDependencyError, UnknownNameError, did_you_mean, unknown_name
+from vla_eval.errors import MAX_SHOWN, MissingDependencyError, UnknownNameError, did_you_mean, unknown_name
 
 PolicyFactory = Callable[..., Policy]
 """`make_x(context: PolicyContext, **args) -> Policy`; `args` come from the policy's recipe."""
@@ -33,6 +41,10 @@ POLICIES = {
 }
 
 
+_TARGET = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
+_NO_ADAPTERS = frozenset({*sys.stdlib_module_names, *sys.builtin_module_names, "__main__"})
+
+
 def policy_adapters() -> dict[str, str]:
     """Return name -> `module:attr` of all adapters; ours win over another package's of the same name."""
     others: dict[str, str] = {point.name: point.value for point in _points(POLICY_GROUP)}
@@ -43,7 +55,7 @@ def check_adapter(adapter: str) -> None:
     """Raise what `policy_factory` would raise for a mistyped name, without importing the adapter."""
     module_name, _ = _target(adapter)
     root = module_name.partition(".")[0]
-    if find_spec(root) is None:
+    if root not in sys.modules and find_spec(root) is None:
         raise _no_module(adapter, module_name)
 
 
@@ -84,9 +96,10 @@ def policy_factory(adapter: str) -> PolicyFactory:
                 f"policy adapter '{adapter}': {module_name} has no '{attribute}'.{did_you_mean(part, known)}"
             )
         found = getattr(found, part)
-    if not callable(found):
+    if not _takes_a_context(found):
         raise UnknownNameError(
-            f"policy adapter '{adapter}': {found!r:.60} is not a function that makes a policy."
+            f"policy adapter '{adapter}': {found!r:.60} is not a function that makes a policy, nor a class "
+            f"of policies: expected `make(context, **args)`."
         )
     factory: PolicyFactory = found
     return factory
@@ -98,12 +111,34 @@ def _target(adapter: str) -> tuple[str, str]:
     target = adapter if ":" in adapter else known.get(adapter)
     if target is None:
         raise unknown_name("policy adapter", adapter, known)
-    module_name, _, attribute = target.partition(":")
-    if not module_name or not attribute:
+    if not _TARGET.fullmatch(target):
         raise UnknownNameError(
-            f"policy adapter '{adapter}': expected 'module:attribute', for example 'my_pkg.policy:make'."
+            f"policy adapter '{adapter:.{MAX_SHOWN}}': expected 'module:attribute', for example "
+            f"'my_pkg.policy:make'."
+        )
+    module_name, _, attribute = target.partition(":")
+    if module_name.partition(".")[0] in _NO_ADAPTERS:
+        raise UnknownNameError(
+            f"policy adapter '{adapter}': {module_name} is a module of Python itself and holds no policies. "
+            f"Name a module of yours, for example 'my_pkg.policy:make'."
         )
     return module_name, attribute
+
+
+def _takes_a_context(found: Any) -> bool:  # Any: whatever the module holds
+    """Whether this is a function or a class that can be given a context as its first argument."""
+    if not (inspect.isroutine(found) or inspect.isclass(found) or isinstance(found, functools.partial)):
+        return False
+    try:
+        parameters = inspect.signature(found).parameters.values()
+    except (ValueError, TypeError):  # code in C that does not say what it takes
+        return False
+    positional = (
+        inspect.Parameter.POSITIONAL_ONLY,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+        inspect.Parameter.VAR_POSITIONAL,
+    )
+    return any(parameter.kind in positional for parameter in parameters)
 
 
 def _no_module(adapter: str, module_name: str) -> UnknownNameError:

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 import vla_eval.tasks.register  # noqa: F401  # registers the gym ids
-from vla_eval.errors import MissingDependencyError, TaskArgumentError
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.settings import EnvSettings
+from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.memory_env import PARK_X_M
 from vla_eval.tasks.register import env_class
@@ -367,6 +369,22 @@ def test_impossible_arguments_are_refused_with_a_reason(
 ) -> None:
     with pytest.raises(TaskArgumentError, match=message):
         make(task, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"cue_steps": True}, "cue_steps=True: expected a whole number"),
+        ({"delay_steps": [1, 10**9]}, "expected a whole number of control steps"),
+        ({"show_cue": "no"}, "'show_cue': expected true or false, found 'no'"),
+        ({"goal_threshold_m": "near"}, "'goal_threshold_m': expected a number, found 'near'"),
+        ({"n_items": None}, "'n_items': expected a whole number, found None"),
+        ({"items": [1]}, "no argument 'items'"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises((TaskArgumentError, UnknownNameError), match=message):
+        make_env(EnvSettings(task="RememberColor3-v0", kwargs=kwargs))
 
 
 def test_a_missing_ycb_mug_is_an_error_and_never_a_question(monkeypatch: pytest.MonkeyPatch) -> None:

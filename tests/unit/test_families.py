@@ -83,6 +83,42 @@ def test_an_environment_of_a_family_without_its_arguments_is_refused() -> None:
         make_env(EnvSettings(task="SeqOfColors", simulator="fake"))
 
 
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (
+            {"delay_steps": 10**12},
+            r"delay_steps=1000000000000: expected a whole number of control steps, 0 to 10000",
+        ),
+        ({"delay_steps": True}, "delay_steps=True: expected a whole number"),
+        ({"cue_steps": "5"}, "cue_steps='5': expected a whole number"),
+        ({"cue_steps": [1, None]}, r"cue_steps=\[1, None\]: expected a whole number"),
+        ({"horizon_steps": 0}, "horizon_steps=0: expected a whole number of control steps, 1 to 10000"),
+    ],
+)
+def test_a_duration_that_is_none_is_refused_before_anything_starts(
+    env: dict[str, object], message: str
+) -> None:
+    with pytest.raises(TaskArgumentError, match=message):
+        make_plan(config(tasks=["RememberColor3-v0"], env=env))
+
+
+@pytest.mark.parametrize(
+    ("task", "env", "message"),
+    [
+        ("RememberColor", {"n_items": "x"}, "'n_items': expected a whole number, found 'x'"),
+        ("RememberColor", {"n_items": 10**12}, "expected 1 ≤ n_shown ≤ n_items ≤ 100"),
+        ("InterceptMedium-v0", {"velocity_range_m_s": 3}, "'velocity_range_m_s': expected a list"),
+        ("InterceptMedium-v0", {"velocity_range_m_s": [1, 0]}, r"expected \(least, most\)"),
+    ],
+)
+def test_the_fake_environment_refuses_what_no_task_could_be(
+    task: str, env: dict[str, object], message: str
+) -> None:
+    with pytest.raises(TaskArgumentError, match=message):
+        make_env(EnvSettings(task=task, kwargs=env, simulator="fake"))
+
+
 def test_a_mistyped_family_gets_a_suggestion() -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'ChainOfColors'"):
         task_spec("ChainOfColor")

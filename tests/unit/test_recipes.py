@@ -8,7 +8,7 @@ import pytest
 
 from vla_eval import shipped
 from vla_eval.decoding import decode, load_yaml
-from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
+from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError, VlaEvalError
 from vla_eval.job_queue import JobQueue
 from vla_eval.model_table import is_model_table, load_model_table
 from vla_eval.plan import fingerprint, make_plan, results_config
@@ -354,3 +354,102 @@ def test_every_task_has_its_instruction_in_the_paper_s_prompts() -> None:
     plan = make_plan(config(tasks=list(TASKS), episodes=1))
 
     assert all(job.group.instruction for job in plan.jobs)
+
+
+class TestBounds:
+    @pytest.mark.parametrize(
+        ("fields", "message"),
+        [
+            ({"seed_start": 2**32}, r"seed_start is 4294967296: .* at most 4294967295"),
+            ({"seed_start": 2**32 - 4, "episodes": 5}, r"the last of 5 seeds would be 4294967296"),
+            ({"episodes": 10**8}, r"episodes is 100000000, expected a number ≤ 1,000,000"),
+            ({"runs": 10**11}, r"runs is 100000000000, expected a number ≤ 1,000,000"),
+            ({"workers": 10**6}, "workers is 1000000, expected a number ≤ 1,024"),
+            ({"slots_per_worker": 10**9}, "slots_per_worker is 1000000000"),
+            ({"n_action_steps": [10**9]}, r"chunking\.n_action_steps is 1000000000"),
+            ({"chunking": {"delay_steps": 10**9}}, r"chunking\.delay_steps is 1000000000"),
+            ({"timeouts": {"step_seconds": 1e300}}, r"timeouts\.step_seconds is 1e\+300"),
+            ({"recording": {"video": 10**9}}, r"recording\.video is 1000000000"),
+            ({"recording": {"frame_stride": 10**9}}, r"recording\.frame_stride is 1000000000"),
+        ],
+    )
+    def test_a_number_that_no_run_can_have_is_refused(self, fields: dict[str, Any], message: str) -> None:
+        with pytest.raises(RecipeError, match=message):
+            config(**fields)
+
+    def test_the_last_seeds_that_generators_take_are_allowed(self) -> None:
+        assert config(seed_start=2**32 - 5, episodes=5).seed_start == 4_294_967_291
+
+    def test_a_plan_of_more_episodes_than_a_folder_may_hold_is_refused(self) -> None:
+        # 2 policies x 1000 runs x 1000 episodes
+        with pytest.raises(RecipeError, match=r"make 2000000 episodes, expected at most 1000000"):
+            make_plan(config(policies=["random", "hold"], runs=1000, episodes=1000))
+
+    @pytest.mark.parametrize(
+        ("path", "fields"),
+        [
+            ("chunking.ensemble_decay", {"chunking": {"ensemble_decay": float("nan")}}),
+            ("chunking.ensemble_decay", {"chunking": {"ensemble_decay": 10**400}}),
+            ("timeouts.step_seconds", {"timeouts": {"step_seconds": float("inf")}}),
+            ("env.range[1]", {"env": {"range": [0.1, float("-inf")]}}),
+        ],
+    )
+    def test_a_number_that_is_not_finite_is_refused(self, path: str, fields: dict[str, Any]) -> None:
+        with pytest.raises(RecipeError, match="expected a finite number") as caught:
+            config(**fields)
+        assert f"'{path}'" in str(caught.value)
+
+    def test_what_is_nested_without_end_is_refused(self) -> None:
+        nested: list[Any] = []
+        for _ in range(5000):
+            nested = [nested]
+
+        with pytest.raises(RecipeError, match="nested more than 50 deep"):
+            config(env={"a": nested})
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ("{checkpoint: 5}", r"policy 'own': args\.checkpoint is 5, expected the path of a folder"),
+        ("{checkpoint: x, base_checkpoint: [a]}", r"policy 'own': args\.base_checkpoint is \['a'\]"),
+        (f"{{checkpoint: {'x' * 5000}}}", "xxx: expected a LeRobot checkpoint .* found no such folder"),
+    ],
+)
+def test_a_checkpoint_that_can_be_no_folder_is_refused(tmp_path: Path, args: str, message: str) -> None:
+    recipe = tmp_path / "own.yaml"
+    recipe.write_text(f"version: 1\ndescription: d\nadapter: lerobot\nargs: {args}\n")
+
+    with pytest.raises(VlaEvalError, match=message):
+        make_plan(config(policies=[str(recipe)]))
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 5000 + ".yaml", "a\0b", "a\0b.yaml"])
+def test_what_can_be_no_path_is_an_unknown_policy(name: str) -> None:
+    with pytest.raises(UnknownNameError, match="there is no policies"):
+        make_plan(config(policies=[name]))
+
+
+class TestNames:
+    @pytest.mark.parametrize("name", ["=cmd", "-x", "+1", "@x", "a\nb", "...", " x"])
+    def test_a_recipe_whose_name_tables_could_not_hold_is_refused(self, tmp_path: Path, name: str) -> None:
+        recipe = tmp_path / f"{name}.yaml"
+        recipe.write_text("version: 1\ndescription: d\nadapter: random\n")
+
+        with pytest.raises(RecipeError, match="Rename the file"):
+            load_recipe("policies", str(recipe), PolicyRecipe)
+
+    def test_letters_of_any_language_are_letters(self, tmp_path: Path) -> None:
+        recipe = tmp_path / "мой policy, №2.yaml"
+        recipe.write_text("version: 1\ndescription: d\nadapter: random\n")
+
+        assert load_recipe("policies", str(recipe), PolicyRecipe).name == "мой policy, №2"
+
+
+def test_a_huge_file_is_no_recipe(tmp_path: Path) -> None:
+    recipe = tmp_path / "huge.yaml"
+    with recipe.open("wb") as file:
+        file.truncate(10**12)  # sparse
+
+    with pytest.raises(RecipeError, match=r"more than 1000000 characters"):
+        load_recipe("policies", str(recipe), PolicyRecipe)

@@ -68,6 +68,54 @@ def test_half_a_target_is_refused(adapter: str) -> None:
         check_adapter(adapter)
 
 
+@pytest.mark.parametrize(
+    "adapter",
+    [
+        "__main__:x",
+        "os:system",
+        "os.path:join",
+        "builtins:exec",
+        "subprocess:run",
+        "sys:exit",
+        "_io:open",
+    ],
+)
+def test_python_itself_holds_no_adapter(adapter: str) -> None:
+    for find in (check_adapter, policy_factory):
+        with pytest.raises(UnknownNameError, match="module of Python itself"):
+            find(adapter)
+
+
+@pytest.mark.parametrize(
+    "adapter", ["a b:c", "a/b:c", "../a:c", "a..b:c", ".a:c", "a:b:c", "a:b()", "a:\n", "1:2"]
+)
+def test_what_is_no_module_and_attribute_is_refused(adapter: str) -> None:
+    for find in (check_adapter, policy_factory):
+        with pytest.raises(UnknownNameError, match="expected 'module:attribute'"):
+            find(adapter)
+
+
+def test_what_takes_no_context_is_refused_and_not_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "odd_policies.py").write_text(
+        "called = []\n"
+        "def make(): called.append(1)\n"
+        "def named(*, context): called.append(1)\n"
+        "class Empty: ...\n"
+        "class Callable:\n    def __call__(self, context): called.append(1)\n"
+        "thing = Callable()\n"
+        "class Policy:\n    def __init__(self, context): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("make", "named", "Empty", "thing"):
+        with pytest.raises(UnknownNameError, match="is not a function that makes a policy"):
+            policy_factory(f"odd_policies:{name}")
+
+    assert policy_factory("odd_policies:Policy").__name__ == "Policy"
+    assert sys.modules["odd_policies"].called == []
+
+
 def test_a_missing_package_of_an_adapter_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "needy.py").write_text("import no_such_package\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -3,7 +3,10 @@
 import argparse
 from pathlib import Path
 
+from vla_eval.bounds import MAX_STEPS, check_bounds
+
 SYNTHETIC = "synthetic"
+MAX_REPEATS, MAX_SAMPLES = 1000, 1_000_000
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -25,6 +28,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print the table."""
+    bounds = {"n_action_steps": (1, MAX_STEPS), "repeats": (1, MAX_REPEATS), "samples": (1, MAX_SAMPLES)}
+    check_bounds(args, bounds, prefix="bench: ")
     return _loader(args) if args.loader else _rendering(args)
 
 

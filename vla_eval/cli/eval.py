@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
-from vla_eval.decoding import decode
+from vla_eval.decoding import decode, set_field
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.model_table import is_model_table
 from vla_eval.policies.recipe import policy_name
@@ -201,7 +201,8 @@ def _config(args: argparse.Namespace) -> EvalConfig:
         for kind in ("video", "rrd"):
             which = getattr(args, f"record_{kind}")
             if which is not None:
-                data.setdefault("recording", {})[kind] = _which(which, flag=f"--record-{kind}")
+                flag = f"--record-{kind}"
+                set_field(EvalConfig, data, f"recording.{kind}", _which(which, flag=flag), where=flag)
         apply_overrides(data, args.overrides, cls=EvalConfig)
 
     if args.config is not None:

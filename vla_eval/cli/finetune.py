@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 from vla_eval.cli.arguments import typed_command
-from vla_eval.decoding import decode
+from vla_eval.decoding import decode, set_field
 from vla_eval.errors import RecipeError
 from vla_eval.model_table import is_model_table
 from vla_eval.recipes import apply_overrides, load_recipe
@@ -93,15 +93,17 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
             data["policy"] = _one_policy(args.policy)
         if args.allow_unreplayed:
             data["allow_unreplayed"] = True
-        evaluation = {"every_steps": args.eval_every, "episodes": args.eval_episodes}
-        given = {name: value for name, value in evaluation.items() if value is not None}
-        if given:
-            data["evaluation"] = {**(data.get("evaluation") or {}), **given}
-        changes: dict[str, Any] = data.setdefault("finetune", {})
-        for name in ("steps", "batch_size", "base_checkpoint"):
-            if getattr(args, name) is not None:
-                changes[name] = getattr(args, name)
-        apply_overrides(changes, args.overrides, cls=FinetuneRecipe)
+        for path, value in (
+            ("evaluation.every_steps", args.eval_every),
+            ("evaluation.episodes", args.eval_episodes),
+            ("finetune.steps", args.steps),
+            ("finetune.batch_size", args.batch_size),
+            ("finetune.base_checkpoint", args.base_checkpoint),
+        ):
+            if value is not None:
+                set_field(FinetuneConfig, data, path, value, where="command line")
+        if isinstance(data.setdefault("finetune", {}), dict):  # anything else is refused when it is decoded
+            apply_overrides(data["finetune"], args.overrides, cls=FinetuneRecipe)
 
     if args.tasks is not None:
         raise RecipeError("--task is for a table of learned policies; otherwise the dataset says the task.")

@@ -10,9 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vla_eval.bounds import MAX_STEPS
 from vla_eval.core import FloatArray, StepResult
 from vla_eval.errors import RecipeError, SpecMismatchError
 
+MAX_CRF = 63  # of AV1; H.264 takes up to 51
 FPS = 20  # control steps per second; every frame is one control step
 
 CAMERA_KEYS = {"base_camera": "observation.images.base", "hand_camera": "observation.images.wrist"}
@@ -58,8 +60,11 @@ class EncoderSettings:
 
     def __post_init__(self) -> None:
         """Check the ranges; whether the codec knows the format is lerobot's to say."""
-        if self.crf < 0 or self.g < 1:
-            raise RecipeError(f"encoder: crf is {self.crf}, g is {self.g}; expected crf ≥ 0 and g ≥ 1.")
+        if not 0 <= self.crf <= MAX_CRF or not 1 <= self.g <= MAX_STEPS:
+            raise RecipeError(
+                f"encoder: crf is {self.crf}, g is {self.g}; expected crf ≥ 0 and g ≥ 1, crf ≤ {MAX_CRF} and "
+                f"g ≤ {MAX_STEPS}."
+            )
 
 
 def dataset_features(state: StateKind) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data

@@ -5,11 +5,13 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 from vla_eval.data.features import EncoderSettings, StateKind
 from vla_eval.envs.settings import RenderSettings, Simulator
 from vla_eval.errors import RecipeError
 from vla_eval.recipes import TimeoutConfig, check_run_name, to_data
 
+MAX_ACTION_NOISE = 10.0  # actions lie between -1 and 1: more is all noise
 EVALUATION_SEEDS = range(1, 101)
 """The default evaluation's seeds. No demonstration may show them: the policy would be tested on them."""
 
@@ -49,14 +51,18 @@ class DatasetRecipe:
         check_run_name(self.name)
         if not self.tasks or len(set(self.tasks)) != len(self.tasks):
             raise RecipeError(f"tasks is {list(self.tasks)}, expected at least one, none of them twice.")
-        for name in ("episodes", "episodes_per_shard"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1.")
-        for name in ("seed_start", "steps_after_success", "action_noise", "max_failed_seeds"):
-            if getattr(self, name) < 0:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 0.")
-        if self.workers != "auto" and self.workers < 1:
-            raise RecipeError(f"workers is {self.workers}, expected 'auto' or a number ≥ 1.")
+        check_bounds(
+            self,
+            {
+                "episodes": (1, MAX_EPISODES),
+                "episodes_per_shard": (1, MAX_EPISODES),
+                "steps_after_success": (0, MAX_STEPS),
+                "action_noise": (0, MAX_ACTION_NOISE),
+                "max_failed_seeds": (0, MAX_EPISODES),
+                "workers": (1, MAX_PROCESSES),
+            },
+        )
+        check_seeds(self.seed_start, self.episodes + self.max_failed_seeds)
         self._refuse_evaluation_seeds()
 
     @property

@@ -8,7 +8,7 @@ from vla_eval.data.recording_jobs import TaskPlan
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.plan import Group, GroupKey
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes
-from vla_eval.prompts import instruction_for, load_prompts
+from vla_eval.prompts import load_prompts, sentences_of
 from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe
 from vla_eval.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
@@ -44,8 +44,9 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)
+    specs = [task_spec(task) for task in recipe.tasks]
     return RecordingPlan(
-        tasks=tuple(_task_plan(recipe, expert, task_spec(task)) for task in recipe.tasks),
+        tasks=tuple(_task_plan(recipe, expert, spec, sentences_of(prompts, spec)[0]) for spec in specs),
         recipe_files={
             f"policies/{expert.name}": expert.sha256,
             f"prompts/{prompts.name}": prompts.sha256,
@@ -54,7 +55,9 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
     )
 
 
-def _task_plan(recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec) -> TaskPlan:
+def _task_plan(
+    recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec, instruction: str
+) -> TaskPlan:
     check_arguments(spec, recipe.env, TASKS.values())
     return TaskPlan(
         group=Group(
@@ -69,7 +72,7 @@ def _task_plan(recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSp
                 stop_at_success=recipe.cut == "after_success",
                 steps_after_success=recipe.steps_after_success,
             ),
-            instruction=instruction_for(spec, recipe.prompt_set),
+            instruction=instruction,
         ),
         task_version=spec.version,
         expert_version=expert.value.version,

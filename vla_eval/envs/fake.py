@@ -22,11 +22,11 @@ from vla_eval.core import (
     TaskStatus,
 )
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
-from vla_eval.errors import check_names
+from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
-from vla_eval.tasks.families import check_arguments
+from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
@@ -41,6 +41,7 @@ STATIC_ACTION = 0.2  # below it in each dimension the point counts as at rest
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
+MAX_ITEMS = 100
 CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5}
 SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75)}
@@ -101,6 +102,10 @@ class FakeEnv:
         known = ("horizon_steps", *defaults)
         check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
+        for name, value in settings.kwargs.items():
+            hint = tuple[float, ...] if name == "velocity_range_m_s" else int
+            check_argument(hint, value, name=name, task=task.id)
+        _check_ranges(arguments, where=task.id)
         self._n_items: int = arguments.get("n_items", 0)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
         self._in_order = task.memory == "sequential"
@@ -290,6 +295,17 @@ def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of
         return BALL_DEFAULTS
     several = "n_shown" in (*task.kwargs, *task.open_arguments)
     return SEVERAL_DEFAULTS if several else CHOICE_DEFAULTS
+
+
+def _check_ranges(arguments: Mapping[str, Any], *, where: str) -> None:  # Any: as above
+    n_items, n_shown = arguments.get("n_items", 1), arguments.get("n_shown", 1)
+    if not 1 <= n_shown <= n_items <= MAX_ITEMS:
+        raise TaskArgumentError(
+            f"{where}: n_items={n_items}, n_shown={n_shown}: expected 1 ≤ n_shown ≤ n_items ≤ {MAX_ITEMS}."
+        )
+    speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
+    if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
+        raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")
 
 
 def _only(targets: tuple[int, ...]) -> int | None:

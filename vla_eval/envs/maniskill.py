@@ -8,7 +8,7 @@ vectorised environment in which slots that are not asked to act hold still. Mani
 import gc
 import inspect
 from collections.abc import Mapping
-from typing import Any  # ManiSkill is untyped: its environments and infos are Any here
+from typing import Any, get_type_hints  # ManiSkill is untyped: its environments and infos are Any here
 
 import numpy as np
 import sapien
@@ -29,7 +29,7 @@ from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.arms import CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
-from vla_eval.tasks.families import check_arguments
+from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
@@ -83,7 +83,7 @@ class ManiSkillEnv:
         check_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
-        _check_arguments(env_class(row), kwargs, row.id)
+        _check_arguments(env_class(row), kwargs, row.id, given=settings.kwargs)
         check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
         self._settings = settings
         self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
@@ -254,17 +254,25 @@ def states(arm: Arm, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]
     return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
-def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str) -> None:
-    """Raise unless every argument is one of the task's own (not of ManiSkill's base class)."""
-    known: set[str] = {"horizon_steps"}
-    for ancestor in cls.__mro__:
+def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: Mapping[str, Any]) -> None:
+    """Raise unless every argument is one of the task's own (not of ManiSkill's base class), and of its type.
+
+    Types are checked of what the user gave.
+    """
+    known: dict[str, Any] = {"horizon_steps": int}  # Any: type annotations
+    for ancestor in reversed(cls.__mro__):
         if issubclass(ancestor, MemoryTableEnv):
             parameters = inspect.signature(ancestor.__init__).parameters.values()
-            known |= {p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY}
-    # The sentence is chosen by the prompt set; and an episode that depends on those before it is nothing
-    # to ask for.
-    known -= {"instruction", "reconfiguration_freq"}
+            hints = get_type_hints(ancestor.__init__)
+            own = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
+            known.update({name: hints[name] for name in own})
+    # The sentence is chosen by the prompt set; an episode that depends on those before it is nothing to ask
+    # for; and a task makes its items itself.
+    for name in ("instruction", "reconfiguration_freq", "items"):
+        known.pop(name, None)
     check_names("argument", kwargs, known, where=task)
+    for name, value in given.items():
+        check_argument(known[name], value, name=name, task=task)
 
 
 def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> int:

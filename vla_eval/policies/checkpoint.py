@@ -6,6 +6,7 @@ Standard library only: planning an evaluation must not wait for torch. Knows not
 import dataclasses
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -81,17 +82,18 @@ def find_checkpoint(path: Path) -> Path:
     if path.name == str(path):
         places += [folder / path for folder in search_folders(SHIPPED_FOLDER)]
     for folder in (place / inside for place in places for inside in INSIDE):
-        if (folder / CONFIG_FILE).is_file() and weights_file(folder) is not None:
+        # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+        if os.path.isfile(folder / CONFIG_FILE) and weights_file(folder) is not None:
             return folder
-    if not path.is_dir():
+    if not os.path.isdir(path):
         found = "no such folder"
     else:
         names = sorted(entry.name for entry in path.iterdir())
         found = ", ".join(names[:8]) or "an empty folder"
     raise CheckpointError(
-        f"{path}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder that "
-        f"holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) are "
-        f"never loaded: convert them to safetensors.{did_you_mean(str(path), list_checkpoints())}"
+        f"{path!s:.300}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder "
+        f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) "
+        f"are never loaded: convert them to safetensors.{did_you_mean(str(path), list_checkpoints())}"
     )
 
 
@@ -114,7 +116,8 @@ def checkpoint_name(path: Path) -> str:
     folder = find_checkpoint(path).resolve()
     parts = [part for part in folder.parts if part not in (MODEL_FOLDER, "checkpoints", "train", "/")]
     named = parts[-2:] if parts and parts[-1].isdigit() else parts[-1:]
-    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(named)) or "checkpoint"
+    name = re.sub(r"[^A-Za-z0-9._-]", "_", "-".join(named))
+    return name.lstrip("-.") or "checkpoint"  # a spreadsheet takes -x for a formula
 
 
 def checkpoint_sha256(path: Path) -> str:

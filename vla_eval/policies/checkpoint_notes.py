@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any  # JSON of another program
 
-from vla_eval.errors import CheckpointError
+from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
@@ -49,7 +49,13 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 
     Raises:
         CheckpointError: the weights are not there.
+        RecipeError: an argument that names a folder is no text.
     """
+    for name in ("checkpoint", "base_checkpoint"):
+        if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
+            raise RecipeError(
+                f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
+            )
     checkpoint = args.get("checkpoint")
     if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
         return {}

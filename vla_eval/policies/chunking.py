@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from vla_eval.bounds import MAX_STEPS, check_bounds
 from vla_eval.core import ActionChunk, FloatArray
 from vla_eval.errors import RecipeError, SpecMismatchError
 
@@ -43,6 +44,8 @@ class ChunkingSpec:
         for name, least in (("n_action_steps", 1), ("delay_steps", 0), ("ensemble_decay", 0)):
             if getattr(self, name) < least:
                 raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ {least}.")
+        bounds = {"n_action_steps": (1, MAX_STEPS), "delay_steps": (0, MAX_STEPS)}
+        check_bounds(self, bounds, prefix="chunking.")
 
     @property
     def n_skipped(self) -> int:

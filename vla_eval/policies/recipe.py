@@ -3,6 +3,7 @@
 Knows nothing of models: a folder is looked at, never loaded.
 """
 
+import os
 from pathlib import Path
 
 from vla_eval.policies.checkpoint import (
@@ -67,4 +68,5 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
 
 def is_folder(name: str) -> bool:
     """Whether the user means a folder: recipes come first where there is one of that name."""
-    return Path(name).is_dir() and name not in list_recipes("policies")
+    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    return os.path.isdir(name) and name not in list_recipes("policies")

@@ -4,10 +4,13 @@
 of its rows; knows nothing of simulators.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
-from vla_eval.errors import TaskArgumentError
+from vla_eval.bounds import MAX_STEPS
+from vla_eval.decoding import check_value
+from vla_eval.errors import RecipeError, TaskArgumentError
 from vla_eval.tasks.spec import TaskSpec
 
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
@@ -88,17 +91,17 @@ def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
     )
 
 
-def check_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[TaskSpec]) -> None:
-    """Raise what can be said of a task's arguments by their names, without a simulator.
+def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
+    """Raise what can be said of a task's arguments without a simulator: by their names, and of durations.
 
     Args:
         spec: a row of the catalogue, or a family.
-        given: names of the user's arguments.
+        given: the user's arguments.
         rows: the catalogue, for the message.
 
     Raises:
         TaskArgumentError: an argument without which it is not known which task is meant; or one for tasks
-            with candidates, and this one has none.
+            with candidates, and this one has none; or a duration that is no number of control steps.
     """
     missing = [name for name in spec.open_arguments if name not in given]
     if missing:
@@ -114,3 +117,25 @@ def check_arguments(spec: TaskSpec, given: Collection[str], rows: Iterable[TaskS
             f"{', '.join(of_choices)}: {spec.id}: there are no candidates to choose among. Use this task "
             f"without it, in a run of its own."
         )
+    for name, value in given.items():
+        if name.endswith("_steps"):
+            _check_steps(name, value, task=spec.id)
+
+
+def check_argument(hint: Any, value: object, *, name: str, task: str) -> None:  # Any: a type annotation
+    """Raise `TaskArgumentError` unless an argument is of the type that the task declares for it."""
+    try:
+        check_value(hint, value, path=name)
+    except RecipeError as exc:
+        raise TaskArgumentError(f"{task}: {exc}") from exc
+
+
+def _check_steps(name: str, value: object, *, task: str) -> None:
+    """Raise unless this is a number of control steps, or a pair of them."""
+    least = 1 if name == "horizon_steps" else 0
+    for steps in value if isinstance(value, list | tuple) else (value,):
+        if not isinstance(steps, int) or isinstance(steps, bool) or not least <= steps <= MAX_STEPS:
+            raise TaskArgumentError(
+                f"{task}: {name}={value!r:.80}: expected a whole number of control steps, {least} to "
+                f"{MAX_STEPS}, or, where a duration may be drawn, a pair of them."
+            )

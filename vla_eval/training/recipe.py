@@ -7,8 +7,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from vla_eval.bounds import (
+    MAX_BATCH,
+    MAX_EPISODES,
+    MAX_PROCESSES,
+    MAX_SLOTS,
+    MAX_STEPS,
+    MAX_TRAINING_STEPS,
+    check_bounds,
+    check_seeds,
+)
 from vla_eval.envs.settings import Simulator
 from vla_eval.errors import RecipeError
+
+MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +42,8 @@ class LoraRecipe:
     full_modules: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what names no modules."""
+        """Check the ranges, and refuse what names no modules."""
+        check_bounds(self, {"rank": (1, MAX_RANK), "alpha": (1, MAX_RANK)}, prefix="finetune.lora.")
         if self.target_modules == "all-linear":
             raise RecipeError(
                 "finetune.lora.target_modules is 'all-linear', which takes heads and embeddings of a policy, "
@@ -83,16 +96,22 @@ class FinetuneRecipe:
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
-        for name in ("steps", "batch_size", "save_every_steps", "log_every_steps"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"finetune.{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        check_bounds(
+            self,
+            {
+                "steps": (1, MAX_TRAINING_STEPS),
+                "batch_size": (1, MAX_BATCH),
+                "save_every_steps": (1, MAX_TRAINING_STEPS),
+                "log_every_steps": (1, MAX_TRAINING_STEPS),
+                "num_workers": (0, MAX_PROCESSES),
+            },
+            prefix="finetune.",
+        )
         if self.micro_batch_size is not None and not 1 <= self.micro_batch_size <= self.batch_size:
             raise RecipeError(
                 f"finetune.micro_batch_size is {self.micro_batch_size}, expected a number from 1 to "
                 f"batch_size ({self.batch_size}), or null."
             )
-        if self.num_workers < 0:
-            raise RecipeError(f"finetune.num_workers is {self.num_workers}, expected a number ≥ 0.")
         if self.lora is not None and self.base_checkpoint is None:
             raise RecipeError(
                 "finetune.lora: adapters are trained on top of a base; name its folder with "
@@ -130,9 +149,18 @@ class HeldOutEvaluation:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("every_steps", "episodes", "slots_per_worker"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"evaluation.{name} is {getattr(self, name)}, expected a number ≥ 1.")
+        check_bounds(
+            self,
+            {
+                "every_steps": (1, MAX_TRAINING_STEPS),
+                "episodes": (1, MAX_EPISODES),
+                "n_action_steps": (1, MAX_STEPS),
+                "slots_per_worker": (1, MAX_SLOTS),
+                "workers": (1, MAX_PROCESSES),
+            },
+            prefix="evaluation.",
+        )
+        check_seeds(self.seed_start, self.episodes, name="evaluation.seed_start")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +186,10 @@ class FinetuneConfig:
     device: str = "auto"
     evaluation: HeldOutEvaluation | None = None
     allow_unreplayed: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the range of the seed."""
+        check_seeds(self.run_seed, name="run_seed")
 
 
 def merge_fields(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data

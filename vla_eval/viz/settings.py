@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from vla_eval.bounds import MAX_EPISODES, MAX_STEPS, check_bounds
 from vla_eval.errors import RecipeError
 
 Outcomes = Literal["none", "all", "failures", "successes"]
@@ -26,14 +27,13 @@ class RecordingConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.frame_stride < 1:
-            raise RecipeError(f"recording.frame_stride is {self.frame_stride}, expected a number ≥ 1.")
+        check_bounds(self, {"frame_stride": (1, MAX_STEPS)}, prefix="recording.")
         for name in ("video", "rrd"):
             which = getattr(self, name)
-            if isinstance(which, int) and which < 1:
+            if isinstance(which, int) and not 1 <= which <= MAX_EPISODES:
                 raise RecipeError(
                     f"recording.{name} is {which}, expected 'none', 'all', 'failures', 'successes' or a "
-                    f"number of episodes ≥ 1."
+                    f"number of episodes from 1 to {MAX_EPISODES}."
                 )
 
     @property

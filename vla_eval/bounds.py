@@ -1,0 +1,50 @@
+"""How large the numbers of a recipe may be. Knows nothing of what they mean.
+
+The upper bounds lie far above what anyone needs. They turn a slip of the pen into a message, where it would
+otherwise fill the memory, or fail in every episode after the start.
+"""
+
+from collections.abc import Mapping
+
+from vla_eval.errors import RecipeError
+
+MAX_SEED = 2**32 - 1  # of numpy's `RandomState`, from which ManiSkill takes its generators
+MAX_EPISODES = 1_000_000  # in one run folder: its plan and its records are held in memory
+MAX_PROCESSES = 1024
+MAX_SLOTS = 16_384  # of one worker; on a GPU, ManiSkill simulates some thousands side by side
+MAX_STEPS = 10_000  # control steps of anything: 500 s
+MAX_SECONDS = 7 * 24 * 3600.0
+MAX_TRAINING_STEPS = 1_000_000_000
+MAX_BATCH = 1_000_000
+
+Bounds = tuple[float, float]
+"""(least, most), both allowed."""
+
+
+def check_bounds(recipe: object, bounds: Mapping[str, Bounds], *, prefix: str = "") -> None:
+    """Raise `RecipeError` unless the numbers in these attributes are within their bounds.
+
+    Args:
+        recipe: the object; attributes that are None or a word are passed over.
+        bounds: attribute -> (least, most).
+        prefix: what stands before the attributes' names in the message: `finetune.`.
+    """
+    for name, (least, most) in bounds.items():
+        value = getattr(recipe, name)
+        for number in value if isinstance(value, tuple | list) else (value,):
+            if number is None or isinstance(number, str):
+                continue
+            if not least <= number <= most:
+                expected = f"≥ {least:g}" if number < least else f"≤ {most:,}"
+                raise RecipeError(f"{prefix}{name} is {number}, expected a number {expected}.")
+
+
+def check_seeds(first: int, count: int = 1, *, name: str = "seed_start") -> None:
+    """Raise `RecipeError` unless `count` seeds from `first` on are seeds that generators take."""
+    if first < 0:
+        raise RecipeError(f"{name} is {first}, expected a number ≥ 0.")
+    if first + count - 1 > MAX_SEED:
+        raise RecipeError(
+            f"{name} is {first}: the last of {count} seeds would be {first + count - 1}, expected at most "
+            f"{MAX_SEED}, the largest seed that numpy and ManiSkill take."
+        )
