@@ -1,4 +1,4 @@
-"""Write a checkpoint in lerobot's form, which appears whole or not at all."""
+"""Checkpoints in lerobot's form: each appears whole or not at all, and is read with a message if damaged."""
 
 import os
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any  # lerobot and accelerate are untyped
 from accelerate.utils import DistributedType
 from lerobot.common import train_utils
 
+from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
 from vla_eval.policies.lerobot_processors import save_tokenizers
 from vla_eval.training.job import TrainingJob
@@ -49,6 +50,21 @@ def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[
     os.replace(partial, folder)
     point(folder.parent / LAST, folder.name)
     return folder
+
+
+def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: bool) -> None:
+    """Load the state of a training, which is safetensors and JSON, and that of the random generators.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
+    try:
+        train_utils.load_training_state(folder, optimizer, scheduler, load_optimizer=load_optimizer)
+    except Exception as exc:  # lerobot, torch and safetensors raise what they like
+        raise TrainingError(
+            f"{folder}: the state of the training cannot be read ({exc!r:.300}). Remove this checkpoint's "
+            "folder to go on from the one before it, or use another --out."
+        ) from exc
 
 
 def _sync(folder: Path) -> None:

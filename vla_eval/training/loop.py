@@ -25,7 +25,6 @@ from lerobot.common.train_utils import (
     load_fsdp_optimizer_state,
     load_training_batch_size,
     load_training_num_processes,
-    load_training_state,
 )
 from lerobot.common.wandb_utils import WandBLogger
 from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
@@ -38,7 +37,7 @@ from tqdm import tqdm
 
 from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.errors import TrainingError
-from vla_eval.training.checkpoints import write_checkpoint
+from vla_eval.training.checkpoints import load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
@@ -124,7 +123,7 @@ class _Training:
         optimizer, scheduler = make_optimizer_and_scheduler(self.config, model)
         is_sharded = accelerator.distributed_type == DistributedType.FSDP
         if job.resume_from is not None:
-            load_training_state(job.resume_from, optimizer, scheduler, load_optimizer=not is_sharded)
+            load_state(job.resume_from, optimizer, scheduler, load_optimizer=not is_sharded)
         loader = _loader(job, self.config, dataset, accelerator)
         prepared = accelerator.prepare(model, optimizer, loader, scheduler)
         self.policy, self.optimizer, loader, self.scheduler = prepared

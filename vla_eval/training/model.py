@@ -21,7 +21,7 @@ from vla_eval.policies.lerobot_loading import (
     fill_policy,
     raise_plainly,
 )
-from vla_eval.policies.lerobot_processors import checked_steps, tokenizer_overrides
+from vla_eval.policies.lerobot_processors import step_names, tokenizer_overrides
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.lora import check_adapters, peft_config
@@ -122,10 +122,10 @@ def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[
             "action_names": getattr(job.policy, "action_feature_names", None),
         }
         after["absolute_actions_processor"] = {"enabled": True}
-    steps = checked_steps(folder / PREPROCESSOR_FILE)
+    steps = step_names(folder / PREPROCESSOR_FILE)
     before |= tokenizer_overrides(folder, job.policy, steps, tokenizer=job.recipe.tokenizer)
     _address_ours(before, steps, "normalizer_processor", ENCODER_STEP, job.policy)
-    steps = checked_steps(folder / POSTPROCESSOR_FILE)
+    steps = step_names(folder / POSTPROCESSOR_FILE)
     _address_ours(after, steps, "unnormalizer_processor", DECODER_STEP, job.policy)
     return {"preprocessor_overrides": before, "postprocessor_overrides": after}
 

@@ -85,6 +85,12 @@ def cut_depth(depth: Tensor, picture_px: int) -> Tensor:
 
 def zoe_depth(sizes: NetworkSizes) -> Any:
     """Return transformers' ZoeDepth with random weights."""
+    model: Any = ZoeDepthForDepthEstimation
+    return model(zoe_config(sizes))
+
+
+def zoe_config(sizes: NetworkSizes) -> Any:
+    """Return transformers' configuration of it."""
     make_eye: Any = BeitConfig
     eye = make_eye(
         image_size=sizes.depth_px,
@@ -97,7 +103,7 @@ def zoe_depth(sizes: NetworkSizes) -> Any:
         out_features=[f"stage{sizes.depth_layers * quarter // 4}" for quarter in (1, 2, 3, 4)],
     )
     make: Any = ZoeDepthConfig
-    config = make(
+    return make(
         backbone_config=eye,
         neck_hidden_sizes=[sizes.depth_neck // share for share in NECK_SHARES],
         fusion_hidden_size=sizes.depth_fusion,
@@ -110,5 +116,3 @@ def zoe_depth(sizes: NetworkSizes) -> Any:
         ],
         **ROUTER,
     )
-    model: Any = ZoeDepthForDepthEstimation
-    return model(config)
