@@ -9,6 +9,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 from unittest.mock import patch
 from urllib.error import URLError
 
+import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 
 from vla_eval.errors import RecipeError, TrainingError
@@ -110,7 +111,7 @@ def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[
     if stats is not None:
         normalizer["stats"] = unnormalizer["stats"] = stats
     before: dict[str, Any] = {
-        "device_processor": {"device": job.device},
+        "device_processor": {"device": torch.device(job.device).type},  # of each process its own
         "normalizer_processor": normalizer,
         "rename_observations_processor": {"rename_map": job.recipe.rename_cameras},
     }
