@@ -18,7 +18,8 @@ from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.recipes import PolicyRecipe, list_recipes, load_recipe
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.description import describe_model
-from vla_eval.training.finetune import finetune, load_finetune_recipe
+from vla_eval.training.finetune import finetune
+from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
 from vla_eval.training.recipe import FinetuneConfig
 from vla_eval.training.tiny_models import TINY_POLICY, Family, tiny_paligemma

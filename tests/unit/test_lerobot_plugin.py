@@ -16,12 +16,15 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
 from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors.torch import load_file
 
+from tests.unit import tiny_trainings
 from vla_eval.data.features import dataset_features, proprioception
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.lerobot_plugin import MikasaEnvConfig, MikasaGym
+from vla_eval.training.finetune import finetune
 
 TASK = "RememberColor3-v0"
 PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_env_mikasa"
@@ -197,3 +200,21 @@ class TestCommands:
         self.run("lerobot_train", arguments, monkeypatch)
         assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
         assert list(out.glob("eval/videos_step_*/**/*.mp4"))
+
+    @pytest.mark.usefixtures("small_act")
+    def test_lerobot_train_goes_on_from_a_checkpoint_of_ours(
+        self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        checkpoint = finetune(tiny_trainings.act(recorded, tmp_path / "run", steps=2)).checkpoint
+        config = checkpoint.resolve() / "train_config.json"
+        self.run("lerobot_train", [f"--config_path={config}", "--resume=true", "--steps=3"], monkeypatch)
+        (later,) = (tmp_path / "run").glob("train/checkpoints/000003")
+        assert json.loads((later / "training_state/training_step.json").read_text())["step"] == 3
+        before, after = (
+            load_file(folder / "pretrained_model/model.safetensors") for folder in (config.parents[1], later)
+        )
+        assert before.keys() == after.keys()
+        # One step of AdamW moves a weight by about the learning rate, 1e-5: it did not start from scratch.
+        moved = [float((after[name] - before[name]).abs().max()) for name in before]
+        assert 0 < max(moved) < 1e-4

@@ -10,7 +10,7 @@ from accelerate import Accelerator
 
 from vla_eval.errors import RecipeError, TrainingError
 from vla_eval.training.finetune import finetune
-from vla_eval.training.micro_batches import InMicroBatches
+from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
 
@@ -51,8 +51,7 @@ def test_the_gradient_and_the_loss_are_those_of_the_whole_batch(size: int, accel
     policy.zero_grad()
     policy.seen.clear()
 
-    loss, _ = InMicroBatches(policy, accelerator, size).forward(batch)
-    loss.backward()
+    loss = add_gradient(policy, batch, accelerator, size=size).value
 
     assert loss.item() == pytest.approx(whole.item(), rel=1e-12)
     torch.testing.assert_close(policy.layer.weight.grad, expected, rtol=1e-12, atol=1e-15)
@@ -63,24 +62,28 @@ def test_the_gradient_and_the_loss_are_those_of_the_whole_batch(size: int, accel
 def test_what_the_policy_tells_is_averaged_over_samples(accelerator: Accelerator) -> None:
     policy, batch = Linear(), batch_of(3)
     errors = (policy.layer(batch["state"]) - batch["action"]).square().mean(dim=1)
-    _, told = InMicroBatches(policy, accelerator, 2).forward(batch)
+    told = add_gradient(policy, batch, accelerator, size=2).parts
     errors = errors.detach()
     assert told["largest"] == pytest.approx(float(errors[:2].max() * 2 / 3 + errors[2] / 3))
     assert told["head"] == "l2"
 
 
-def test_everything_else_is_the_policys_own(accelerator: Accelerator) -> None:
+def test_the_forward_pass_alone_is_under_autocast(accelerator: Accelerator) -> None:
     policy = Linear()
-    divided = InMicroBatches(policy, accelerator, 2)
-    assert list(divided.parameters()) == list(policy.parameters())
-    divided.train()
-    assert policy.training
+    during: list[tuple[str, bool]] = []
+    for register, name in (
+        (policy.layer.register_forward_hook, "forward"),
+        (policy.layer.weight.register_hook, "backward"),
+    ):
+        register(lambda *_, name=name: during.append((name, torch.is_autocast_enabled("cpu"))))
+    add_gradient(policy, batch_of(4), accelerator, size=2, autocast=torch.bfloat16)
+    assert during == [("forward", True), ("backward", False)] * 2
 
 
 def test_a_field_that_cannot_be_divided_is_named(accelerator: Accelerator) -> None:
     batch = {**batch_of(4), "mask": torch.ones(7)}
     with pytest.raises(TrainingError, match="'mask' has 7 entries, expected one for each of 4 samples"):
-        InMicroBatches(Linear(), accelerator, 2).forward(batch)
+        add_gradient(Linear(), batch, accelerator, size=2)
 
 
 @pytest.mark.parametrize("size", [0, 9])

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -17,6 +18,7 @@ from vla_eval.policies.openvla.network import OpenVLANetwork
 from vla_eval.policies.spatialvla import ego3d
 from vla_eval.policies.spatialvla.network import SpatialVLANetwork
 from vla_eval.training.finetune import finetune
+from vla_eval.training.loop import autocast_dtype
 from vla_eval.training.recipe import FinetuneConfig
 
 ONE_STEP = {"steps": 1, "batch_size": 2, "save_every_steps": 1, "log_every_steps": 1, "num_workers": 0}
@@ -171,3 +173,21 @@ def test_the_fastest_column_turns_by_128_radians_in_two_metres() -> None:
     columns = position_columns(torch.tensor([[2.0, 0.0, 2.0] * 4], dtype=torch.float64))
     assert columns.shape == (1, 204)
     assert float(columns[0, 8]) == pytest.approx(math.sin(128))
+
+
+@pytest.mark.parametrize(
+    ("fields", "launched", "expected"),
+    [
+        ({"dtype": "bfloat16"}, "", torch.bfloat16),
+        ({"dtype": "float32", "use_amp": True}, "bf16", None),
+        ({"use_amp": True}, "", torch.bfloat16),  # torch's own choice on a CPU
+        ({"use_amp": False}, "bf16", torch.bfloat16),
+        ({"use_amp": False}, "no", None),
+        ({"use_amp": False}, "", None),
+    ],
+)
+def test_the_recipe_says_the_precision_and_else_accelerates_launcher(
+    monkeypatch: pytest.MonkeyPatch, fields: dict[str, Any], launched: str, expected: Any
+) -> None:
+    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", launched)
+    assert autocast_dtype(SimpleNamespace(**fields), "cpu") == expected

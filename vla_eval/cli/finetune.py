@@ -12,7 +12,7 @@ from vla_eval.model_table import is_model_table
 from vla_eval.recipes import apply_overrides, load_recipe
 from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
-DESCRIPTION = """Train a policy on a dataset: lerobot's training loop, the recipe in policies/NAME.yaml.
+DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 
 CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `evaluation`; or name
 --policy and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's

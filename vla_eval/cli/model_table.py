@@ -146,7 +146,7 @@ def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> No
 def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
     """Find now what would otherwise stop the work after days: datasets and bases that are not there."""
     from vla_eval.policies.checkpoint import find_checkpoint
-    from vla_eval.training.finetune import load_finetune_recipe
+    from vla_eval.training.job import load_finetune_recipe
 
     missing = [one.config.dataset for one in ahead if not Path(one.config.dataset).is_dir()]
     if missing:
@@ -165,7 +165,7 @@ def _unfinished(work: _Work) -> list[Finetuning]:
 
 
 def _is_finished(one: Finetuning) -> bool:
-    from vla_eval.training.finetune import load_finetune_recipe
+    from vla_eval.training.job import load_finetune_recipe
     from vla_eval.training.run_folder import whole_checkpoints
 
     whole = whole_checkpoints(Path(str(one.config.out)))

@@ -1,1 +1,1 @@
-"""Fine-tuning: a recipe and a dataset go into lerobot's own training loop."""
+"""Fine-tuning: a recipe and a dataset become one `TrainingJob`, which `train` brings to its last step."""

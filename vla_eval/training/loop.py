@@ -1,238 +1,183 @@
-"""lerobot's own training loop, with some of the names it calls replaced while it runs.
+"""The training loop: gradient steps, checkpoints, metrics. Knows nothing of run folders or of who listens.
 
-lerobot 0.6.1 has no place to hook into, so names of its module are replaced (the version is pinned, and
-a test notices if one is gone):
-
-- `make_policy`: weights of a base are loaded strictly, never by the loaders that swallow errors.
-- `make_pre_post_processors`: those of a base or of a checkpoint get the tokenizer that lies on this machine.
-- `make_optimizer_and_scheduler`: what is about to be trained is reported.
-- `make_train_eval_datasets`: optionally, frames are decoded once and not per sample.
-- `update_policy`: all noise of a step is drawn from (run seed, step, process), so that a run that was
-  killed goes on exactly as it would have; a batch may go through the network in parts; metrics are
-  written.
-- `load_training_state`: a damaged state is an error that says what to do; it is safetensors and JSON.
-- `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on; it is
-  then shown to whoever evaluates it.
+It is written on accelerate and on what lerobot offers to others: its factories, its sampler, its form of a
+checkpoint, so that `lerobot-train --resume` goes on from ours. All noise of a step is drawn from (run seed,
+step, process): a run that was killed goes on exactly as it would have.
 """
 
 import contextlib
-import importlib
-import json
 import logging
+import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any  # lerobot is untyped
-from unittest.mock import patch
-from urllib.error import URLError
+from pprint import pformat
+from typing import Any  # lerobot and accelerate are untyped
 
 import numpy as np
-from accelerate.state import AcceleratorState
+import torch
+from accelerate import Accelerator
+from accelerate.utils import DistributedDataParallelKwargs, DistributedType
+from lerobot.common.train_utils import (
+    load_fsdp_optimizer_state,
+    load_training_batch_size,
+    load_training_num_processes,
+)
+from lerobot.common.wandb_utils import WandBLogger
+from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
+from lerobot.datasets.factory import make_dataset
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.random_utils import set_seed
+from lerobot.utils.utils import cycle, has_method, init_logging
+from tqdm import tqdm
 
 from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.errors import TrainingError
-from vla_eval.policies.checkpoint import (
-    MODEL_FOLDER,
-    POSTPROCESSOR_FILE,
-    PREPROCESSOR_FILE,
-    TrainingFacts,
-    write_facts,
-)
-from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy, raise_plainly
-from vla_eval.policies.lerobot_processors import save_tokenizers, step_names, tokenizer_overrides
-from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
-from vla_eval.training.micro_batches import InMicroBatches
+from vla_eval.training.checkpoints import load_state, write_checkpoint
+from vla_eval.training.job import TrainingJob, lerobot_config
+from vla_eval.training.metrics import append_metrics, new_tracker, next_line
+from vla_eval.training.micro_batches import add_gradient
+from vla_eval.training.model import local_files_only, make_model, make_processors
+from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE
 
-PARTIAL_PREFIX = ".partial-"
-REPLACED = (
-    "make_policy",
-    "make_pre_post_processors",
-    "make_optimizer_and_scheduler",
-    "make_train_eval_datasets",
-    "update_policy",
-    "load_training_state",
-    "save_checkpoint",
-    "init_logging",
-    "inside_slurm",
-)
+MAX_UINT8 = 255.0
+LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
+LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopHooks:
-    """What is to happen at the replaced places.
+class Listeners:
+    """Who is told of a training.
 
     Attributes:
-        facts: written beside each checkpoint's weights.
-        metrics_file: one line of JSON per logged step.
-        log_file: what lerobot says of itself, warnings apart, which go to standard error, too.
-        log_every_steps: how often.
-        run_seed: of all noise.
-        weights: folder of the weights to start from; None: from scratch.
-        cast: whether the weights' precision may differ from the model's.
-        begins_from_base: whether they are a base's, which need not have what fine-tuning begins anew.
-        decode_ahead, tokenizer: see `FinetuneRecipe`.
-        whole_episodes: see `MemoryDataset`.
-        micro_batch_size: see `FinetuneRecipe`.
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
     """
 
-    facts: TrainingFacts
-    metrics_file: Path
-    log_file: Path
-    log_every_steps: int
-    run_seed: int
-    weights: Path | None
-    cast: bool
-    begins_from_base: bool
-    decode_ahead: bool
-    whole_episodes: bool
-    micro_batch_size: int | None
-    tokenizer: str | None
     on_model: Callable[[Any], None]
     on_metrics: Callable[[Mapping[str, float]], None]
     on_checkpoint: Callable[[Path], None]
 
 
-def run_loop(config: Any, hooks: LoopHooks, *, resume_from: Path | None) -> None:
-    """Train.
+def train(job: TrainingJob, listeners: Listeners) -> None:
+    """Train to the job's last step; one that has got there is left alone.
 
-    Args:
-        config: lerobot's `TrainPipelineConfig`.
-        hooks: see there.
-        resume_from: folder of a checkpoint (`…/000100`) to go on from.
+    Raises:
+        TrainingError: the loss is not finite, or the model does not fit the job.
     """
-    module: Any = importlib.import_module("lerobot.scripts.lerobot_train")
-    for name in REPLACED:
-        if not hasattr(module, name):
-            raise TrainingError(
-                f"the installed lerobot's training loop does not call '{name}' any more. Install the version "
-                f"that this package names: pip install lerobot==0.6.1"
-            )
-    # lerobot reads the command line again, for the checkpoint to go on from.
-    arguments = [sys.argv[0]]
-    if resume_from is not None:
-        arguments.append(f"--config_path={resume_from / MODEL_FOLDER}")
-    with (
-        patch.object(sys, "argv", arguments),
-        _logging_as_it_was(),
-        contextlib.ExitStack() as stack,
-    ):
-        for name, replacement in _replacements(module, hooks).items():
-            stack.enter_context(patch.object(module, name, replacement))
-        # It is one for the whole process, and refuses a second training in another precision.
-        AcceleratorState._reset_state()
-        module.train(config)
-
-
-def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]]:
-    originals = {name: getattr(module, name) for name in REPLACED}
-
-    def make_policy(*, cfg: Any, ds_meta: Any, rename_map: Any = None) -> Any:
-        path, cfg.pretrained_path = cfg.pretrained_path, None  # lerobot's loader is not to be asked
-        peft, cfg.use_peft = cfg.use_peft, False
-        set_seed(hooks.run_seed)
-        try:
-            policy = originals["make_policy"](cfg=cfg, ds_meta=ds_meta, rename_map=rename_map or {"": ""})
-        except URLError as exc:
-            raise TrainingError(
-                f"the policy asks for weights that are not on this machine, and they could not be downloaded "
-                f"({exc.reason}). Without them: --set policy.pretrained_backbone_weights=null"
-            ) from exc
-        except (OSError, RuntimeError) as exc:
-            raise_plainly(exc, cfg.type)
-        cfg.pretrained_path, cfg.use_peft = path, peft
-        if hooks.weights is None:
-            return policy
-        options = LoadOptions(device=cfg.device, dtype=getattr(cfg, "dtype", None) if hooks.cast else None)
-        may_be_new = getattr(policy, "new_in_finetuning", ()) if hooks.begins_from_base else ()
-        filled = fill_policy(policy, hooks.weights, options, may_be_new=may_be_new)
-        if hooks.begins_from_base:
-            begin_from(filled, hooks.weights)
-        return filled.to(cfg.device)
-
-    def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
-        if pretrained_path:
-            folder = Path(pretrained_path)
-            steps = step_names(folder / PREPROCESSOR_FILE)
-            found = tokenizer_overrides(folder, policy_cfg, steps, tokenizer=hooks.tokenizer)
-            kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **found}
-            _override_our_steps(folder, policy_cfg, kwargs)
-        make = originals["make_pre_post_processors"]
-        try:
-            return make(policy_cfg, pretrained_path=pretrained_path, **kwargs)
-        except OSError as exc:
-            raise_plainly(exc, policy_cfg.type)
-
-    def make_optimizer_and_scheduler(cfg: Any, policy: Any) -> Any:
-        hooks.on_model(policy)
-        return originals["make_optimizer_and_scheduler"](cfg, policy)
-
-    def make_train_eval_datasets(cfg: Any) -> Any:
-        training, held_out = originals["make_train_eval_datasets"](cfg)
-        if not hooks.decode_ahead:
-            return training, held_out
-        return MemoryDataset(training, whole_episodes=hooks.whole_episodes), held_out
-
-    def update_policy(tracker: Any, policy: Any, *args: Any, **kwargs: Any) -> Any:
-        accelerator = kwargs["accelerator"]
-        process = accelerator.process_index
-        seed_step(hooks.run_seed, tracker.steps, process)
-        if hooks.micro_batch_size is not None:
-            policy = InMicroBatches(policy, accelerator, hooks.micro_batch_size)
-        answer = originals["update_policy"](tracker, policy, *args, **kwargs)
-        step = tracker.steps + 1
-        if step % hooks.log_every_steps == 0 and process == 0:
-            _write_metrics(hooks, step, tracker, answer[1] or {})
-        return answer
-
-    def load_training_state(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> Any:
-        try:
-            return originals["load_training_state"](checkpoint_dir, *args, **kwargs)
-        except Exception as exc:  # lerobot, torch and safetensors raise what they like
-            raise TrainingError(
-                f"{checkpoint_dir}: the state of the training cannot be read ({exc!r:.300}). Remove this "
-                "checkpoint's folder to go on from the one before it, or use another --out."
-            ) from exc
-
-    def save_checkpoint(checkpoint_dir: Path, **kwargs: Any) -> None:
-        partial = checkpoint_dir.with_name(f"{PARTIAL_PREFIX}{checkpoint_dir.name}")
-        originals["save_checkpoint"](checkpoint_dir=partial, **kwargs)
-        write_facts(partial / MODEL_FOLDER, hooks.facts)
-        save_tokenizers(kwargs["preprocessor"], partial / MODEL_FOLDER)
-        _sync(partial)
-        os.replace(partial, checkpoint_dir)
-        hooks.on_checkpoint(checkpoint_dir)
-
-    def init_logging(accelerator: Any = None) -> None:
-        is_first = accelerator is None or accelerator.is_main_process
-        originals["init_logging"](
-            log_file=hooks.log_file if is_first else None,
-            console_level="WARNING",
-            file_level="INFO",
-            accelerator=accelerator,
-        )
-
-    def inside_slurm() -> bool:
-        """Where lerobot draws no bar: here, too, if nobody would see it move."""
-        return originals["inside_slurm"]() or not sys.stderr.isatty()
-
-    replaced = (
-        make_policy,
-        make_pre_post_processors,
-        make_optimizer_and_scheduler,
-        make_train_eval_datasets,
-        update_policy,
-        load_training_state,
-        save_checkpoint,
-        init_logging,
-        inside_slurm,
+    recipe = job.recipe
+    if job.first_step >= recipe.steps:
+        return
+    accelerator = Accelerator(
+        # One process may train in several precisions, and accelerate has one for all: see `autocast_dtype`.
+        mixed_precision="no",
+        step_scheduler_with_optimizer=False,  # else once per process
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        cpu=job.device == "cpu",
     )
-    return {function.__name__: function for function in replaced}
+    with _logging(job.out / LOG_FILE, accelerator), local_files_only(job):
+        training = _Training(job, accelerator, listeners.on_model)
+        is_main = accelerator.is_main_process
+        wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
+        silent = not (is_main and sys.stderr.isatty())
+        for step in tqdm(range(job.first_step + 1, recipe.steps + 1), desc="Training", disable=silent):
+            training.do_step(step)
+            if step % recipe.log_every_steps == 0:
+                line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
+                if is_main:
+                    _report(line, job.out / METRICS_FILE, listeners, wandb)
+            if step % recipe.save_every_steps == 0 or step == recipe.steps:
+                folder = write_checkpoint(job, step, accelerator, training.parts())
+                if folder is not None:
+                    listeners.on_checkpoint(folder)
+                    if wandb is not None:
+                        wandb.log_policy(folder)
+                accelerator.wait_for_everyone()
+        logging.info("End of training")
+        accelerator.end_training()
+
+
+class _Training:
+    """What steps need and change, made or loaded in lerobot's order: it decides what is drawn when."""
+
+    def __init__(self, job: TrainingJob, accelerator: Accelerator, on_model: Callable[[Any], None]) -> None:
+        self.job, self.accelerator, self.config = job, accelerator, lerobot_config(job)
+        logging.info(pformat(self.config.to_dict()))
+        torch.backends.cudnn.benchmark = True
+        torch.backends.cuda.matmul.allow_tf32 = True
+        with accelerator.main_process_first():  # the others find the decoded frames
+            dataset = make_dataset(self.config)
+            if job.recipe.decode_ahead:
+                dataset = MemoryDataset(dataset, whole_episodes=job.whole_episodes)
+        self.cameras = dataset.meta.camera_keys
+        self.tracker = new_tracker(job, dataset, accelerator)
+        set_seed(job.run_seed)
+        model = make_model(job, dataset.meta)
+        self.before, self.after = make_processors(job, model, dataset.meta)
+        on_model(model)
+        optimizer, scheduler = make_optimizer_and_scheduler(self.config, model)
+        is_sharded = accelerator.distributed_type == DistributedType.FSDP
+        if job.resume_from is not None:
+            load_state(job.resume_from, optimizer, scheduler, load_optimizer=not is_sharded)
+        loader = _loader(job, self.config, dataset, accelerator)
+        prepared = accelerator.prepare(model, optimizer, loader, scheduler)
+        self.policy, self.optimizer, loader, self.scheduler = prepared
+        if job.resume_from is not None and is_sharded:
+            load_fsdp_optimizer_state(self.policy, self.optimizer, job.resume_from)
+        self.batches = cycle(loader)
+        self.autocast = autocast_dtype(job.policy, job.device)
+        half = self.autocast == torch.float16  # whose small gradients would be 0
+        self.scaler = torch.GradScaler(accelerator.device.type, enabled=half)
+
+    def parts(self) -> dict[str, Any]:
+        """Return what a checkpoint is made of, by lerobot's names."""
+        parts = {"policy": self.policy, "optimizer": self.optimizer, "scheduler": self.scheduler}
+        return {**parts, "cfg": self.config, "preprocessor": self.before, "postprocessor": self.after}
+
+    def do_step(self, step: int) -> None:
+        """Do one gradient step, the `step`-th counted from 1."""
+        tracker, started = self.tracker, time.perf_counter()
+        batch = next(self.batches)
+        for key in self.cameras:
+            if key in batch and batch[key].dtype == torch.uint8:
+                batch[key] = batch[key].to(dtype=torch.float32) / MAX_UINT8
+        batch = self.before(batch)
+        loaded = time.perf_counter()
+        seed_step(self.job.run_seed, step - 1, self.accelerator.process_index)
+        self.policy.train()
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
+        size, scale = self.job.recipe.micro_batch_size, self.scaler.scale
+        loss = add_gradient(
+            self.policy, batch, self.accelerator, size=size, autocast=self.autocast, scale=scale
+        )
+        tracker.grad_norm = self._update()
+        tracker.loss, tracker.lr = loss.value.item(), self.optimizer.param_groups[0]["lr"]
+        tracker.update_metrics(loss.parts)
+        tracker.dataloading_s, tracker.update_s = loaded - started, time.perf_counter() - loaded
+        if torch.cuda.is_available():
+            tracker.gpu_mem_gb = torch.cuda.max_memory_allocated() / (1 << 30)
+        tracker.step()
+
+    def _update(self) -> float:
+        """Change the weights by the gradient that was added up; return its norm."""
+        self.scaler.unscale_(self.optimizer)
+        limit = self.config.optimizer.grad_clip_norm
+        norm = self.accelerator.clip_grad_norm_(self.policy.parameters(), limit if limit > 0 else math.inf)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        self.optimizer.zero_grad()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        model = self.accelerator.unwrap_model(self.policy)
+        if has_method(model, "update"):  # of policies with weights that follow slowly
+            model.update()
+        return float(norm)
 
 
 def seed_step(run_seed: int, step: int, process: int) -> None:
@@ -241,61 +186,72 @@ def seed_step(run_seed: int, step: int, process: int) -> None:
     set_seed(int(drawn[0]))
 
 
-def _write_metrics(hooks: LoopHooks, step: int, tracker: Any, parts: Mapping[str, Any]) -> None:
-    """Write means since the last line and, of the loss, the parts that the policy tells of this step."""
-    values = {name: value for name, value in tracker.to_dict().items() if name != "steps"}
-    told = {name: value for name, value in parts.items() if isinstance(value, float | int)}
-    line = {"step": step, **{name: float(value) for name, value in {**told, **values}.items()}}
-    append_metrics(hooks.metrics_file, line)
-    hooks.on_metrics(line)
-    if not np.isfinite(line["loss"]):
+def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
+    """Return the precision of the forward pass: `dtype`, else `use_amp`, else what accelerate was told."""
+    if getattr(policy, "dtype", None) in ("bfloat16", "float16", "float32"):
+        return None if policy.dtype == "float32" else getattr(torch, policy.dtype)
+    if getattr(policy, "use_amp", False) and not hasattr(policy, "dtype"):
+        return torch.get_autocast_dtype(torch.device(device).type)
+    return LAUNCHED.get(os.environ.get(LAUNCHED_PRECISION, ""))
+
+
+def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:
+    """Return batches in an order that is a function of run seed and epoch, from the job's first step on."""
+    episodes = dataset.meta.episodes
+    sampler = EpisodeAwareSampler(
+        episodes["dataset_from_index"],
+        episodes["dataset_to_index"],
+        episode_indices_to_use=dataset.episodes,
+        drop_n_last_frames=getattr(job.policy, "drop_n_last_frames", 0),
+        shuffle=True,
+        seed=job.run_seed,
+        absolute_to_relative_idx=dataset.absolute_to_relative_idx,
+    )
+    if job.resume_from is not None:
+        n_processes = load_training_num_processes(job.resume_from) or accelerator.num_processes
+        size = load_training_batch_size(job.resume_from) or job.recipe.batch_size
+        sampler.load_state_dict(compute_sampler_state(job.first_step, len(sampler), size, n_processes))
+    in_workers = {
+        "prefetch_factor": config.prefetch_factor,
+        "persistent_workers": config.persistent_workers,
+        "multiprocessing_context": config.dataloader_multiprocessing_context,
+    }
+    return torch.utils.data.DataLoader(
+        dataset,
+        batch_size=job.recipe.batch_size,
+        sampler=sampler,
+        num_workers=config.num_workers,
+        pin_memory=accelerator.device.type == "cuda",
+        collate_fn=lerobot_collate_fn if dataset.meta.has_language_columns else None,
+        **(in_workers if config.num_workers else {}),
+    )
+
+
+def _report(line: Mapping[str, float], file: Path, listeners: Listeners, wandb: Any) -> None:
+    logging.info(line)
+    append_metrics(file, line)
+    if wandb is not None:
+        wandb.log_dict(dict(line), int(line["step"]))
+    listeners.on_metrics(line)
+    if not math.isfinite(line["loss"]):
         raise TrainingError(
-            f"step {step}: the loss is {line['loss']}. Lower the learning rate, or look for fields of the "
-            f"dataset that hardly vary (docs/finetuning.md)."
+            f"step {line['step']}: the loss is {line['loss']}. Lower the learning rate, or look for fields "
+            f"of the dataset that hardly vary (docs/finetuning.md)."
         )
 
 
-def append_metrics(file: Path, line: Mapping[str, float | str]) -> None:
-    """Write one line of metrics."""
-    with file.open("a", encoding="utf-8") as lines:
-        lines.write(f"{json.dumps(dict(line))}\n")
-
-
-def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> None:
-    """Give our own normaliser what lerobot addresses to its own by name.
-
-    That is the dataset's statistics; with them, the settings of this training and not those of its base.
-    """
-    for overrides_name, file, lerobots, ours in (
-        ("preprocessor_overrides", PREPROCESSOR_FILE, "normalizer_processor", ENCODER_STEP),
-        ("postprocessor_overrides", POSTPROCESSOR_FILE, "unnormalizer_processor", DECODER_STEP),
-    ):
-        names = step_names(folder / file)
-        overrides = dict(kwargs.get(overrides_name) or {})
-        if ours not in names or lerobots not in overrides:
-            continue
-        given = overrides.pop(lerobots)
-        if "stats" in given:
-            overrides[ours] = {**getattr(config, "encoder_settings", {}), "stats": given["stats"]}
-        kwargs[overrides_name] = overrides
-
-
-def _sync(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_file():
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-
-
 @contextlib.contextmanager
-def _logging_as_it_was() -> Iterator[None]:
-    """Undo what lerobot does to the root logger."""
+def _logging(file: Path, accelerator: Accelerator) -> Iterator[None]:
+    """Let the first process write what is logged to a file, warnings to standard error; then as it was."""
     root = logging.getLogger()
     handlers, level = list(root.handlers), root.level
     try:
+        init_logging(
+            log_file=file if accelerator.is_main_process else None,
+            console_level="WARNING",
+            file_level="INFO",
+            accelerator=accelerator,
+        )
         yield
     finally:
         for handler in root.handlers:

@@ -1,11 +1,8 @@
-"""Gradient accumulation: one gradient step's samples go through the network in parts.
+"""The gradient of one step, whose samples may go through the network in parts (gradient accumulation)."""
 
-lerobot's step of training calls the policy's `forward` once and goes backwards from what it returns. So the
-policy that it is given here does the same for all parts but the last, and returns the last one's loss.
-"""
-
-from collections.abc import Iterator, Mapping
-from typing import Any  # lerobot and accelerate are untyped
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple  # lerobot and accelerate are untyped
 
 import torch
 from torch import Tensor
@@ -13,45 +10,52 @@ from torch import Tensor
 from vla_eval.errors import TrainingError
 
 
-class InMicroBatches:
-    """A policy for one gradient step; everything but its `forward` is the policy's own.
+class Loss(NamedTuple):
+    """Of a whole batch: its value, and what the policy says of it, numbers averaged over samples."""
 
-    The gradient is that of the whole batch wherever the policy's loss is a mean over samples that count
+    value: Tensor
+    parts: dict[str, Any]
+
+
+def add_gradient(
+    policy: Any,
+    batch: Mapping[str, Any],
+    accelerator: Any,
+    *,
+    size: int | None = None,
+    autocast: torch.dtype | None = None,
+    scale: Callable[[Tensor], Tensor] = lambda loss: loss,
+) -> Loss:
+    """Add the gradient of a batch's loss to the parameters'.
+
+    In parts, it is that of the whole batch wherever the policy's loss is a mean over samples that count
     alike (ACT's is one over actions that are no padding, so not quite), but for noise that the policy
     draws: it is drawn part by part.
 
     Args:
         policy: as accelerate has prepared it.
+        batch: tensors and lists with one entry per sample.
         accelerator: accelerate's `Accelerator`.
-        micro_batch_size: samples of a part; the last one has what is left.
+        size: samples of a part, the last one has what is left; None: all at once.
+        autocast: in which precision the forward pass runs; None: as the weights are.
+        scale: applied to the loss before the backward pass.
+
+    Raises:
+        TrainingError: a field of the batch cannot be divided.
     """
-
-    def __init__(self, policy: Any, accelerator: Any, micro_batch_size: int) -> None:
-        self._policy, self._accelerator, self._size = policy, accelerator, micro_batch_size
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._policy, name)
-
-    def forward(self, batch: Mapping[str, Any]) -> tuple[Tensor, dict[str, Any]]:
-        """Go backwards through all parts but the last.
-
-        Returns:
-            the whole batch's loss, whose gradient is the last part's; and what the policy tells, numbers
-            averaged over samples.
-        """
-        *parts, (last_share, last) = _parts(batch, self._size)
-        whole, told = 0.0, _Told()
-        for share, part in parts:
-            with self._accelerator.no_sync(self._policy):
-                loss, output = self._policy.forward(part)
-                # The whole of lerobot's forward is under autocast; a backward need not be.
-                with torch.autocast(self._accelerator.device.type, enabled=False):
-                    self._accelerator.backward(share * loss)
-            whole = whole + share * loss.detach()
-            told.add(output, share)
-        loss, output = self._policy.forward(last)
-        told.add(output, last_share)
-        return whole + last_share * loss, told.values
+    whole, told = torch.zeros(()), _Told()
+    parts = [(1.0, batch)] if size is None else list(_parts(batch, size))
+    for index, (share, part) in enumerate(parts, start=1):
+        # Processes exchange gradients once, with the last part.
+        waits = accelerator.no_sync(policy) if index < len(parts) else contextlib.nullcontext()
+        with waits:
+            with torch.autocast(accelerator.device.type, autocast, enabled=autocast is not None):
+                loss, output = policy.forward(part)
+            loss = share * loss.to(torch.promote_types(loss.dtype, torch.float32))
+            accelerator.backward(scale(loss))
+        whole = whole.to(loss) + loss.detach()
+        told.add(output, share)
+    return Loss(whole, told.values)
 
 
 class _Told:
@@ -63,7 +67,7 @@ class _Told:
     def add(self, output: Mapping[str, Any] | None, share: float) -> None:
         """Add what was told of a part with this share of the samples; what is no number is the last one's."""
         for name, value in (output or {}).items():
-            if isinstance(value, float | int):
+            if isinstance(value, float | int) and not isinstance(value, bool):
                 value = self.values.get(name, 0.0) + share * value
             self.values[name] = value
 

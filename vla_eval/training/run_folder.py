@@ -80,7 +80,7 @@ def newest_checkpoint(path: Path) -> Path | None:
         return None
     for partial in folder.glob(".partial-*"):
         shutil.rmtree(partial)
-    _point(folder / LAST, whole[-1].name)
+    point(folder / LAST, whole[-1].name)
     _cut_metrics(path / METRICS_FILE, int(whole[-1].name))
     return whole[-1]
 
@@ -99,7 +99,7 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def _point(link: Path, target: str) -> None:
+def point(link: Path, target: str) -> None:
     """Let the link name the target, without a moment at which there is no link."""
     if link.is_symlink() and os.readlink(link) == target:
         return

@@ -1,6 +1,6 @@
 """Metrics to services beside the file: trackio, and figures of evaluations to wandb.
 
-What the training loop itself logs to wandb is lerobot's affair.
+Lines of metrics and checkpoints go to wandb from the training loop, by lerobot's logger.
 """
 
 import contextlib

@@ -1,0 +1,77 @@
+"""Checkpoints in lerobot's form: each appears whole or not at all, and is read with a message if damaged."""
+
+import os
+from pathlib import Path
+from typing import Any  # lerobot and accelerate are untyped
+
+from accelerate.utils import DistributedType
+from lerobot.common import train_utils
+
+from vla_eval.errors import TrainingError
+from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
+from vla_eval.policies.lerobot_processors import save_tokenizers
+from vla_eval.training.job import TrainingJob
+from vla_eval.training.run_folder import LAST, point
+
+PARTIAL_PREFIX = ".partial-"
+
+
+def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any]) -> Path | None:
+    """Write the checkpoint of a step, with what it was trained on; every process has to take part.
+
+    Args:
+        job: see there.
+        step: counted from 1.
+        accelerator: accelerate's `Accelerator`.
+        parts: `cfg`, `policy`, `optimizer`, `scheduler`, `preprocessor`, `postprocessor`, see lerobot's
+            `save_checkpoint`.
+
+    Returns:
+        The folder (`…/000100`); None in all processes but the first, which writes.
+    """
+    if accelerator.distributed_type == DistributedType.FSDP:  # each process has a share of the weights
+        gathered = train_utils.gather_fsdp_state_dicts(parts["policy"], parts["optimizer"])
+        parts["model_state_dict"], parts["optim_state_dict"] = gathered
+    if not accelerator.is_main_process:
+        return None
+    folder: Path = train_utils.get_step_checkpoint_dir(parts["cfg"].output_dir, job.recipe.steps, step)
+    partial = folder.with_name(f"{PARTIAL_PREFIX}{folder.name}")
+    parts["policy"] = accelerator.unwrap_model(parts["policy"])
+    train_utils.save_checkpoint(
+        checkpoint_dir=partial,
+        step=step,
+        num_processes=accelerator.num_processes,
+        batch_size=job.recipe.batch_size,
+        **parts,
+    )
+    write_facts(partial / MODEL_FOLDER, job.facts)
+    save_tokenizers(parts["preprocessor"], partial / MODEL_FOLDER)
+    _sync(partial)
+    os.replace(partial, folder)
+    point(folder.parent / LAST, folder.name)
+    return folder
+
+
+def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: bool) -> None:
+    """Load the state of a training, which is safetensors and JSON, and that of the random generators.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
+    try:
+        train_utils.load_training_state(folder, optimizer, scheduler, load_optimizer=load_optimizer)
+    except Exception as exc:  # lerobot, torch and safetensors raise what they like
+        raise TrainingError(
+            f"{folder}: the state of the training cannot be read ({exc!r:.300}). Remove this checkpoint's "
+            "folder to go on from the one before it, or use another --out."
+        ) from exc
+
+
+def _sync(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)

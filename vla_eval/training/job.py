@@ -1,0 +1,188 @@
+"""What one fine-tuning is, resolved once: recipe, dataset, policy, base, folders, where it resumes.
+
+Everything that can be refused is refused here, before the run has a folder. Knows nothing of the loop.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+from lerobot.configs.default import DatasetConfig, WandBConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.data.opening import video_decoder
+from vla_eval.decoding import decode
+from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
+from vla_eval.policies.lerobot import choose_device
+from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
+from vla_eval.training.dataset import TrainingDataset, training_dataset
+from vla_eval.training.held_out import check_held_out
+from vla_eval.training.lora import check_lora_is_told, peft_config
+from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
+from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation, merge_fields
+from vla_eval.training.run_folder import TRAIN_FOLDER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingJob:
+    """One fine-tuning.
+
+    Attributes:
+        name, recipe_sha256: of the policy's recipe.
+        recipe: its section `finetune`, with the configuration's values on top.
+        dataset: what is trained on.
+        policy: lerobot's configuration of the policy, which it completes when the model is made.
+        frames: how many of the dataset's frames begin a chunk.
+        base: folder of the weights to start from; None: from scratch.
+        device: `cpu`, `cuda` …
+        out: the run folder.
+        run_seed: of initial weights, order of samples and noise.
+        evaluation: of checkpoints meanwhile; None: there is none.
+        evaluated_task: on which task.
+        resume_from: folder of the checkpoint (`…/000100`) to go on from; None: from the beginning.
+    """
+
+    name: str
+    recipe_sha256: str
+    recipe: FinetuneRecipe
+    dataset: TrainingDataset
+    policy: Any
+    frames: UsedFrames
+    base: Path | None
+    device: str
+    out: Path
+    run_seed: int
+    evaluation: HeldOutEvaluation | None
+    evaluated_task: str | None
+    resume_from: Path | None = None
+
+    @property
+    def first_step(self) -> int:
+        """Steps that are done."""
+        return 0 if self.resume_from is None else int(self.resume_from.name)
+
+    @property
+    def weights(self) -> Path | None:
+        """Folder of the weights to load: the checkpoint's, else the base's."""
+        return self.base if self.resume_from is None else self.resume_from / MODEL_FOLDER
+
+    @property
+    def whole_episodes(self) -> bool:
+        """Whether a sample is an episode up to its end, see `MemoryDataset`."""
+        return bool(getattr(self.policy, "whole_episodes", False))
+
+    @property
+    def facts(self) -> TrainingFacts:
+        """What is written beside each checkpoint's weights."""
+        dataset, features = self.dataset, self.dataset.meta.features
+        return TrainingFacts(
+            run=self.out.resolve().name,
+            dataset=dataset.name,
+            dataset_sha256=dataset.sha256,
+            task=dataset.task,
+            state=dataset.state,
+            images={field: tuple(features[field]["shape"][:2]) for field in CAMERA_KEYS.values()},
+            fps=float(dataset.meta.fps),
+            action_names=tuple(features["action"]["names"]),
+            control_mode=dataset.control_mode,
+            run_seed=self.run_seed,
+        )
+
+
+def training_job(config: FinetuneConfig) -> TrainingJob:
+    """Return the fine-tuning that a configuration asks for, from its beginning.
+
+    Raises:
+        VlaEvalError: recipe, dataset, base, policy and evaluation do not fit each other.
+    """
+    loaded = load_finetune_recipe(config)
+    recipe = loaded.value
+    dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    evaluation = config.evaluation
+    task = None if evaluation is None else check_held_out(evaluation, recipe, dataset)
+    device = choose_device(config.device)
+    check_lora_is_told(recipe)
+    policy = policy_config(recipe, dataset, device=device)
+    image_transforms(recipe)
+    job = TrainingJob(
+        name=loaded.name,
+        recipe_sha256=loaded.sha256,
+        recipe=recipe,
+        dataset=dataset,
+        policy=policy,
+        frames=used_frames(policy, dataset),
+        base=find_checkpoint(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None,
+        device=device,
+        out=Path(config.out) if config.out is not None else default_out(config),
+        run_seed=config.run_seed,
+        evaluation=evaluation,
+        evaluated_task=task,
+    )
+    if job.whole_episodes and not recipe.decode_ahead:
+        raise RecipeError(
+            f"finetune.decode_ahead is false; '{recipe.type}' is trained on whole episodes, which are served "
+            "from decoded frames alone. Leave the field out."
+        )
+    return job
+
+
+def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
+
+    Raises:
+        RecipeError: the policy has none, or a field is wrong.
+    """
+    recipe = load_recipe("policies", config.policy, PolicyRecipe)
+    if recipe.value.finetune is None:
+        raise RecipeError(
+            f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
+            f"`mikasa-vla list policies` shows the recipes."
+        )
+    data = merge_fields(to_data(recipe.value.finetune), config.finetune)
+    value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
+    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+
+
+def default_out(config: FinetuneConfig) -> Path:
+    """Return the run folder of a fine-tuning that names none."""
+    return (
+        Path("runs") / f"{Path(config.policy).stem}-{Path(config.dataset).resolve().name}-{config.run_seed}"
+    )
+
+
+def lerobot_config(job: TrainingJob) -> Any:
+    """Return the same as lerobot's `TrainPipelineConfig`, which its factories take and its checkpoints hold.
+
+    lerobot would complete it from the command line (`validate`); what that sets is set here.
+    """
+    recipe, dataset = job.recipe, job.dataset
+    config = TrainPipelineConfig(
+        dataset=DatasetConfig(
+            repo_id=f"local/{dataset.name}",
+            root=str(dataset.root),
+            use_imagenet_stats=recipe.imagenet_statistics,
+            image_transforms=image_transforms(recipe),
+            video_backend=video_decoder(),
+        ),
+        policy=job.policy,
+        output_dir=job.out / TRAIN_FOLDER,
+        job_name=job.policy.type,
+        resume=job.resume_from is not None,
+        seed=job.run_seed,
+        steps=recipe.steps,
+        batch_size=recipe.batch_size,
+        num_workers=min(recipe.num_workers, len(os.sched_getaffinity(0))),  # more would only wait
+        log_freq=recipe.log_every_steps,
+        save_freq=recipe.save_every_steps,
+        env_eval_freq=0,
+        optimizer=job.policy.get_optimizer_preset(),
+        scheduler=job.policy.get_scheduler_preset(),
+        rename_map=dict(recipe.rename_cameras),
+        wandb=WandBConfig(enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none"),
+        peft=peft_config(recipe),
+    )
+    config.checkpoint_path = job.resume_from
+    return config

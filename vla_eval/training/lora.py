@@ -1,0 +1,69 @@
+"""LoRA in a fine-tuning: which layers get an adapter, and a check that just these are trained."""
+
+from typing import Any  # lerobot is untyped
+
+from lerobot.configs.default import PeftConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
+
+from vla_eval.errors import RecipeError
+from vla_eval.policies.lerobot_loading import config_class
+from vla_eval.policies.steps.trainable import check_lora
+from vla_eval.training.recipe import FinetuneRecipe
+
+LORA_TARGETS = {
+    "pi05": r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"
+    r"|model\.(action_in_proj|action_out_proj|time_mlp_in|time_mlp_out))"
+}
+"""By type, where lerobot 0.6.1 chooses wrongly: it looks for π0.5's projections of time under π0's names, and
+leaves them frozen (https://github.com/huggingface/lerobot/pull/4494)."""
+
+
+def peft_config(recipe: FinetuneRecipe) -> PeftConfig | None:
+    """Return lerobot's settings of the adapters; None: all weights are trained."""
+    lora = recipe.lora
+    if lora is None:
+        return None
+    return PeftConfig(
+        r=lora.rank,
+        lora_alpha=lora.alpha or lora.rank,
+        target_modules=lora.target_modules or LORA_TARGETS.get(recipe.type),
+        full_training_modules=list(lora.full_modules) or None,
+    )
+
+
+def check_lora_is_told(recipe: FinetuneRecipe) -> None:
+    """Refuse LoRA where neither the recipe nor the policy says which layers get an adapter.
+
+    Raises:
+        RecipeError: nobody does.
+    """
+    if recipe.lora is None or recipe.lora.target_modules is not None:
+        return
+    if hasattr(config_class(recipe.type, where="finetune.type"), "lora_defaults"):
+        return
+    chosen = get_policy_class(recipe.type)._get_default_peft_targets
+    if chosen is PreTrainedPolicy._get_default_peft_targets:
+        raise RecipeError(
+            f"finetune.lora.target_modules is not set, and '{recipe.type}' does not say itself which layers "
+            f"get an adapter. Write a regular expression of whole module names, or leave `lora` out."
+        )
+
+
+def check_adapters(model: Any, recipe: FinetuneRecipe, policy: Any) -> None:
+    """Check what LoRA trains against the recipe, else against the policy's own choice.
+
+    Args:
+        model: peft's wrapper around the policy; any model if the recipe has no LoRA.
+        recipe: see there.
+        policy: lerobot's configuration.
+
+    Raises:
+        TrainingError: other parameters are trained.
+    """
+    if recipe.lora is None:
+        return
+    own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
+    target = recipe.lora.target_modules or LORA_TARGETS.get(policy.type) or own.get("target_modules")
+    if target is not None:
+        check_lora(model, target, tuple(recipe.lora.full_modules or own.get("modules_to_save") or ()))
