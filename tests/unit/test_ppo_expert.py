@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from vla_eval.cli.main import main
-from vla_eval.core import EpisodeStart, Observation, ObservationWindow, PrivilegedState
+from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, SimulationError, SpecMismatchError, UnknownNameError
@@ -20,6 +20,7 @@ from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.ppo_expert import make_ppo_expert
 from vla_eval.registry import policy_factory
+from vla_eval.task_state import PrivilegedState
 from vla_eval.training.lockstep import LockstepEnvs, LockstepResult, distance_to_go_m
 from vla_eval.training.ppo_expert import _Learner, advantages_of, train_expert
 from vla_eval.training.ppo_network import ActorCritic, NetworkSpec

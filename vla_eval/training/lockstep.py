@@ -16,10 +16,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import FloatArray, PrivilegedState, SimEnv, StepResult
+from vla_eval.core import FloatArray, SimEnv, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import SimulationError, SpecMismatchError
+from vla_eval.task_state import PrivilegedState
 
 
 class LockstepResult(NamedTuple):
