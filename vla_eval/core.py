@@ -1,72 +1,28 @@
-"""The contracts of one evaluated episode: what is seen, what is done, what came of it.
+"""The contracts of one evaluated episode: observations in, chunks of actions out, a result per step.
 
 Read this file, then `rollout.py`, and you can follow an episode from reset to record. Everything
-here is numpy and the standard library: it knows nothing of simulators, models or files.
+here is numpy and the standard library: it knows nothing of simulators, models or files. What a task
+says of its episode has a file of its own, `task_state.py`.
 
 A *slot* is one of the episodes that run side by side in one environment object; every per-episode
 value is keyed by it. An episode is a function of (task, seed, actions) alone, whatever its slot.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.specs import EnvSpec, PolicySpec
-
-Phase = Literal["cue", "delay", "response"]
-"""Part of an episode: the cue is shown; nothing to remember it by is in view; the answer is due."""
+from vla_eval.task_state import PrivilegedState, TaskStatus
 
 Stage = Literal["setup", "reset", "step", "inference"]
 """What a worker is busy with; each stage has a time limit of its own."""
 
 FloatArray = NDArray[np.float32]
 ImageArray = NDArray[np.uint8]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrivilegedState:
-    """The world as it truly is, for scripted controls. Never given to a learned policy.
-
-    Attributes:
-        phase: the phase that holds at this step.
-        response_step: the step at which the response phase begins (0 for a task without phases).
-        tcp_position_m: (3,) tool centre point, world frame.
-        tcp_velocity_m_s: (3,) its linear velocity, world frame.
-        gripper_width_m: gap between the fingers, 0 to 0.08.
-        candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
-            be), world frame, in candidate order; (0, 3) for a task without candidates.
-        target: index of the right candidate; None for a task without candidates or with several right ones.
-        right_candidates: indices of all right candidates, in the order shown; empty without candidates.
-        in_order: whether several right candidates must be touched in that order.
-        touched_candidates: indices of those touched so far, in the order of first touch.
-        bodies: bodies and places by name, as the task names them: `ball`, `goal` …
-        tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
-    """
-
-    phase: Phase
-    response_step: int
-    tcp_position_m: NDArray[np.float64]
-    tcp_velocity_m_s: NDArray[np.float64]
-    gripper_width_m: float
-    candidate_positions_m: NDArray[np.float64]
-    target: int | None
-    right_candidates: tuple[int, ...] = ()
-    in_order: bool = False
-    touched_candidates: tuple[int, ...] = ()
-    bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
-    tcp_yaw_rad: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BodyState:
-    """Position (m) and linear velocity (m/s) of a body, each (3,), and its yaw, in the world frame."""
-
-    position_m: NDArray[np.float64]
-    velocity_m_s: NDArray[np.float64]
-    yaw_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,37 +92,6 @@ class EpisodeStart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TaskStatus:
-    """What the task says of the episode so far; reading it changes nothing.
-
-    Attributes:
-        phase: the phase at this step.
-        success: the success rule holds at this very step.
-        fail: the episode is lost for good (`strict_choice`, first wrong candidate).
-        target: index of the right candidate; None for a task without candidates or with several right ones.
-        right_first_choices: the candidates that it is right to touch first; empty without candidates.
-        n_candidates: how many candidates there are; 0 for a task without candidates.
-        first_choice: index of the candidate that was touched first in the response phase, if any.
-        n_wrong_choices: how many different wrong candidates have been touched in the response phase.
-        chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
-            environment; None where it has to be measured.
-        candidate_places: the place at which each candidate lies when the response phase begins, in candidate
-            order: 0 is the rightmost as the robot sees it (-y). Empty where places are not known.
-    """
-
-    phase: Phase
-    success: bool
-    fail: bool
-    target: int | None
-    n_candidates: int
-    first_choice: int | None
-    n_wrong_choices: int
-    right_first_choices: tuple[int, ...] = ()
-    chance_success: float | None = None
-    candidate_places: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
     """What comes back from a reset or a control step of one slot.
 
@@ -215,11 +140,7 @@ class SimEnv(Protocol):
 
 
 class Policy(Protocol):
-    """Observations in, chunks of actions out.
-
-    A policy may also offer `act_batch(windows) -> list[ActionChunk]`; the loop then calls that
-    instead of `act`, once for all slots that are due. The chunk must not depend on the other slots.
-    """
+    """Observations in, chunks of actions out; a `BatchPolicy` infers for several slots at once."""
 
     @property
     def spec(self) -> PolicySpec:
@@ -232,8 +153,12 @@ class Policy(Protocol):
         """Decide on the actions from the last observation of the window on."""
 
 
+@runtime_checkable
 class BatchPolicy(Policy, Protocol):
-    """A policy that infers for several slots at once."""
+    """A policy that infers for several slots at once: the loop calls `act_batch` instead of `act`.
+
+    A chunk must not depend on the other slots.
+    """
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
         """Decide for each window; the order of the answers is that of the windows."""

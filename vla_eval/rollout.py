@@ -1,19 +1,16 @@
 """Run one batch of episodes from start to record. Knows nothing of simulators, models or files.
 
-The way of one control step: whoever is due for an inference is asked for a chunk (the policy sees the
-frames since it was last asked, or just the newest one); the chunk executor names the action; the
-environment executes it and renders only if somebody will look at the picture.
+One control step: each episode that is due for an inference asks the policy for a chunk (the policy is given
+the frames since its last inference, or only the newest one); the chunk executor chooses the action; the
+environment executes it, and renders only if somebody will use the image. What is counted, checked and
+recorded on the way is in `episode_log.py`.
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass, replace
 
 from vla_eval.core import (
-    ActionChunk,
+    BatchPolicy,
     EpisodeStart,
     FloatArray,
     Observation,
@@ -23,14 +20,11 @@ from vla_eval.core import (
     Stage,
     StepObserver,
     StepResult,
-    TaskStatus,
 )
-from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
+from vla_eval.episode_log import EpisodeLog, check_chunk, check_instruction
 from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.results.records import EpisodeRecord
-from vla_eval.specs import ActionSpec, PolicySpec, check_compatible
-
-TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre point, m
+from vla_eval.specs import PolicySpec, check_compatible
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,23 +46,21 @@ class RolloutSettings:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Episode:
-    """One running episode: what has been seen and done so far."""
+class _Running:
+    """One running episode: what the policy has not been given yet, its chunks, its log."""
 
-    start: EpisodeStart
+    log: EpisodeLog
     executor: ChunkExecutor
-    result: StepResult
     window: list[Observation]
-    n_steps: int = 0
-    success_step: int | None = None
-    episode_return: float = 0.0
-    n_inferences: int = 0
-    n_frames: int = 0
-    n_clipped_steps: int = 0
-    tcp_start_m: NDArray[np.float64] | None = None
-    tcp_reach_m: float | None = None
     done: bool = False
-    digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
+
+    @property
+    def start(self) -> EpisodeStart:
+        return self.log.start
+
+    @property
+    def step(self) -> int:
+        return self.log.n_steps
 
 
 def _ignore(_stage: Stage) -> None:
@@ -98,89 +90,118 @@ def rollout(
         SpecMismatchError: policy, environment and chunking do not fit together.
         MissingInstructionError: an episode has no instruction.
         InvalidActionError: the policy returned something that is no finite chunk.
+        SimulationError: the simulator returned a reward or a state that is not finite.
     """
     check_compatible(policy.spec, env.spec)
     settings.chunking.check_chunk_size(policy.spec.chunk_size, policy=policy.spec.name)
     for episode in episodes:
-        if not episode.instruction.strip():
-            raise MissingInstructionError(
-                f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
-            )
-    running = _begin(env, policy, episodes, settings, observers, heartbeat)
+        check_instruction(episode)
+    loop = _Loop(env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat)
+    running = loop.begin(episodes)
     while active := [episode for episode in running if not episode.done]:
-        _infer(policy, active, env.spec.action, observers, heartbeat)
-        _step(env, policy.spec, active, settings, observers, heartbeat)
-    return [_record(episode, policy.spec, settings) for episode in running]
-
-
-def _begin(
-    env: SimEnv,
-    policy: Policy,
-    episodes: Sequence[EpisodeStart],
-    settings: RolloutSettings,
-    observers: Sequence[StepObserver],
-    heartbeat: Callable[[Stage], None],
-) -> list[_Episode]:
-    heartbeat("reset")
-    render = bool(policy.spec.cameras) or any(o.wants_images(0) for o in observers)
-    results = env.reset({e.slot: e.seed for e in episodes}, render=render)
-    policy.reset(episodes)
-    running = []
-    for start in episodes:
-        result = results[start.slot]
-        episode = _Episode(
-            start=start,
-            executor=ChunkExecutor(settings.chunking),
-            result=result,
-            window=[result.observation],
-            tcp_start_m=_tcp_m(result),
+        loop.infer(active)
+        loop.step(active)
+    return [
+        episode.log.record(
+            policy.spec.name, settings.chunking.n_action_steps, stops_at_success=settings.stop_at_success
         )
-        _digest_state(episode, result)
-        for observer in observers:
-            observer.on_reset(start, result)
-        running.append(episode)
-    return running
-
-
-def _infer(
-    policy: Policy,
-    active: Sequence[_Episode],
-    action_spec: ActionSpec,
-    observers: Sequence[StepObserver],
-    heartbeat: Callable[[Stage], None],
-) -> None:
-    """Ask the policy for a chunk for each episode that is due."""
-    due = [episode for episode in active if episode.executor.infers_at(episode.n_steps)]
-    if not due:
-        return
-    windows = [
-        ObservationWindow(
-            slot=episode.start.slot,
-            frames=tuple(
-                _as_declared(observation, policy.spec)
-                for observation in (episode.window if policy.spec.reads == "every" else episode.window[-1:])
-            ),
-        )
-        for episode in due
+        for episode in running
     ]
-    heartbeat("inference")
-    act_batch: Callable[[Sequence[ObservationWindow]], list[ActionChunk]] | None
-    act_batch = getattr(policy, "act_batch", None)
-    chunks = act_batch(windows) if act_batch is not None else [policy.act(window) for window in windows]
-    for episode, window, chunk in zip(due, windows, chunks, strict=True):
-        _check_chunk(chunk, policy.spec, action_spec, episode)
-        episode.executor.submit(episode.n_steps, chunk)
-        episode.n_inferences += 1
-        episode.n_frames += len(window.frames)
-        episode.window.clear()
-        for observer in observers:
-            observer.on_inference(episode.start, episode.n_steps, chunk)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Loop:
+    """Who takes part in a rollout."""
+
+    env: SimEnv
+    policy: Policy
+    settings: RolloutSettings
+    observers: Sequence[StepObserver]
+    heartbeat: Callable[[Stage], None]
+
+    def begin(self, episodes: Sequence[EpisodeStart]) -> list[_Running]:
+        """Reset environment and policy."""
+        self.heartbeat("reset")
+        render = bool(self.policy.spec.cameras) or any(o.wants_images(0) for o in self.observers)
+        results = self.env.reset({e.slot: e.seed for e in episodes}, render=render)
+        self.policy.reset(episodes)
+        for start in episodes:
+            for observer in self.observers:
+                observer.on_reset(start, results[start.slot])
+        return [
+            _Running(
+                log=EpisodeLog.begin(start, results[start.slot]),
+                executor=ChunkExecutor(self.settings.chunking),
+                window=[results[start.slot].observation],
+            )
+            for start in episodes
+        ]
+
+    def infer(self, active: Sequence[_Running]) -> None:
+        """Ask the policy for a chunk for each episode that is due."""
+        due = [episode for episode in active if episode.executor.infers_at(episode.step)]
+        if not due:
+            return
+        policy, spec = self.policy, self.policy.spec
+        windows = [_window(episode, spec) for episode in due]
+        self.heartbeat("inference")
+        if isinstance(policy, BatchPolicy):
+            chunks = policy.act_batch(windows)
+        else:
+            chunks = [policy.act(window) for window in windows]
+        for episode, window, chunk in zip(due, windows, chunks, strict=True):
+            check_chunk(chunk, spec, self.env.spec.action, episode.log)
+            episode.executor.submit(episode.step, chunk)
+            episode.log.note_inference(n_frames=len(window.frames))
+            episode.window.clear()
+            for observer in self.observers:
+                observer.on_inference(episode.start, episode.step, chunk)
+
+    def step(self, active: Sequence[_Running]) -> None:
+        """Execute one control step in each running episode."""
+        actions: dict[int, FloatArray] = {}
+        for episode in active:
+            action = episode.executor.action(episode.step)
+            slot = episode.start.slot
+            actions[slot] = self.env.hold_action(slot) if action is None else action
+        render = frozenset(episode.start.slot for episode in active if self._needs_images(episode))
+        self.heartbeat("step")
+        results = self.env.step(actions, render=render)
+        for episode in active:
+            slot = episode.start.slot
+            episode.log.note_step(actions[slot], results[slot], self.env.spec.action)
+            episode.window.append(results[slot].observation)
+            episode.done = _is_done(episode, results[slot], self.settings)
+            for observer in self.observers:
+                observer.on_step(episode.start, actions[slot], results[slot])
+
+    def _needs_images(self, episode: _Running) -> bool:
+        """Whether the observation after the coming step must hold images."""
+        step, spec = episode.step + 1, self.policy.spec
+        is_last = step >= episode.start.horizon_steps
+        for_policy = self.settings.eager_rendering or (not is_last and _is_given(episode, spec, step))
+        return (bool(spec.cameras) and for_policy) or any(o.wants_images(step) for o in self.observers)
+
+
+def _is_given(episode: _Running, spec: PolicySpec, step: int) -> bool:
+    """Whether the policy will be given the observation at `step`."""
+    inference_step = episode.executor.next_inference_step
+    if spec.reads == "every":
+        return inference_step < episode.start.horizon_steps  # nothing after the last inference is given
+    return step == inference_step
+
+
+def _window(episode: _Running, spec: PolicySpec) -> ObservationWindow:
+    frames = episode.window if spec.reads == "every" else episode.window[-1:]
+    return ObservationWindow(
+        slot=episode.start.slot, frames=tuple(_as_declared(frame, spec) for frame in frames)
+    )
 
 
 def _as_declared(observation: Observation, spec: PolicySpec) -> Observation:
     """Return what the policy has declared that it reads: observers may have asked for more.
 
-    A missing picture stays missing: `check_compatible` has found each camera in the environment.
+    A missing image stays missing: `check_compatible` has found each camera in the environment.
     """
     return replace(
         observation,
@@ -189,156 +210,11 @@ def _as_declared(observation: Observation, spec: PolicySpec) -> Observation:
     )
 
 
-def _step(
-    env: SimEnv,
-    spec: PolicySpec,
-    active: Sequence[_Episode],
-    settings: RolloutSettings,
-    observers: Sequence[StepObserver],
-    heartbeat: Callable[[Stage], None],
-) -> None:
-    """Execute one control step in each running episode."""
-    actions: dict[int, FloatArray] = {}
-    render: set[int] = set()
-    for episode in active:
-        slot, next_step = episode.start.slot, episode.n_steps + 1
-        action = episode.executor.action(episode.n_steps)
-        actions[slot] = env.hold_action(slot) if action is None else action
-        is_last = next_step >= episode.start.horizon_steps
-        policy_looks = bool(spec.cameras) and (
-            settings.eager_rendering or (not is_last and _is_for_policy(episode, spec, next_step))
-        )
-        if policy_looks or any(o.wants_images(next_step) for o in observers):
-            render.add(slot)
-    heartbeat("step")
-    results = env.step(actions, render=frozenset(render))
-    for episode in active:
-        slot = episode.start.slot
-        _account(episode, actions[slot], results[slot], env.spec.action, settings)
-        for observer in observers:
-            observer.on_step(episode.start, actions[slot], results[slot])
-
-
-def _is_for_policy(episode: _Episode, spec: PolicySpec, step: int) -> bool:
-    """Whether the policy will be given the observation at `step`."""
-    inference_step = episode.executor.next_inference_step
-    if spec.reads == "every":
-        return inference_step < episode.start.horizon_steps  # what comes after the last inference is not seen
-    return step == inference_step
-
-
-def _account(
-    episode: _Episode,
-    action: FloatArray,
-    result: StepResult,
-    action_spec: ActionSpec,
-    settings: RolloutSettings,
-) -> None:
-    """Take down what one control step brought."""
-    episode.n_steps += 1
-    _check_result(episode, result)
-    _account_reach(episode, result)
-    episode.result = result
-    episode.window.append(result.observation)
-    episode.episode_return += result.reward
-    episode.n_clipped_steps += bool(np.any(action < action_spec.low) or np.any(action > action_spec.high))
-    episode.digest.update(np.ascontiguousarray(action, dtype="<f4").tobytes())
-    _digest_state(episode, result)
-    if result.status.success and episode.success_step is None:
-        episode.success_step = episode.n_steps
-    stops = settings.stop_at_success and episode.success_step is not None
-    since_success = episode.n_steps - (episode.success_step or 0)
-    episode.done = (
-        episode.n_steps >= episode.start.horizon_steps
+def _is_done(episode: _Running, result: StepResult, settings: RolloutSettings) -> bool:
+    success_step = episode.log.success_step
+    stops = settings.stop_at_success and success_step is not None
+    return (
+        episode.step >= episode.start.horizon_steps
         or result.status.fail
-        or (stops and since_success >= settings.steps_after_success)
+        or (stops and episode.step - (success_step or 0) >= settings.steps_after_success)
     )
-
-
-def _account_reach(episode: _Episode, result: StepResult) -> None:
-    """Keep how far the tool centre point ever was from where it began; None if its pose is no state."""
-    position_m = _tcp_m(result)
-    if position_m is not None and episode.tcp_start_m is not None:
-        distance_m = float(np.linalg.norm(position_m - episode.tcp_start_m))
-        episode.tcp_reach_m = max(episode.tcp_reach_m or 0.0, distance_m)
-
-
-def _tcp_m(result: StepResult) -> NDArray[np.float64] | None:
-    pose = result.observation.state.get(TCP_POSE)
-    return None if pose is None else pose[:3].astype(np.float64)
-
-
-def _check_result(episode: _Episode, result: StepResult) -> None:
-    """Raise `SimulationError` unless reward and states are finite."""
-    values = {"reward": np.asarray(result.reward), **result.observation.state}
-    for name, value in values.items():
-        if not np.isfinite(value).all():
-            raise SimulationError(
-                f"{episode.start.task}, seed {episode.start.seed}, step {episode.n_steps}: expected a finite "
-                f"'{name}', found {value}. The simulation diverged; please report the seed and the policy."
-            )
-
-
-def _digest_state(episode: _Episode, result: StepResult) -> None:
-    for name in sorted(result.observation.state):
-        episode.digest.update(np.ascontiguousarray(result.observation.state[name], dtype="<f4").tobytes())
-
-
-def _check_chunk(chunk: object, spec: PolicySpec, action_spec: ActionSpec, episode: _Episode) -> None:
-    """Raise `InvalidActionError` unless this is a finite float chunk of the declared shape."""
-    where = (
-        f"policy '{spec.name}', {episode.start.task}, seed {episode.start.seed}, "
-        f"inference at step {episode.n_steps}"
-    )
-    expected = f"an ActionChunk of shape ({spec.chunk_size}, {len(action_spec.dims)}), float32, all finite"
-    if not isinstance(chunk, ActionChunk) or not isinstance(chunk.actions, np.ndarray):
-        found = f"{type(chunk).__name__}"
-    elif chunk.actions.shape != (spec.chunk_size, len(action_spec.dims)):
-        found = f"shape {chunk.actions.shape}"
-    elif chunk.actions.dtype != np.float32:
-        found = f"dtype {chunk.actions.dtype}"
-    elif not np.isfinite(chunk.actions).all():
-        row, column = (int(i) for i in np.argwhere(~np.isfinite(chunk.actions))[0])
-        found = f"{chunk.actions[row, column]} at row {row}, dimension '{action_spec.dims[column]}'"
-    else:
-        return
-    raise InvalidActionError(
-        f"{where}: expected {expected}, found {found}. "
-        f"Check the policy's post-processing (un-normalisation, chunk length, dtype)."
-    )
-
-
-def _record(episode: _Episode, spec: PolicySpec, settings: RolloutSettings) -> EpisodeRecord:
-    status = episode.result.status
-    has_candidates = status.n_candidates > 0
-    succeeded = episode.success_step is not None
-    return EpisodeRecord(
-        task=episode.start.task,
-        policy=spec.name,
-        n_action_steps=settings.chunking.n_action_steps,
-        run=episode.start.run,
-        seed=episode.start.seed,
-        outcome="success" if succeeded else "failure",
-        success_once=succeeded,
-        success_at_end=None if settings.stop_at_success and succeeded else status.success,
-        success_step=episode.success_step,
-        n_steps=episode.n_steps,
-        target=status.target,
-        n_candidates=status.n_candidates if has_candidates else None,
-        first_choice=status.first_choice,
-        first_choice_success=status.first_choice in status.right_first_choices if has_candidates else None,
-        n_wrong_choices=status.n_wrong_choices if has_candidates else None,
-        chance_success=status.chance_success,
-        episode_return=episode.episode_return,
-        n_inferences=episode.n_inferences,
-        n_frames=episode.n_frames,
-        n_clipped_steps=episode.n_clipped_steps,
-        trajectory_sha256=episode.digest.hexdigest(),
-        target_place=_place(status, status.target),
-        first_choice_place=_place(status, status.first_choice),
-        tcp_reach_m=episode.tcp_reach_m,
-    )
-
-
-def _place(status: TaskStatus, candidate: int | None) -> int | None:
-    return status.candidate_places[candidate] if status.candidate_places and candidate is not None else None

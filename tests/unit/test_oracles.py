@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vla_eval.core import BodyState, PrivilegedState
 from vla_eval.oracles import carry, catch, cradle, turn
 from vla_eval.oracles.arm_model import action_row, wrapped_rad
+from vla_eval.task_state import BodyState, PrivilegedState
 
 ZERO = np.zeros(3)
 

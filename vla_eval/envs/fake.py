@@ -11,19 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import (
-    BodyState,
-    FloatArray,
-    ImageArray,
-    Observation,
-    Phase,
-    PrivilegedState,
-    StepResult,
-    TaskStatus,
-)
+from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_argument, check_arguments

@@ -14,18 +14,11 @@ import numpy as np
 import sapien
 import torch
 
-from vla_eval.core import (
-    BodyState,
-    FloatArray,
-    ImageArray,
-    Observation,
-    PrivilegedState,
-    StepResult,
-    TaskStatus,
-)
+from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
 from vla_eval.tasks.arms import CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv

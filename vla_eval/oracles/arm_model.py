@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
+from vla_eval.task_state import PrivilegedState
 
 Vector = NDArray[np.float64]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
@@ -17,6 +16,7 @@ from vla_eval.oracles.arm_model import (
     gripper_state,
     towards,
 )
+from vla_eval.task_state import PrivilegedState
 
 HOVER_M = 0.08
 GRASP_M = 0.02

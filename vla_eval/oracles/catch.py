@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     FULL_SPEED_M_S,
     GRIPPER_CLOSED,
@@ -25,6 +24,7 @@ from vla_eval.oracles.arm_model import (
     towards,
 )
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, IMAGINED_Y_M, ROLLING_SHARE, UNSEEN_STEPS
+from vla_eval.task_state import PrivilegedState
 
 HOVER_M = 0.075  # of the tool centre point over the table: fingertips above the ball's top
 GRASP_M = 0.02

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     FULL_SPEED_M_S,
     GRIPPER_CRADLE,
@@ -27,6 +26,7 @@ from vla_eval.oracles.arm_model import (
     advance,
     arm_state,
 )
+from vla_eval.task_state import PrivilegedState
 
 HEIGHT_M = 0.022  # of the tool centre point while waiting and pushing: the ball's centre is at 0.02
 BASE_X_M = -0.615

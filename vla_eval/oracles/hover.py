@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state, towards
+from vla_eval.task_state import PrivilegedState
 
 TOUCH_MARGIN = 1.2  # near enough is 1.2 times the height at which the arm comes to rest
 

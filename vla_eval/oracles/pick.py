@@ -9,7 +9,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
@@ -23,6 +22,7 @@ from vla_eval.oracles.arm_model import (
     turn_towards,
     wrapped_rad,
 )
+from vla_eval.task_state import PrivilegedState
 
 HANDLE_RADIUS_M = 0.061  # of the tool centre point from the mug's axis: fingers clear of the wall
 GRASP_ABOVE_CENTRE_M = 0.012  # the hand stays above the mug's bottom, which is on top

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     GRIPPER_CLOSED,
     ArmState,
@@ -13,6 +12,7 @@ from vla_eval.oracles.arm_model import (
     arm_state,
     towards,
 )
+from vla_eval.task_state import PrivilegedState
 
 TRAVEL_M = 0.16  # of the tool centre point over the table: above all mugs, 8.1 cm high
 PUSH_HEIGHT_M = 0.055  # the hand passes over the mug's top, the fingers push above its centre

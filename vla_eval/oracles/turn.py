@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import (
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
@@ -25,6 +24,7 @@ from vla_eval.oracles.arm_model import (
     turn_towards,
     wrapped_rad,
 )
+from vla_eval.task_state import PrivilegedState
 
 # Joint 7 stands at π/4 and goes to ±2.9 rad: the wrist can turn farther to the left than to the right.
 WRIST_RANGE_RAD = (-1.95, 3.4)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import PrivilegedState
 from vla_eval.oracles.arm_model import GRIPPER_OPEN, ArmState, Vector, action_row, advance, arm_state
+from vla_eval.task_state import PrivilegedState
 
 # Action per metre of distance: a third of the way per step. More is a little faster at one action per
 # inference, but the arm swings, and its model then predicts touches badly.

@@ -9,9 +9,10 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, PrivilegedState
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
+from vla_eval.task_state import PrivilegedState
 
 STATIC_RAD_S = 0.2
 

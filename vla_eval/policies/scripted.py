@@ -17,11 +17,12 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, PrivilegedState
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.choices import CandidateExpert, ChoicePolicy, Mode, VisitExpert, VisitPolicy
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.task_state import PrivilegedState
 
 
 class BallExpert(Protocol):

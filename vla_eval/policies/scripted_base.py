@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import EpisodeStart, ObservationWindow, PrivilegedState
+from vla_eval.core import EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.policies.context import PolicyContext
 from vla_eval.specs import PolicySpec
+from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.streams import Stream, generator
 

@@ -20,7 +20,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import ActionChunk, BodyState, ObservationWindow, PrivilegedState
+from vla_eval.core import ActionChunk, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
@@ -29,6 +29,7 @@ from vla_eval.policies.choices import CandidateExpert
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import BallExpertFactory
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.task_state import BodyState, PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from vla_eval.core import ActionChunk, EpisodeStart, Observation, ObservationWindow, Policy
+from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, Observation, ObservationWindow, Policy
 from vla_eval.specs import EnvSpec, PolicySpec, check_compatible
 from vla_eval.testing.claims import claim
 
@@ -74,8 +74,10 @@ def _episode(
     for index in range(N_INFERENCES):
         windows = [_window(spec, look, start, index) for start in starts]
         before = [_bytes(window) for window in windows]
-        act_batch = getattr(policy, "act_batch", None)
-        answers = act_batch(windows) if act_batch else [policy.act(window) for window in windows]
+        if isinstance(policy, BatchPolicy):
+            answers = policy.act_batch(windows)
+        else:
+            answers = [policy.act(window) for window in windows]
         claim([_bytes(w) for w in windows] == before, "A policy leaves the observations as they are.")
         for slot, answer in enumerate(answers):
             for earlier in chunks[slot]:

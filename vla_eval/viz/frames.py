@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from vla_eval.core import ImageArray, Phase
+from vla_eval.core import ImageArray
 from vla_eval.envs.settings import HUMAN_CAMERA
 from vla_eval.results.records import EpisodeRecord
+from vla_eval.task_state import Phase
 from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 

@@ -1,0 +1,176 @@
+"""What the loop keeps of a running episode: checks, counts, the digest, and in the end the record.
+
+Knows nothing of when a policy is asked or a simulator stepped: that is `rollout.py`.
+"""
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
+from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
+from vla_eval.results.records import EpisodeRecord
+from vla_eval.specs import ActionSpec, PolicySpec
+from vla_eval.task_state import TaskStatus
+
+TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre point, m
+
+
+@dataclass(slots=True, kw_only=True)
+class EpisodeLog:
+    """Counts and digest of one episode.
+
+    Attributes:
+        start: the episode.
+        status: what the task said last.
+        n_steps: control steps executed.
+        success_step: control steps executed when the success rule first held.
+        tcp_start_m: where the tool centre point began; None if its pose is no state of the environment.
+        tcp_reach_m: how far it ever was from there.
+    """
+
+    start: EpisodeStart
+    status: TaskStatus
+    tcp_start_m: NDArray[np.float64] | None
+    tcp_reach_m: float | None = None
+    n_steps: int = 0
+    success_step: int | None = None
+    episode_return: float = 0.0
+    n_inferences: int = 0
+    n_frames: int = 0
+    n_clipped_steps: int = 0
+    digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
+
+    @classmethod
+    def begin(cls, start: EpisodeStart, reset: StepResult) -> Self:
+        """Start the log of an episode from its reset result."""
+        log = cls(start=start, status=reset.status, tcp_start_m=_tcp_m(reset))
+        log._digest_state(reset)
+        return log
+
+    def note_inference(self, *, n_frames: int) -> None:
+        """Count one call of the policy that was given so many observations."""
+        self.n_inferences += 1
+        self.n_frames += n_frames
+
+    def note_step(self, action: FloatArray, result: StepResult, action_spec: ActionSpec) -> None:
+        """Account for one control step.
+
+        Args:
+            action: (A,) the action asked for.
+            result: what came back.
+            action_spec: its bounds; an action beyond them counts as clipped.
+
+        Raises:
+            SimulationError: reward or a state is not finite.
+        """
+        self.n_steps += 1
+        self._check_finite(result)
+        self.status = result.status
+        self._note_reach(result)
+        self.episode_return += result.reward
+        self.n_clipped_steps += bool(np.any(action < action_spec.low) or np.any(action > action_spec.high))
+        self.digest.update(np.ascontiguousarray(action, dtype="<f4").tobytes())
+        self._digest_state(result)
+        if result.status.success and self.success_step is None:
+            self.success_step = self.n_steps
+
+    def record(self, policy: str, n_action_steps: int, *, stops_at_success: bool) -> EpisodeRecord:
+        """Return the record of the finished episode.
+
+        Args:
+            policy: the policy's name.
+            n_action_steps: actions executed per inference.
+            stops_at_success: the episode ended at its first success, so the end is not known.
+        """
+        status, succeeded = self.status, self.success_step is not None
+        has_candidates = status.n_candidates > 0
+        return EpisodeRecord(
+            task=self.start.task,
+            policy=policy,
+            n_action_steps=n_action_steps,
+            run=self.start.run,
+            seed=self.start.seed,
+            outcome="success" if succeeded else "failure",
+            success_once=succeeded,
+            success_at_end=None if stops_at_success and succeeded else status.success,
+            success_step=self.success_step,
+            n_steps=self.n_steps,
+            target=status.target,
+            n_candidates=status.n_candidates if has_candidates else None,
+            first_choice=status.first_choice,
+            first_choice_success=status.first_choice in status.right_first_choices
+            if has_candidates
+            else None,
+            n_wrong_choices=status.n_wrong_choices if has_candidates else None,
+            chance_success=status.chance_success,
+            episode_return=self.episode_return,
+            n_inferences=self.n_inferences,
+            n_frames=self.n_frames,
+            n_clipped_steps=self.n_clipped_steps,
+            trajectory_sha256=self.digest.hexdigest(),
+            target_place=_place(status, status.target),
+            first_choice_place=_place(status, status.first_choice),
+            tcp_reach_m=self.tcp_reach_m,
+        )
+
+    def _note_reach(self, result: StepResult) -> None:
+        position_m = _tcp_m(result)
+        if position_m is not None and self.tcp_start_m is not None:
+            distance_m = float(np.linalg.norm(position_m - self.tcp_start_m))
+            self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
+
+    def _check_finite(self, result: StepResult) -> None:
+        values = {"reward": np.asarray(result.reward), **result.observation.state}
+        for name, value in values.items():
+            if not np.isfinite(value).all():
+                raise SimulationError(
+                    f"{self.start.task}, seed {self.start.seed}, step {self.n_steps}: expected a finite "
+                    f"'{name}', found {value}. The simulation diverged; please report seed and policy."
+                )
+
+    def _digest_state(self, result: StepResult) -> None:
+        state = result.observation.state
+        for name in sorted(state):
+            self.digest.update(np.ascontiguousarray(state[name], dtype="<f4").tobytes())
+
+
+def check_instruction(episode: EpisodeStart) -> None:
+    """Raise `MissingInstructionError` if there is nothing to tell the policy."""
+    if not episode.instruction.strip():
+        raise MissingInstructionError(
+            f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
+        )
+
+
+def check_chunk(chunk: object, spec: PolicySpec, action_spec: ActionSpec, log: EpisodeLog) -> None:
+    """Raise `InvalidActionError` unless this is a finite float chunk of the declared shape."""
+    where = f"policy '{spec.name}', {log.start.task}, seed {log.start.seed}, inference at step {log.n_steps}"
+    expected = f"an ActionChunk of shape ({spec.chunk_size}, {len(action_spec.dims)}), float32, all finite"
+    if not isinstance(chunk, ActionChunk) or not isinstance(chunk.actions, np.ndarray):
+        found = f"{type(chunk).__name__}"
+    elif chunk.actions.shape != (spec.chunk_size, len(action_spec.dims)):
+        found = f"shape {chunk.actions.shape}"
+    elif chunk.actions.dtype != np.float32:
+        found = f"dtype {chunk.actions.dtype}"
+    elif not np.isfinite(chunk.actions).all():
+        row, column = (int(i) for i in np.argwhere(~np.isfinite(chunk.actions))[0])
+        found = f"{chunk.actions[row, column]} at row {row}, dimension '{action_spec.dims[column]}'"
+    else:
+        return
+    raise InvalidActionError(
+        f"{where}: expected {expected}, found {found}. "
+        f"Check the policy's post-processing (un-normalisation, chunk length, dtype)."
+    )
+
+
+def _tcp_m(result: StepResult) -> NDArray[np.float64] | None:
+    pose = result.observation.state.get(TCP_POSE)
+    return None if pose is None else pose[:3].astype(np.float64)
+
+
+def _place(status: TaskStatus, candidate: int | None) -> int | None:
+    return status.candidate_places[candidate] if status.candidate_places and candidate is not None else None

@@ -1,0 +1,88 @@
+"""What a task says of its episode: its status, for the record; the true state, for scripted controls.
+
+Knows nothing of simulators. A learned policy is given none of it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Phase = Literal["cue", "delay", "response"]
+"""Part of an episode: the cue is shown; nothing to remember it by is in view; the answer is due."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskStatus:
+    """What the task says of the episode so far; reading it changes nothing.
+
+    Attributes:
+        phase: the phase at this step.
+        success: the success rule holds at this very step.
+        fail: the episode is lost for good (`strict_choice`, first wrong candidate).
+        target: index of the right candidate; None for a task without candidates or with several right ones.
+        right_first_choices: the candidates that it is right to touch first; empty without candidates.
+        n_candidates: how many candidates there are; 0 for a task without candidates.
+        first_choice: index of the candidate that was touched first in the response phase, if any.
+        n_wrong_choices: how many different wrong candidates have been touched in the response phase.
+        chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
+            environment; None where it has to be measured.
+        candidate_places: the place at which each candidate lies when the response phase begins, in candidate
+            order: 0 is the rightmost as the robot sees it (-y). Empty where places are not known.
+    """
+
+    phase: Phase
+    success: bool
+    fail: bool
+    target: int | None
+    n_candidates: int
+    first_choice: int | None
+    n_wrong_choices: int
+    right_first_choices: tuple[int, ...] = ()
+    chance_success: float | None = None
+    candidate_places: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrivilegedState:
+    """The world as it truly is, for scripted controls. Never given to a learned policy.
+
+    Attributes:
+        phase: the phase that holds at this step.
+        response_step: the step at which the response phase begins (0 for a task without phases).
+        tcp_position_m: (3,) tool centre point, world frame.
+        tcp_velocity_m_s: (3,) its linear velocity, world frame.
+        gripper_width_m: gap between the fingers, 0 to 0.08.
+        candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
+            be), world frame, in candidate order; (0, 3) for a task without candidates.
+        target: index of the right candidate; None for a task without candidates or with several right ones.
+        right_candidates: indices of all right candidates, in the order shown; empty without candidates.
+        in_order: whether several right candidates must be touched in that order.
+        touched_candidates: indices of those touched so far, in the order of first touch.
+        bodies: bodies and places by name, as the task names them: `ball`, `goal` …
+        tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
+    """
+
+    phase: Phase
+    response_step: int
+    tcp_position_m: NDArray[np.float64]
+    tcp_velocity_m_s: NDArray[np.float64]
+    gripper_width_m: float
+    candidate_positions_m: NDArray[np.float64]
+    target: int | None
+    right_candidates: tuple[int, ...] = ()
+    in_order: bool = False
+    touched_candidates: tuple[int, ...] = ()
+    bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
+    tcp_yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyState:
+    """Position (m) and linear velocity (m/s) of a body, each (3,), and its yaw, in the world frame."""
+
+    position_m: NDArray[np.float64]
+    velocity_m_s: NDArray[np.float64]
+    yaw_rad: float = 0.0
