@@ -50,6 +50,24 @@ def test_decoding_all_at_once_is_the_originals() -> None:
     torch.testing.assert_close(told[0], expected, atol=golden.TOLERANCE, rtol=0)
 
 
+def test_the_loss_of_tokens_all_at_once_is_the_originals_with_the_stop_token() -> None:
+    network, chunk = made("parallel_tokens"), golden.values()["train.actions"]
+    inputs = Inputs(golden.pictures(2), golden.training_prompts())
+    with torch.no_grad():
+        loss = token_loss(network, inputs, chunk, torch.ones(chunk.shape[:2]))
+        sequence = network.sequence(inputs)
+        logits = network.llm.lm_head(network.hidden(sequence))
+    # The original labels all that follows a prompt, the stop token included, and transformers predicts each
+    # label one position before it; the rest is left out (-100).
+    tokens = TEXT - np.digitize(chunk.flatten(1).numpy().clip(-1, 1), np.linspace(-1, 1, 256))
+    labels = torch.full(logits.shape[:2], -100)
+    for row, (first, answer) in enumerate(zip(sequence.first_action, tokens, strict=True)):
+        labels[row, first : first + len(answer) + 1] = torch.tensor([*answer, golden.SIZES.stop_token])
+    assert (labels != -100).sum(dim=1).tolist() == [57, 57]  # 8 actions of 7 numbers, and stop
+    expected = functional.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
+    torch.testing.assert_close(loss, expected)
+
+
 class TestOneAfterTheOther:
     @pytest.fixture
     def network(self) -> OpenVLANetwork:
