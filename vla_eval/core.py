@@ -43,7 +43,6 @@ class PrivilegedState:
         in_order: whether several right candidates must be touched in that order.
         touched_candidates: indices of those touched so far, in the order of first touch.
         bodies: bodies and places by name, as the task names them: `ball`, `goal` …
-        state_vector: (D,) the simulator's own flat state observation, for experts that are learned on it.
         tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
     """
 
@@ -58,7 +57,6 @@ class PrivilegedState:
     in_order: bool = False
     touched_candidates: tuple[int, ...] = ()
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
-    state_vector: FloatArray = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
     tcp_yaw_rad: float = 0.0
 
 

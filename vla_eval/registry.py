@@ -30,7 +30,6 @@ POLICIES = {
     "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
     "openvla": "vla_eval.policies.openvla.paper_compat:make_openvla",
-    "ppo_expert": "vla_eval.policies.ppo_expert:make_ppo_expert",
 }
 
 

@@ -41,6 +41,13 @@ def test_every_module_of_the_package_is_in_the_wheel(wheel: zipfile.ZipFile) -> 
     assert modules <= set(wheel.namelist())
 
 
+def test_the_templates_of_the_report_page_are_in_the_wheel(wheel: zipfile.ZipFile) -> None:
+    templates = [path for path in (ROOT / "vla_eval/page/templates").iterdir() if path.is_file()]
+    assert {path.suffix for path in templates} == {".j2", ".css"}
+    for path in templates:
+        assert wheel.read(path.relative_to(ROOT).as_posix()) == path.read_bytes()
+
+
 def test_the_wheel_says_that_it_is_typed(wheel: zipfile.ZipFile) -> None:
     assert "vla_eval/py.typed" in wheel.namelist()
 

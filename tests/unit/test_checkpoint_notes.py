@@ -79,29 +79,6 @@ def test_other_weights_are_another_run_whichever_adapter_reads_them(
     assert {name for name in before if before[name] != after[name]} == {"checkpoints/mine"}
 
 
-def test_other_weights_of_a_learned_expert_are_another_run_and_another_recording(tmp_path: Path) -> None:
-    expert = tmp_path / "expert"
-    expert.mkdir()
-    (expert / "config.json").write_text("{}")
-    (expert / "expert.safetensors").write_bytes(b"one")
-    (expert / "progress.jsonl").write_text("a line")
-
-    def notes() -> tuple[dict[str, str], dict[str, str]]:
-        evaluated = plan(tmp_path, "ppo_expert", expert).recipe_hashes
-        data = {"name": "d", "tasks": ["RememberColor3-v0"], "expert": str(tmp_path / "mine.yaml")}
-        return dict(evaluated), plan_recording(decode(DatasetRecipe, data, where="test")).recipe_files
-
-    before = notes()
-    (expert / "progress.jsonl").write_text("two lines")
-    assert notes() == before
-    (expert / "expert.safetensors").write_bytes(b"two")
-    for old, new in zip(before, notes(), strict=True):
-        assert {name for name in old if old[name] != new[name]} == {"checkpoints/mine/expert.safetensors"}
-    (expert / "expert.safetensors").unlink()
-    with pytest.raises(CheckpointError, match=r"expert\.safetensors: expected a file of `mikasa-vla train"):
-        notes()
-
-
 def test_a_run_says_by_which_statistics_its_policies_normalise(tmp_path: Path, checkpoint: Path) -> None:
     expected = {
         "of": "the checkpoint",

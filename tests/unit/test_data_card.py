@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from huggingface_hub import DatasetCard
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
@@ -32,6 +33,16 @@ def test_the_front_matter_is_what_the_hub_reads(recorded: Path) -> None:
     assert data["task_categories"] == ["robotics"]
     assert "LeRobot" in data["tags"]  # type: ignore[operator]
     assert data["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+
+
+def test_the_hubs_own_class_reads_the_card_as_it_was_written(recorded: Path) -> None:
+    text = write_card(recorded, license_id="cc-by-4.0")
+    card = DatasetCard.load(recorded / CARD_FILE)
+
+    assert card.data.license == "cc-by-4.0"
+    assert card.data.to_dict() == front_matter(text)
+    assert card.content == text
+    assert card.text.startswith("\n# ")
 
 
 def test_the_numbers_are_those_of_the_dataset(recorded: Path) -> None:

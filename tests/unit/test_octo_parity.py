@@ -4,7 +4,7 @@
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 from unittest.mock import patch
@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
+from tests.unit.golden_values import GoldenValues
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.octo import diffusion_head, transformer
 from vla_eval.policies.octo.diffusion_head import Draws, HeadSizes, Targets, cosine_schedule
@@ -29,8 +30,8 @@ WITH_LANGUAGE = [case for case in CONFIG["cases"] if case != "w2_nolang"]
 
 
 @pytest.fixture(scope="module")
-def io() -> dict[str, Tensor]:
-    return dict(load_file(GOLDEN / "io.safetensors"))
+def io() -> GoldenValues:
+    return GoldenValues(GOLDEN / "io.safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +67,7 @@ def sizes() -> tuple[TransformerSizes, HeadSizes]:
     )
 
 
-@pytest.fixture(scope="module")
-def network(weights: dict[str, Tensor]) -> OctoNetwork:
+def make_network(weights: Mapping[str, Tensor]) -> OctoNetwork:
     made = OctoNetwork(*sizes())
     converted = from_flax(weights)
     prefix = "network."
@@ -76,7 +76,12 @@ def network(weights: dict[str, Tensor]) -> OctoNetwork:
     return made
 
 
-def window(io: dict[str, Tensor], case: str) -> Window:
+@pytest.fixture(scope="module")
+def network(weights: dict[str, Tensor]) -> OctoNetwork:
+    return make_network(weights)
+
+
+def window(io: Mapping[str, Tensor], case: str) -> Window:
     n_steps = io[f"{case}.timestep_pad_mask"].shape[1]
     images, masks = {}, {}
     for camera in CONFIG["cameras"]:
@@ -102,7 +107,7 @@ class TestForward:
     @pytest.mark.parametrize("case", CONFIG["cases"])
     @torch.no_grad()
     def test_tokens_readouts_and_noise_are_those_of_the_original(
-        self, io: dict[str, Tensor], network: OctoNetwork, case: str
+        self, io: Mapping[str, Tensor], network: OctoNetwork, case: str
     ) -> None:
         outputs = network.transformer(window(io, case))
         assert furthest(outputs.readout_BWD, io[f"{case}.out.readout_action"]) < TIGHT
@@ -118,7 +123,7 @@ class TestForward:
 
     @torch.no_grad()
     def test_image_tokens_are_those_of_the_original(
-        self, io: dict[str, Tensor], network: OctoNetwork
+        self, io: Mapping[str, Tensor], network: OctoNetwork
     ) -> None:
         tokens = network.transformer.image_tokens(window(io, "wmax"))
         for camera in CONFIG["cameras"]:
@@ -126,7 +131,7 @@ class TestForward:
 
     @torch.no_grad()
     def test_the_text_encoder_of_transformers_is_that_of_the_original(
-        self, io: dict[str, Tensor], weights: dict[str, Tensor]
+        self, io: Mapping[str, Tensor], weights: dict[str, Tensor]
     ) -> None:
         from vla_eval.policies.octo.language import T5Sizes, make_text_encoder
 
@@ -150,10 +155,12 @@ class TestForward:
             input_ids=io["in.language_input_ids"], attention_mask=io["in.language_attention_mask"]
         ).last_hidden_state
         assert furthest(embedded, io["mid.language_embeddings"]) < TIGHT
+        # Padding of an instruction is attended to like its words: there is one mask per instruction.
+        assert io["mid.language_token_mask"].all()
 
 
 class TestDiffusion:
-    def test_the_schedule_is_that_of_the_original(self, io: dict[str, Tensor]) -> None:
+    def test_the_schedule_is_that_of_the_original(self, io: Mapping[str, Tensor]) -> None:
         schedule = cosine_schedule(CONFIG["action_head"]["diffusion_steps"])
         for name, values in zip(("betas", "alphas", "alpha_hats"), schedule, strict=True):
             assert furthest(values, io[f"schedule.{name}"]) < 1e-6
@@ -161,7 +168,7 @@ class TestDiffusion:
     @pytest.mark.parametrize("case", ["w1", "wmax_padhist"])
     @torch.no_grad()
     def test_sampling_from_the_same_noise_gives_the_same_chunk(
-        self, io: dict[str, Tensor], network: OctoNetwork, case: str
+        self, io: Mapping[str, Tensor], network: OctoNetwork, case: str
     ) -> None:
         readout = io[f"{case}.out.readout_action"][:, -1]
         chunk = network.head.sample(readout, sampling_noise(io, case))
@@ -169,11 +176,12 @@ class TestDiffusion:
 
     @pytest.mark.parametrize(("case", "loss"), [("w1", "w1"), ("wmax_pad_wristmask",) * 2])
     def test_loss_and_gradients_are_those_of_the_original(
-        self, io: dict[str, Tensor], network: OctoNetwork, case: str, loss: str
+        self, io: Mapping[str, Tensor], network: OctoNetwork, case: str, loss: str
     ) -> None:
         network.zero_grad()
         value = loss_of(network, io, case)
-        assert furthest(value.detach()[None], io[f"loss.{loss}.value"]) < TIGHT
+        for name in ("value", "mse"):  # the same, where the loss is the squared error
+            assert furthest(value.detach()[None], io[f"loss.{loss}.{name}"]) < TIGHT
         value.backward()
         gradients = {f"network.{name}": x.grad for name, x in network.named_parameters()}
         for key, norm in zip(CONFIG["gradient_norm_order"], io[f"loss.{loss}.grad_norms"], strict=True):
@@ -189,12 +197,12 @@ class TestDiffusion:
             assert furthest(cast(Tensor, found), expected) < TIGHT
 
 
-def sampling_noise(io: dict[str, Tensor], case: str) -> Tensor:
+def sampling_noise(io: Mapping[str, Tensor], case: str) -> Tensor:
     start, added = io[f"sample.{case}.x_init"][:, None], io[f"sample.{case}.z"].transpose(0, 1)
     return torch.cat([start, added], dim=1)[:, :, -1]  # of the window, the newest step is executed
 
 
-def loss_of(network: OctoNetwork, io: dict[str, Tensor], case: str) -> Tensor:
+def loss_of(network: OctoNetwork, io: Mapping[str, Tensor], case: str) -> Tensor:
     seen = window(io, case)
     outputs: Outputs = network.transformer(seen)
     return network.head.loss(
@@ -233,7 +241,7 @@ REAL_MASK = transformer.attention_mask
 class TestTraps:
     """What ports get wrong moves a readout by more than the tolerance."""
 
-    def moved(self, network: OctoNetwork, io: dict[str, Tensor], case: str) -> float:
+    def moved(self, network: OctoNetwork, io: Mapping[str, Tensor], case: str) -> float:
         with torch.no_grad():
             readout = network.transformer(window(io, case)).readout_BWD
         return furthest(readout, io[f"{case}.out.readout_action"])
@@ -252,7 +260,7 @@ class TestTraps:
         ids=["deviation", "gelu", "readouts", "padding", "causality", "epsilon", "levels"],
     )
     def test_a_broken_transformer_is_noticed(
-        self, io: dict[str, Tensor], network: OctoNetwork, target: Any, attribute: str, broken: Any
+        self, io: Mapping[str, Tensor], network: OctoNetwork, target: Any, attribute: str, broken: Any
     ) -> None:
         with patch.object(target, attribute, broken):
             assert self.moved(network, io, "wmax_pad_wristmask") > TIGHT
@@ -267,7 +275,7 @@ class TestTraps:
         ids=["padded steps", "colours in reverse", "missing camera"],
     )
     def test_a_wrong_window_is_noticed(
-        self, io: dict[str, Tensor], network: OctoNetwork, change: Callable[[Window], Window]
+        self, io: Mapping[str, Tensor], network: OctoNetwork, change: Callable[[Window], Window]
     ) -> None:
         case = "wmax_pad_wristmask"
         with torch.no_grad():
@@ -275,10 +283,15 @@ class TestTraps:
         assert furthest(readout, io[f"{case}.out.readout_action"]) > TIGHT
 
     def test_a_schedule_without_the_offset_or_noise_in_the_last_step_is_noticed(
-        self, io: dict[str, Tensor], network: OctoNetwork
+        self, io: Mapping[str, Tensor], network: OctoNetwork
     ) -> None:
         with patch.object(diffusion_head, "SCHEDULE_OFFSET", 0.0):
-            assert furthest(cosine_schedule(20).betas, io["schedule.betas"]) > TIGHT
+            assert (
+                furthest(
+                    cosine_schedule(CONFIG["action_head"]["diffusion_steps"]).betas, io["schedule.betas"]
+                )
+                > TIGHT
+            )
         noise = torch.cat([io["sample.w1.x_init"][:, None], io["sample.w1.z"].transpose(0, 1)], dim=1)[
             :, :, -1
         ]
@@ -287,7 +300,9 @@ class TestTraps:
             chunk = network.head.sample(io["w1.out.readout_action"][:, -1], late)
         assert furthest(chunk, io["sample.w1.actions"]) > TIGHT
 
-    def test_a_loss_that_counts_padding_is_noticed(self, io: dict[str, Tensor], network: OctoNetwork) -> None:
+    def test_a_loss_that_counts_padding_is_noticed(
+        self, io: Mapping[str, Tensor], network: OctoNetwork
+    ) -> None:
         case = "wmax_pad_wristmask"
         everything = {
             **io,

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from safetensors.torch import load_file
 from torch import Tensor
 
+from tests.unit.golden_values import GoldenValues
 from tests.unit.tiny_octo import GOLDEN, TINY
 from vla_eval.cli.main import main
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
@@ -34,6 +36,10 @@ from vla_eval.results.store import read_run
 
 TASK = "RememberColor3-v0"
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
+CHUNK_KEYS = (
+    *("trajectory_actions", "observation_index", "actions"),
+    *("timestep_pad_mask", "action_pad_mask", "task_completed"),
+)
 
 
 def tiny_policy(**fields: Any) -> MikasaOctoPolicy:
@@ -57,31 +63,40 @@ def batch(policy: MikasaOctoPolicy, *, n: int = 2, n_missing: int = 0) -> dict[s
 
 
 @pytest.fixture(scope="module")
-def golden() -> dict[str, Tensor]:
-    return dict(load_file(GOLDEN / "io.safetensors"))
+def golden() -> GoldenValues:
+    return GoldenValues(GOLDEN / "io.safetensors")
 
 
 class TestWindows:
-    def test_training_targets_are_the_originals_where_they_count(self, golden: dict[str, Tensor]) -> None:
-        """From a trajectory of 10 steps as lerobot gives it: ends repeated, and flags for what is beyond."""
-        policy = tiny_policy(window=4, max_window=4)
-        actions = golden["data.chunk_full.trajectory_actions"]
+    @pytest.mark.parametrize("name", ["chunk_full", "chunk_w2"])
+    def test_training_targets_are_the_originals_where_they_count(
+        self, golden: Mapping[str, Tensor], name: str
+    ) -> None:
+        """From a trajectory as lerobot gives it: ends repeated, and flags for what is beyond."""
+        stored = {key: golden[f"data.{name}.{key}"] for key in CHUNK_KEYS}
+        actions, windows = stored["trajectory_actions"], stored["observation_index"]
+        n_window, n_chunk = stored["actions"].shape[1:3]
+        policy = tiny_policy(window=n_window, max_window=n_window, chunk_size=n_chunk)
         for step in range(len(actions)):
-            wanted = torch.arange(step - 3, step + 4)
+            wanted = torch.arange(step - n_window + 1, step + n_chunk)
+            assert torch.equal(wanted[:n_window].clamp(min=0), windows[step])
             targets = policy._targets(
                 {
                     "action": actions[wanted.clamp(0, len(actions) - 1)][None],
                     "action_is_pad": ((wanted < 0) | (wanted >= len(actions)))[None],
                 }
             )
-            assert torch.equal(targets.step_mask[0], golden["data.chunk_full.timestep_pad_mask"][step])
-            counts = targets.step_mask[0][:, None, None] & targets.action_mask[0]
-            expected = golden["data.chunk_full.action_pad_mask"][step]
-            assert torch.equal(counts, targets.step_mask[0][:, None, None] & expected)
-            found = targets.actions[0][counts]
-            assert torch.equal(found, golden["data.chunk_full.actions"][step][counts])
+            is_real = stored["timestep_pad_mask"][step]
+            assert torch.equal(targets.step_mask[0], is_real)
+            counts = is_real[:, None, None] & targets.action_mask[0]
+            assert torch.equal(counts, is_real[:, None, None] & stored["action_pad_mask"][step])
+            # No action counts once the task is done, which it is after the last step.
+            assert torch.equal(counts[..., 0], is_real[:, None] & ~stored["task_completed"][step])
+            assert torch.equal(targets.actions[0][counts], stored["actions"][step][counts])
 
-    def test_history_in_an_episode_is_that_of_the_originals_wrapper(self, golden: dict[str, Tensor]) -> None:
+    def test_history_in_an_episode_is_that_of_the_originals_wrapper(
+        self, golden: Mapping[str, Tensor]
+    ) -> None:
         """8 rows: the reset and 7 steps, each with the frames of a window of 4, also within a chunk."""
         policy = tiny_policy(window=4, max_window=4)
         seen: list[dict[str, Tensor]] = []
@@ -131,6 +146,26 @@ class TestTraining:
         kernels, others = policy.get_optim_params()
         assert len(kernels["params"]) + len(others["params"]) == len(named)
         assert others["weight_decay"] == 0.0 and all(x.ndim > 1 for x in kernels["params"])
+
+    def test_decay_is_for_just_the_kernels_of_the_original(self) -> None:
+        """The original's rule is `"kernel" in path`; norms have scales there, positions are embeddings."""
+        policy = tiny_policy(trained="all")
+        stem = (*(f"convolutions.{index}" for index in range(4)), "embedding")
+        trunk = [
+            *(f"stems.{camera}.{part}" for camera in ("primary", "wrist") for part in stem),
+            *("projections.primary", "projections.wrist", "language_projection"),
+            *(f"blocks.0.{part}" for part in ("query", "key", "value", "out", "fc1", "fc2")),
+        ]
+        head = ["time_fc1", "time_fc2", "first", "last", "blocks.0.fc1", "blocks.0.fc2"]
+        expected = {
+            "network.head.frequencies",  # `time_preprocess.kernel`
+            *(f"network.transformer.{name}.weight" for name in trunk),
+            *(f"network.head.{name}.weight" for name in head),
+        }
+        kernels, others = policy.get_optim_params()
+        names = {id(x): name for name, x in policy.named_parameters()}
+        assert {names[id(x)] for x in kernels["params"]} == expected
+        assert "weight_decay" not in kernels and others["weight_decay"] == 0.0
 
     def test_remembered_readouts_are_computed_once_and_are_the_same(self) -> None:
         policy = tiny_policy(remember_readouts=True, augment=False)

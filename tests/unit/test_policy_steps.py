@@ -11,9 +11,10 @@ import pytest
 import torch
 from lerobot.lerobot_types import TransitionKey
 from lerobot.processor import PolicyProcessorPipeline
-from safetensors.torch import load_file
 from torch import nn
 
+from tests.unit import spatialvla_golden
+from tests.unit.golden_values import GoldenValues
 from vla_eval.errors import CheckpointError, RecipeError, TrainingError
 from vla_eval.policies.steps.gripper import Gripper
 from vla_eval.policies.steps.images import (
@@ -24,6 +25,7 @@ from vla_eval.policies.steps.images import (
     centre_crop,
     crop_and_resize,
     resize_and_centre_crop,
+    resize_bicubic,
     resize_lanczos3,
 )
 from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
@@ -35,8 +37,8 @@ ALL7 = mask_all_but(7, left_alone=(-1,))
 
 
 @pytest.fixture(scope="module")
-def golden() -> dict[str, torch.Tensor]:
-    return dict(load_file(GOLDEN / "io.safetensors"))
+def golden() -> GoldenValues:
+    return GoldenValues(GOLDEN / "io.safetensors")
 
 
 def channels_first(image: torch.Tensor) -> torch.Tensor:
@@ -44,7 +46,7 @@ def channels_first(image: torch.Tensor) -> torch.Tensor:
 
 
 class TestNormalizer:
-    def test_mean_std_with_a_mask_is_that_of_the_original(self, golden: dict[str, torch.Tensor]) -> None:
+    def test_mean_std_with_a_mask_is_that_of_the_original(self, golden: GoldenValues) -> None:
         spec = Normalization(kind="mean_std", mask=tuple(golden["data.norm.mask"].tolist()))
         stats = {"mean": golden["data.norm.mean"], "std": golden["data.norm.std"]}
         normalizer = Normalizer(spec, stats, where="golden")
@@ -61,13 +63,43 @@ class TestNormalizer:
         torch.testing.assert_close(normalizer.normalize(values), expected)
         torch.testing.assert_close(normalizer.unnormalize(expected[1]), values[1])
 
-    @pytest.mark.parametrize("kind", ["mean_std", "q01_q99"])
-    def test_a_dimension_that_does_not_vary_is_zero_and_back_its_value(self, kind: Any) -> None:
-        stats = {"mean": [0.3], "std": [1e-9], "q01": [0.3], "q99": [0.3]}
-        normalizer = Normalizer(Normalization(kind=kind, mask=(True,)), stats, where="x")
-        noisy = torch.tensor([0.3 + 1e-6])  # (x - mean) / std would be a thousand
-        assert normalizer.normalize(noisy).item() == 0.0
-        assert normalizer.unnormalize(torch.tensor([5.0])).item() == pytest.approx(0.3)
+    def test_a_dimension_whose_extremes_are_equal_is_zero_and_back_its_value(self) -> None:
+        stats = {"q01": [0.3, 1.0], "q99": [0.3, 1.0], "min": [0.3, 1.0], "max": [0.3, 1.0]}
+        spec = Normalization(kind="q01_q99", mask=(True, False), clip=True)
+        # Without extremes, as in checkpoints from before they were kept, equal quantiles stand for them.
+        for known in (stats, {name: stats[name] for name in ("q01", "q99")}):
+            normalizer = Normalizer(spec, known, where="x")
+            # A gripper that is always open is not normalised, and stays open.
+            assert normalizer.normalize(torch.tensor([0.3, 1.0])).tolist() == [0.0, 1.0]
+            back = normalizer.unnormalize(torch.tensor([0.5, 1.0]))
+            assert back.tolist() == pytest.approx([0.3, 1.0])
+            assert set(normalizer.statistics) == set(known)
+
+    def test_a_dimension_that_moves_once_in_a_hundred_frames_is_at_the_ends(self) -> None:
+        stats = {"q01": [0.3], "q99": [0.3], "min": [0.3], "max": [0.8]}
+        normalizer = Normalizer(Normalization(kind="q01_q99", mask=(True,), clip=True), stats, where="x")
+        assert normalizer.normalize(torch.tensor([[0.3], [0.8]])).flatten().tolist() == [-1.0, 1.0]
+        assert normalizer.unnormalize(torch.tensor([-1.0])).item() == pytest.approx(0.3)
+
+    def test_without_deviation_the_mean_is_zero_and_back_the_mean(self) -> None:
+        spec = Normalization(kind="mean_std", mask=(True,))
+        normalizer = Normalizer(spec, {"mean": [0.5], "std": [0.0]}, where="x")
+        assert normalizer.normalize(torch.tensor([0.5])).item() == 0.0
+        assert normalizer.unnormalize(torch.tensor([3.0])).item() == 0.5
+        # The original divides by 1e-8 what does not fit its statistics.
+        assert normalizer.normalize(torch.tensor([0.5 + 2**-20])).item() == pytest.approx(2**-20 / 1e-8)
+
+    def test_q01_q99_is_that_of_the_original_and_back_what_was_not_cut(self) -> None:
+        golden = spatialvla_golden.values()
+        names = ("actions", "mask", "min", "max", "q01", "q99", "normalised")
+        values = {name: golden[f"data.norm.{name}"] for name in names}
+        spec = Normalization(kind="q01_q99", mask=tuple(values["mask"].tolist()), clip=True)
+        normalizer = Normalizer(spec, values, where="golden")
+        normalized = normalizer.normalize(values["actions"])
+        torch.testing.assert_close(normalized, values["normalised"], atol=1e-6, rtol=0)
+        is_inside = (values["normalised"].abs() < 1) | ~values["mask"]
+        back = normalizer.unnormalize(normalized)
+        torch.testing.assert_close(back[is_inside], values["actions"][is_inside], atol=1e-6, rtol=0)
 
     @pytest.mark.parametrize(
         ("stats", "message"),
@@ -162,21 +194,19 @@ class TestProcessorSteps:
 
 class TestImages:
     @pytest.mark.parametrize("case", ["resize_down", "resize_up", "resize_down_rect"])
-    def test_resizing_is_tensorflows_to_a_level(self, golden: dict[str, torch.Tensor], case: str) -> None:
+    def test_resizing_is_tensorflows_to_a_level(self, golden: GoldenValues, case: str) -> None:
         expected = channels_first(golden[f"data.{case}.resized"])
         size = Size(*expected.shape[-2:])
         resized = resize_lanczos3(channels_first(golden[f"data.{case}.image"]), size)
         assert float((resized - expected).abs().max()) <= 1
 
-    def test_a_filter_without_antialiasing_would_be_seen(self, golden: dict[str, torch.Tensor]) -> None:
+    def test_a_filter_without_antialiasing_would_be_seen(self, golden: GoldenValues) -> None:
         expected = channels_first(golden["data.resize_down.resized"])
         image = channels_first(golden["data.resize_down.image"])
         other = nn.functional.interpolate(image[None], size=64, mode="bicubic")[0]
         assert float((other - expected).abs().max()) > 10
 
-    def test_resize_and_centre_crop_are_those_of_the_originals_evaluation(
-        self, golden: dict[str, torch.Tensor]
-    ) -> None:
+    def test_resize_and_centre_crop_are_those_of_the_originals_evaluation(self, golden: GoldenValues) -> None:
         image = channels_first(golden["data.eval_resize_crop.image"])
         cropped = resize_and_centre_crop(image[None], Size(64, 64), 0.9)[0]
         expected = channels_first(golden["data.eval_resize_crop.out"])
@@ -218,6 +248,28 @@ class TestImages:
     def test_no_saturation_is_grey(self) -> None:
         grey = augment(torch.rand(1, 1, 3, 4, 4) * 255, Augmentation(saturation=(0.0, 0.0)))
         torch.testing.assert_close(grey[:, :, 0], grey[:, :, 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda images: resize_lanczos3(images, Size(7, 5)),
+        lambda images: resize_bicubic(images, Size(7, 5)),
+        lambda images: resize_and_centre_crop(images, Size(7, 5), 0.9),
+        lambda images: centre_crop(images, 0.9),
+        lambda images: augment(images, Augmentation(crop_area=(0.5, 0.6), contrast=(0.8, 1.2), hue=0.1)),
+        lambda images: crop_and_resize(images, Boxes(*(torch.full((2,), 0.3) for _ in range(4)))),
+    ],
+)
+def test_images_are_changed_in_float32_whatever_the_network_is_run_in(change: Any) -> None:
+    images = torch.rand(2, 1, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round()
+    torch.manual_seed(1)
+    wanted = change(images)
+    for given in (images, images.bfloat16()):  # whole levels up to 255 are exact in bfloat16
+        torch.manual_seed(1)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            found = change(given)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
 
 
 class Tiny(nn.Module):

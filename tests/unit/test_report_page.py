@@ -8,13 +8,14 @@ from functools import lru_cache
 from html.parser import HTMLParser
 from pathlib import Path
 
+import matplotlib
 import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.errors import ReportError
-from vla_eval.page.build import build_page, write_page
-from vla_eval.page.charts import Bar, Point, Series, curves, forest
-from vla_eval.page.markup import element, with_code
+from vla_eval.page.build import build_page, with_code, write_page
+from vla_eval.page.charts import MARKERS, Bar, Chart, Point, Series, curves, forest, sign
+from vla_eval.page.svg import PALETTE
 from vla_eval.results.recording_files import video_file
 from vla_eval.results.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
@@ -174,11 +175,32 @@ def test_what_is_missing_is_said_in_words() -> None:
     assert "No videos were recorded" in sections["episodes"]
 
 
-def test_text_of_a_run_never_becomes_markup() -> None:
-    evil = "</script><script>alert(1)</script><img src=http://evil>"
-    page = build_page([stored(episode(evil, 1, True), error("p", 2, evil), name=evil)])
+@pytest.mark.parametrize(
+    "evil",
+    [
+        "</script><script>alert(1)</script><img src=http://evil>",
+        "</text></svg><script>alert(1)</script>",
+        '"><script>alert(1)</script><a title="',
+        "{{ 7 * 7 }}{% include 'page.css' %}",  # a template's marks
+        r"$\frac{$ & ünï 記憶",  # no formula; no glyph of matplotlib's font
+        "\x1b[31m red \x00",  # no XML can hold these
+    ],
+)
+def test_text_of_a_run_never_becomes_markup(evil: str) -> None:
+    page = build_page(
+        [stored(episode(evil, 1, True), episode(evil, 1, True, k=4), error("p", 2, evil), name=evil)]
+    )
+    read = Page(page)
     assert "<script>alert" not in page
-    assert Page(page).loads.count("http://evil") == 0
+    assert [link for link in read.loads if "evil" in link] == []
+    assert read.rows[1][1] == evil  # the name of the policy is shown as it is
+    assert evil in read.sections["errors"] and evil in read.sections["reproduce"]
+    assert "49" not in read.sections["table"]
+
+
+def test_a_name_is_drawn_as_it_is() -> None:
+    drawn = one_bar(r'$a$ <b> & "c"').svg
+    assert r'>$a$ &lt;b&gt; &amp; "c"</text>' in drawn
 
 
 def test_nothing_is_loaded_from_anywhere(tmp_path: Path) -> None:
@@ -187,9 +209,14 @@ def test_nothing_is_loaded_from_anywhere(tmp_path: Path) -> None:
     video.parent.mkdir()
     video.write_bytes(b"not a video, but bytes")
     page = build_page([run])
-    assert "default-src &#x27;none&#x27;" in page
+    assert "default-src 'none'" in page
     links = [link for link in Page(page).loads if not link.startswith("#")]
     assert {link.split(",")[0] for link in links} == {"data:", "data:video/mp4;base64"}
+
+
+def one_bar(label: str = "a") -> Chart:
+    bar = Bar(label=label, color=0, value=0.5, low=0.25, high=0.75, chance=0.3, ceiling=1.0)
+    return forest([bar], title="t", description="d")
 
 
 def test_a_rate_lies_where_it_belongs_and_no_result_is_said_in_words() -> None:
@@ -197,12 +224,12 @@ def test_a_rate_lies_where_it_belongs_and_no_result_is_said_in_words() -> None:
         Bar(label="a", color=0, value=0.5, low=0.25, high=0.75, chance=None, ceiling=None),
         Bar(label="b", color=1, value=None, low=None, high=None, chance=None, ceiling=None),
     ]
-    drawn = forest(bars, title="t", description="d")
-    whisker = re.search(r'<line x1="([\d.]+)" x2="([\d.]+)" [^>]*class="whisker', drawn)
-    marker = re.search(r'<circle cx="([\d.]+)"', drawn)
+    drawn = forest(bars, title="t", description="d").svg
+    whisker = re.search(r'<g class="whisker"><path d="M ([\d.]+) [\d.]+ L ([\d.]+) ', drawn)
+    marker = re.search(r'<g class="marker"><path [^>]*translate\(([\d.]+) ', drawn)
     assert whisker and marker
-    assert float(marker[1]) - float(whisker[1]) == pytest.approx(100, abs=0.02)  # a quarter of 400 px
-    assert float(whisker[2]) - float(marker[1]) == pytest.approx(100, abs=0.02)
+    assert float(marker[1]) - float(whisker[1]) == pytest.approx(80, abs=0.02)  # a quarter of 320 px
+    assert float(whisker[2]) - float(marker[1]) == pytest.approx(80, abs=0.02)
     assert "no result" in drawn
 
 
@@ -210,15 +237,55 @@ def test_a_higher_rate_is_drawn_higher() -> None:
     points = (Point(1, 0.0), Point(8, 1.0))
     drawn = curves(
         [Series(name="p", color=0, points=points)], title="t", description="d", x_title="K", x_ticks=[1, 8]
-    )
-    corners = re.search(r'points="([\d.]+),([\d.]+) ([\d.]+),([\d.]+)"', drawn)
+    ).svg
+    corners = re.search(r'<g class="curve"><path d="M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)"', drawn)
     assert corners is not None
     x1, y1, x2, y2 = map(float, corners.groups())
     assert x1 < x2 and y1 - y2 == pytest.approx(180)  # the height of the plot
 
 
-def test_elements_escape_text_and_attributes() -> None:
-    assert element("p", "a<b", title='"&') == '<p title="&quot;&amp;">a&lt;b</p>'
+def test_a_rate_holds_until_the_step_of_the_next_success() -> None:
+    points = (Point(0, 0.0), Point(50, 1.0), Point(100, 1.0))
+    one = Series(name="p", color=0, points=points, is_step=True)
+    drawn = curves([one], title="t", description="d", x_title="step", x_ticks=[0, 100]).svg
+    path = re.search(r'<g class="curve"><path d="M ([^"]*)"', drawn)
+    assert path is not None
+    corners = [tuple(map(float, corner.split())) for corner in path[1].split(" L ")]
+    (x0, low), (x50, high), (x100, _) = corners[0], corners[2], corners[-1]
+    assert x50 - x0 == pytest.approx(x100 - x50, abs=0.02)
+    assert (x50, low) in corners and (x50, high) in corners and low > high  # straight up, not slanting
+
+
+def test_colors_are_those_of_the_page_so_that_dark_mode_and_print_have_theirs() -> None:
+    drawn = one_bar().svg + "".join(sign(n, is_line=line) for n in range(9) for line in (True, False))
+    used = set(re.findall(r"(?:fill|stroke): ([^;\"]+)", drawn))
+    assert used <= {f"var(--{name})" for name in PALETTE} | {"none"}
+    assert {"var(--c0)", "var(--c5)", "var(--ink)", "var(--muted)"} <= used
+    style = re.search(r"<style>(.*?)</style>", full_page(), re.S)
+    assert style is not None
+    light = dict(re.findall(r"--(\w+): (#\w+)", style[1].partition("@media")[0]))
+    light["paper"] = light["paper"].replace("#fff", "#ffffff")
+    assert light.items() >= PALETTE.items()
+
+
+def test_charts_of_one_page_share_no_ids_and_no_styles() -> None:
+    drawn = one_bar().svg
+    assert not re.search(r"\bid=|href=|url\(|<style|<defs", drawn)
+    assert full_page().count("<style") == 1
+
+
+def test_seven_policies_have_seven_markers_and_seven_dashes() -> None:
+    markers = {str(re.findall(r' d="([^"]*)"', sign(n, is_line=False))) for n in range(len(MARKERS))}
+    dashes = {str(re.findall(r"dasharray: ([^;]*)", sign(n, is_line=True))) for n in range(len(MARKERS))}
+    assert len(markers) == len(dashes) == 7
+
+
+def test_settings_of_the_user_for_matplotlib_move_nothing() -> None:
+    with matplotlib.rc_context(
+        {"font.size": 30, "svg.fonttype": "path", "axes.grid": False, "lines.linewidth": 9}
+    ):
+        drawn = one_bar()
+    assert drawn == one_bar()
 
 
 def test_names_between_backticks_are_set_as_code_and_still_escaped() -> None:

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from tests.unit import spatialvla_golden as golden
-from tests.unit.spatialvla_golden import CHUNK, ELSEWHERE, LOGITS
+from tests.unit.spatialvla_golden import CHUNK, ELSEWHERE, LOGITS, ROOT_OF_WIDTH, SIZES
 from vla_eval.policies.spatialvla.action_tokens import to_tokens
 from vla_eval.policies.spatialvla.depth import cut_depth, shown_pictures
 from vla_eval.policies.spatialvla.ego3d import frequencies, patch_points
 from vla_eval.policies.spatialvla.generation import generated_actions, generated_tokens, token_loss
 from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
-from vla_eval.policies.spatialvla.sizes import Attention, NetworkSizes
+from vla_eval.policies.spatialvla.sizes import TOKENS_PER_ACTION, Attention, NetworkSizes
 from vla_eval.policies.spatialvla.weight_names import to_original, to_ours
 
 ALL = [[0], [1], [2], [3]]
@@ -23,6 +23,7 @@ REGIMES: list[tuple[str, Attention]] = [
     ("causal", "causal"),
     ("prefix_bidirectional", "bidirectional_with_padding"),
 ]
+DEPTH_PX: int = golden.config()["ego3d"]["depth_input_size"]
 VISIBLE = 2e-3  # of logits up to about 2; the least of the traps moves them by more
 
 
@@ -46,7 +47,7 @@ def one(index: int = 0) -> Inputs:
 
 class TestVision:
     def test_the_depth_model_is_shown_padded_pictures(self) -> None:
-        shown = shown_pictures(golden.inputs(ALL, golden.prompts(0)).pictures[:2, 0], 384)
+        shown = shown_pictures(golden.inputs(ALL, golden.prompts(0)).pictures[:2, 0], DEPTH_PX)
         close(shown[..., ::16, ::16], golden.values()["vision.depth_network_input_strided16"])
 
     @pytest.mark.parametrize("camera", ["default", "mikasa"])
@@ -56,13 +57,16 @@ class TestVision:
         close(matrix, values[f"pre.intrinsic_{camera}"])
         inputs = golden.inputs(ALL, golden.prompts(0), matrix)
         assert inputs.depth is not None
-        depth, matrices = cut_depth(inputs.depth[:, 0], 56), inputs.intrinsics[:, 0]
+        depth, matrices = cut_depth(inputs.depth[:, 0], SIZES.image_px), inputs.intrinsics[:, 0]
         points = patch_points(depth, matrices, network.sizes)
         close(points, values[f"vision.{camera}.points_xyz"])
         with torch.no_grad():
             close(network.position_embedding_3d(depth, matrices), values[f"vision.{camera}.ego3d_embedding"])
             # The original divides by the root of Gemma's width what Gemma multiplies by it.
-            close(network.image_features(inputs) / 8, values[f"vision.{camera}.image_features_divided"])
+            close(
+                network.image_features(inputs) / ROOT_OF_WIDTH,
+                values[f"vision.{camera}.image_features_divided"],
+            )
         if camera == "mikasa":
             close(frequencies(points[:1]), values["vision.frequency_encoding"])
 
@@ -70,7 +74,7 @@ class TestVision:
         matrices = golden.values()["vision.per_sample_intrinsic.K"][:, None]
         with torch.no_grad():
             features = made().image_features(golden.inputs(ALL, golden.prompts(0), matrices))
-        close(features / 8, golden.values()["vision.per_sample_intrinsic.image_features_divided"])
+        close(features / ROOT_OF_WIDTH, golden.values()["vision.per_sample_intrinsic.image_features_divided"])
 
     def test_siglips_last_state(self) -> None:
         pictures = golden.inputs(ALL, golden.prompts(0)).pictures[:, 0]
@@ -86,7 +90,7 @@ class TestInference:
         assert int(values[f"infer{index}.image_index"]) == index
         logits = prefill(made(), inputs)
         close(logits[:, -1:], values[f"infer{index}.prefill_logits"], atol=LOGITS)
-        if index == 0:
+        if index == 0:  # stored for this one alone
             close(logits, values["infer0.prefill_logits_all"], atol=LOGITS)
         with torch.no_grad():
             told = generated_tokens(made(), inputs, chunk=CHUNK, attention="bidirectional")
@@ -101,6 +105,10 @@ class TestInference:
 
     def test_two_pictures(self) -> None:
         inputs, values = golden.inputs([[0, 1]], golden.prompts(1)), golden.values()
+        ids = values["infer_img2.input_ids"][0]
+        n_patches = 2 * SIZES.n_patches  # of the one picture, then of the other, before the prompt
+        assert bool((ids[:n_patches] == SIZES.image_token).all())
+        assert torch.equal(ids[n_patches:], inputs.prompts.ids[0])
         with torch.no_grad():
             told = generated_tokens(made(), inputs, chunk=CHUNK, attention="bidirectional")
         assert torch.equal(told.tokens, values["infer_img2.generated_ids"])
@@ -124,7 +132,7 @@ class TestInference:
             sequence = made().sequence(one(1), told)
             logits = made().logits(made().hidden(sequence, "bidirectional"))[0]
         first = int(sequence.first_action)
-        assert torch.equal(logits[first - 1 : first + 11].argmax(dim=-1), told[0])
+        assert torch.equal(logits[first - 1 : first + TOKENS_PER_ACTION * CHUNK - 1].argmax(dim=-1), told[0])
 
 
 class TestTraining:
@@ -137,8 +145,14 @@ class TestTraining:
         inputs = golden.inputs(pictures, golden.training_prompts(name))
         actions = values["in.actions"][: len(pictures)]
         ids = to_tokens(actions, golden.grid(), network.sizes).flatten(1)
+        close(
+            inputs.intrinsics, values[f"{name}.intrinsic"].reshape(-1, 1, 3, 3).expand_as(inputs.intrinsics)
+        )
         sequence = network.sequence(inputs, ids)
         logits = network.logits(network.hidden(sequence, attention))
+        places = torch.arange(logits.shape[1])
+        is_told = (places >= sequence.first_action[:, None]) & (places < sequence.lengths[:, None])
+        assert torch.equal(is_told, values[f"{name}.token_type_ids"].bool())
         is_real = values[f"{name}.attention_mask"].bool()
         compared = is_real if attention == "causal" else torch.ones_like(is_real)
         expected = values[f"{name}.{regime}.logits"]
@@ -204,7 +218,7 @@ class TestTraps:
 
     def test_patches_divided_by_the_root_of_gemmas_width(self, network: SpatialVLANetwork) -> None:
         features = network.image_features
-        network.image_features = lambda inputs: features(inputs) / 8  # type: ignore[method-assign]
+        network.image_features = lambda inputs: features(inputs) / ROOT_OF_WIDTH  # type: ignore[method-assign]
         assert self.difference(network) > VISIBLE
 
     def test_action_tokens_not_multiplied_by_the_root_of_gemmas_width(
@@ -213,10 +227,12 @@ class TestTraps:
         ids = golden.values()["infer0.generated_ids"]
         right = golden.values()["infer0.step_logits"][:, -1]
         with torch.no_grad():
-            for factor, is_right in ((1.0, True), (1 / 8, False)):
+            for factor, is_right in ((1.0, True), (1 / ROOT_OF_WIDTH, False)):
                 network.spatial_embed_tokens.weight.mul_(factor)
                 sequence = network.sequence(one(), ids)
-                last = network.hidden(sequence, "bidirectional")[:, int(sequence.first_action) + 10]
+                last = network.hidden(sequence, "bidirectional")[
+                    :, int(sequence.first_action) + TOKENS_PER_ACTION * CHUNK - 2
+                ]
                 difference = float((network.logits(last) - right).abs().max())
                 assert (difference < LOGITS) == is_right and (difference > VISIBLE) != is_right
 
@@ -251,8 +267,10 @@ class TestTraps:
         assert self.difference(network, inputs) > VISIBLE / 4
 
     def test_depth_that_is_not_cut_back(self, network: SpatialVLANetwork) -> None:
-        whole = torch.nn.functional.interpolate(golden.values()["in.predicted_depth"][:1, None], (56, 56))
-        cut = cut_depth(golden.values()["in.predicted_depth"][:1], 56)
+        whole = torch.nn.functional.interpolate(
+            golden.values()["in.predicted_depth"][:1, None], (SIZES.image_px,) * 2
+        )
+        cut = cut_depth(golden.values()["in.predicted_depth"][:1], SIZES.image_px)
         assert float((whole[:, 0] - cut).abs().mean()) > 0.1
 
     def test_a_prompt_without_its_newline(self, network: SpatialVLANetwork) -> None:

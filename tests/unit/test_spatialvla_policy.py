@@ -82,7 +82,7 @@ class TestPrompt:
         begun = finished(torch.tensor([[2, 6, 4], [2, 4, 0]]), mask, golden.SIZES)
         assert begun.ids.tolist() == [[2, 6, 4], [2, 4, 0]] and torch.equal(begun.mask, mask)
 
-    @pytest.mark.parametrize("index", range(4))
+    @pytest.mark.parametrize("index", range(len(golden.config()["prompts"])))
     def test_tokens_of_the_golden_tokenizer_are_the_originals(self, index: int) -> None:
         from transformers import PreTrainedTokenizerFast
 
@@ -117,7 +117,12 @@ class TestPictures:
     def test_the_originals_are_the_same(self) -> None:
         raw = golden.values()["pre.raw_image"].permute(2, 0, 1).float()
         expected = golden.values()["pre.pixel_values"][0]
-        torch.testing.assert_close(resize_bicubic(raw, Size(56, 56)) / 255, expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            resize_bicubic(raw, Size(golden.SIZES.image_px, golden.SIZES.image_px)) / 255,
+            expected,
+            atol=1e-6,
+            rtol=0,
+        )
 
     def test_the_cameras_matrix_is_that_of_a_quarter_turn(self, recorded: Path) -> None:
         policy, before, _ = tiny(recorded, pictures=BOTH)

@@ -24,6 +24,13 @@ from vla_eval.policies.spatialvla.sizes import NetworkSizes, network_sizes
 from vla_eval.policies.steps.gripper import Gripper
 
 SIZES = golden.SIZES
+GRIDS = [
+    ("uniform", "act.uniform_bins"),
+    ("gaussian", "act.gaussian_bins"),
+    ("adapted_gaussian", "adapt.bins"),
+]
+TRANSLATIONS = slice(0, SIZES.n_translations)
+ROTATIONS = slice(SIZES.n_translations, SIZES.n_translations + SIZES.n_rotations)
 
 
 def grid_of(name: str) -> ActionGrid:
@@ -31,26 +38,18 @@ def grid_of(name: str) -> ActionGrid:
 
 
 class TestGrid:
-    @pytest.mark.parametrize(
-        ("name", "prefix"),
-        [
-            ("uniform", "act.uniform_bins"),
-            ("gaussian", "act.gaussian_bins"),
-            ("adapted_gaussian", "adapt.bins"),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "prefix"), GRIDS)
     def test_edges_are_the_originals(self, name: str, prefix: str) -> None:
         for axis, edges in zip(AXES, grid_of(name).edges, strict=True):
             expected = golden.values()[f"{prefix}.{axis}_bins"].numpy()
             np.testing.assert_allclose(edges, expected, atol=1e-12, rtol=0)
 
     def test_bins_of_a_gaussian_are_equally_likely(self) -> None:
-        draws = np.random.default_rng(0).normal(0.3, 0.31, 40_000)
         edges = golden.grid().edges[AXES.index("roll")]
         mu, sigma = golden.config()["action_tokens"]["gaussian"]["roll"].values()
-        draws = (draws - 0.3) / 0.31 * sigma + mu
+        draws = np.random.default_rng(0).normal(mu, sigma, 40_000)
         counts, _ = np.histogram(draws[np.abs(draws) < 1], np.array(edges))
-        assert counts / counts.sum() == pytest.approx([0.25] * 4, abs=0.01)
+        assert counts / counts.sum() == pytest.approx([1 / SIZES.roll_bins] * SIZES.roll_bins, abs=0.01)
 
     def test_what_is_fitted_is_mean_and_deviation_of_each_axis(self) -> None:
         actions = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (500, 7)))
@@ -97,7 +96,7 @@ class TestTokens:
         assert torch.equal(to_tokens(decoded, grid, SIZES), values[f"act.{name}.ids_again"])
 
     def test_every_token_in_every_column_is_decoded_as_the_original_does(self) -> None:
-        ids = torch.arange(40, 178)[:, None].expand(-1, 3)
+        ids = torch.arange(SIZES.first_action_token, SIZES.vocabulary)[:, None].expand(-1, 3)
         decoded = from_tokens(ids, golden.grid(), SIZES)
         torch.testing.assert_close(decoded, golden.values()["act.gaussian.decode_all"], atol=1e-12, rtol=0)
 
@@ -125,7 +124,7 @@ class TestTokens:
         gripper, action = Gripper(encoding="unit_open"), torch.zeros(7)
         action[-1] = maniskill
         ids = to_tokens(gripper.encode(action), golden.grid(), SIZES)
-        assert int(ids[-1]) == 176 + token
+        assert int(ids[-1]) == SIZES.vocabulary - 2 + token
         assert float(gripper.decode(from_tokens(ids, golden.grid(), SIZES))[-1]) == executed
 
     def test_a_gripper_that_is_not_mapped_never_closes(self) -> None:
@@ -153,17 +152,17 @@ class TestRefit:
 
         rows = torch.cat([table(old), torch.full((2, 3), 9.0)])
         moved = refitted(rows, old, new)
-        for part, axes in ((slice(0, 72), range(3)), (slice(72, 136), range(3, 6))):
+        for part, axes in ((TRANSLATIONS, range(3)), (ROTATIONS, range(3, 6))):
             low = torch.tensor([float(old.centres(axis)[0]) for axis in axes], dtype=torch.float64)
             high = torch.tensor([float(old.centres(axis)[-1]) for axis in axes], dtype=torch.float64)
             torch.testing.assert_close(moved[part], table(new)[part].clamp(low, high))
-        assert torch.equal(moved[136:], rows[136:])  # the gripper
+        assert torch.equal(moved[-2:], rows[-2:])  # the gripper
 
     def test_the_original_interpolates_between_the_same_middles_but_takes_roll_for_pitch(self) -> None:
         """Its triangulation is one of many; what all of them share is where the interpolated point is."""
-        table = golden.original_weights()["spatial_embed_tokens.weight"][72:136].double()
-        theirs = golden.values()["adapt.spatial_embed_tokens"][72:136].double()
-        shares = torch.linalg.solve(table.T, theirs.T).T  # 64 rows of 64 numbers: the mixture is unique
+        table = golden.original_weights()["spatial_embed_tokens.weight"][ROTATIONS].double()
+        theirs = golden.values()["adapt.spatial_embed_tokens"][ROTATIONS].double()
+        shares = torch.linalg.solve(table.T, theirs.T).T  # as many rows as numbers: unique
         old, new = golden.grid(), golden.grid("adapted_gaussian")
 
         def points(grid: ActionGrid) -> Tensor:
@@ -174,12 +173,14 @@ class TestRefit:
 
         low, high = points(old).amin(dim=0), points(old).amax(dim=0)
         torch.testing.assert_close(shares @ points(old), points(new).clamp(low, high), atol=1e-4, rtol=0)
-        torch.testing.assert_close(shares.sum(dim=1), torch.ones(64, dtype=torch.float64), atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            shares.sum(dim=1), torch.ones(SIZES.n_rotations, dtype=torch.float64), atol=1e-4, rtol=0
+        )
 
     def test_another_number_of_bins_is_an_error(self) -> None:
-        other = uniform_grid((4, 6, 3, 4, 4, 5))
+        other = uniform_grid((*SIZES.n_bins[:-1], SIZES.n_bins[-1] + 1))
         with pytest.raises(RecipeError, match="cannot be moved"):
-            refitted(torch.zeros(138, 2), golden.grid(), other)
+            refitted(torch.zeros(SIZES.n_action_tokens, 2), golden.grid(), other)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ VERBS = (
     "dataset",
     "finetune",
     "checkpoint",
-    "train-expert",
     "list",
     "show",
     "doctor",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
@@ -44,25 +45,22 @@ def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> st
     """Return the card of a dataset."""
     if license_id is None and summary.facts is not None:
         license_id = OWN_LICENSE
-    sections = [_front_matter(license_id), f"# {_title(summary)}\n", _introduction(summary)]
+    sections = [f"# {_title(summary)}\n", _introduction(summary)]
     for heading, section in _SECTIONS.items():
         text = section(summary)
         if text:
             sections.append(f"## {heading}\n\n{text}")
     if license_id is None:
         sections.append("## Licence\n\nThat of the source, which the converter does not know.\n")
-    return "\n".join(sections)
-
-
-def _front_matter(license_id: str | None) -> str:
-    data = {
-        **({"license": license_id} if license_id else {}),
-        "task_categories": ["robotics"],
-        "tags": ["LeRobot", "ManiSkill", "memory", "mikasa-vla"],
+    data = DatasetCardData(
+        license=license_id,
+        task_categories=["robotics"],
+        tags=["LeRobot", "ManiSkill", "memory", "mikasa-vla"],
         # Without it the Hub's viewer guesses, and shows the manifest as data.
-        "configs": [{"config_name": "default", "data_files": "data/*/*.parquet"}],
-    }
-    return f"---\n{yaml.safe_dump(data, sort_keys=False)}---\n"
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    text = "\n".join(sections)
+    return str(DatasetCard(f"---\n{data.to_yaml()}\n---\n\n{text}"))
 
 
 def _title(summary: DatasetSummary) -> str:

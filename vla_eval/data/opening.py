@@ -35,6 +35,11 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
     except (OSError, ValueError, KeyError, TypeError) as exc:
         raise DatasetError(f"{root}: lerobot cannot read its meta/ ({exc!r:.300}).") from exc
     for path in _files(meta):
+        if path.is_absolute() or ".." in path.parts:
+            raise DatasetError(
+                f"{root}: meta/info.json says that a file lies at {path!s:.200}; expected a path inside of "
+                "the dataset. It is not read. Fetch the dataset again, from where you trust it."
+            )
         if not (root / path).is_file():
             raise DatasetError(
                 f"{root}: {path} is missing. Fetch the dataset again, or rebuild it from its manifest."

@@ -282,16 +282,7 @@ class FakeEnv:
             in_order=self._in_order,
             touched_candidates=tuple(episode.touched),
             bodies=bodies,
-            state_vector=np.concatenate(
-                [episode.tcp_m, [episode.gripper_width_m], self._wanted_m(episode), episode.ball_m]
-            ).astype(np.float32),
         )
-
-    @staticmethod
-    def _wanted_m(episode: _Episode) -> Vector:
-        """Return where the point has to go: the right candidate, or the ball's goal."""
-        wanted: Vector = episode.candidates_m[episode.targets[0]] if episode.targets else episode.goal_m
-        return wanted
 
 
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them

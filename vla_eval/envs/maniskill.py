@@ -361,7 +361,6 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
             )
             for name, body in env.moving_bodies().items()
         },
-        state_vector=_array(env.state_vector()[row]),
         tcp_yaw_rad=float(env.tcp_yaw_rad()[row]),
     )
 

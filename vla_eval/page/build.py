@@ -1,39 +1,24 @@
-"""Build the report page: one HTML file that needs nothing else. Reads and returns; it draws no numbers."""
+"""Build the report page: one HTML file that needs nothing else. It computes no number.
+
+The markup is in `templates/`. Whatever a template is given is escaped, unless it is `Markup`: the drawings of
+`svg.py` and the JSON report.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
 from vla_eval import __version__
 from vla_eval.errors import ReportError
-from vla_eval.page.choice_sections import choices_section
-from vla_eval.page.machine_sections import (
-    episodes_section,
-    errors_section,
-    latency_section,
-    reproduction_section,
-)
-from vla_eval.page.markup import Markup, element, joined, paragraph
+from vla_eval.page import choice_sections, machine_sections, rates
 from vla_eval.page.material import Material, gather
-from vla_eval.page.rates import chunk_section, paired_section, steps_section, success_section, table_section
 from vla_eval.results.store import StoredRun
 from vla_eval.results.table_formats import render
 
 PAGE_FILE = "index.html"
-STYLE = Path(__file__).with_name("page.css")
-# The browser itself refuses whatever is not in the file.
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
-LINKS = (
-    ("table", "Results"),
-    ("success", "By task"),
-    ("chunks", "By K"),
-    ("paired", "Paired"),
-    ("steps", "Steps"),
-    ("choices", "Choices"),
-    ("latency", "Latency"),
-    ("errors", "Errors"),
-    ("episodes", "Episodes"),
-    ("reproduce", "To do it again"),
-)
+TEMPLATE = "page.html.j2"
 
 
 def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str:
@@ -48,19 +33,30 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
         UnknownNameError: there is no such baseline.
     """
     material = gather(runs, baseline=baseline)
-    title = "Evaluation: " + ", ".join(dict.fromkeys(run.description.name for run in material.runs))
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", http_equiv="Content-Security-Policy", content=POLICY),
-        element("title", title),
-        element("style", Markup(STYLE.read_text(encoding="utf-8"))),
-        # A picture of its own, or the browser would ask for one.
-        Markup('<link rel="icon" href="data:,"/>'),
+    chunks = rates.chunk_plots(material)
+    return (
+        _templates()
+        .get_template(TEMPLATE)
+        .render(
+            title="Evaluation: " + ", ".join(dict.fromkeys(run.description.name for run in material.runs)),
+            summary=_summary(material),
+            version=__version__,
+            material=material,
+            results=rates.results_table(material),
+            success=rates.success_plots(material),
+            chunks=chunks,
+            sweep=rates.chunk_sweep(material) if chunks.charts else None,
+            paired=rates.paired_table(material),
+            steps=rates.steps_plots(material),
+            choices=choice_sections.choices(material),
+            latency=machine_sections.latency(material),
+            errors=machine_sections.errors_table(material),
+            videos=machine_sections.videos(material),
+            reproductions=[machine_sections.reproduction(run) for run in material.runs],
+            # `<` is escaped as JSON does it, so that no text in it can end the element.
+            report=Markup(render(material.table, "json").replace("<", "\\u003c")),
+        )
     )
-    body = element("body", element("main", *_content(material, title)), _report_data(material))
-    return f"<!DOCTYPE html>\n{element('html', head, body, lang='en')}\n"
 
 
 def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None = None) -> Path:
@@ -85,23 +81,26 @@ def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None 
     return path
 
 
-def _content(material: Material, title: str) -> list[Markup]:
-    links = [element("li", element("a", name, href=f"#{anchor}")) for anchor, name in LINKS]
-    return [
-        element("h1", title),
-        paragraph(_summary(material), muted=True),
-        element("nav", element("ul", *links), aria_label="Sections"),
-        table_section(material),
-        success_section(material),
-        chunk_section(material),
-        paired_section(material),
-        steps_section(material),
-        choices_section(material),
-        latency_section(material),
-        errors_section(material),
-        episodes_section(material),
-        reproduction_section(material),
-    ]
+def _templates() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("vla_eval.page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["with_code"] = with_code
+    return environment
+
+
+def with_code(text: str) -> Markup:
+    """Return text in which names stand between backticks, as in Markdown, with these set as code."""
+    parts = text.split("`")
+    if len(parts) % 2 == 0:  # one of them stands alone: it is no mark
+        return Markup.escape(text)
+    code = Markup("<code>{}</code>")
+    return Markup().join(code.format(part) if i % 2 else part for i, part in enumerate(parts))
 
 
 def _summary(material: Material) -> str:
@@ -113,16 +112,9 @@ def _summary(material: Material) -> str:
         (len(material.colors), "policies"),
         (len(material.runs), "run folders"),
     )
-    said = ", ".join(f"{n} {noun if n != 1 else _singular(noun)}" for n, noun in counts)
-    return f"{said}. Written by mikasa-vla-eval {__version__}."
+    return ", ".join(f"{n} {noun if n != 1 else _singular(noun)}" for n, noun in counts)
 
 
 def _singular(noun: str) -> str:
     words = {"policies": "policy", "episodes with a result": "episode with a result"}
     return words.get(noun, noun.removesuffix("s"))
-
-
-def _report_data(material: Material) -> Markup:
-    """Return the JSON report, to be read by programs; `<` is escaped, so that it cannot end the element."""
-    data = render(material.table, "json").replace("<", "\\u003c")
-    return element("script", joined([Markup(data)]), type="application/json", id="report")

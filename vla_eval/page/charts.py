@@ -1,21 +1,33 @@
-"""Draw inline SVG: estimates with intervals, and curves. Knows nothing of runs or policies.
+"""Draw estimates with intervals, and curves, by matplotlib. Knows nothing of runs or policies.
 
-Colours are classes (`c0`, `c1` …) that the style sheet defines for light, dark and paper. No chart tells
-series apart by colour alone: each has a marker or a dash pattern of its own, and its name in words.
+No chart tells series apart by color alone: each has a marker or a dash pattern of its own, and its name in
+words. matplotlib is imported by whoever imports this: only what builds a page does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
-from vla_eval.page.markup import Markup, element
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-N_COLORS = 7
-MARKERS = ("circle", "square", "triangle", "diamond", "cross", "down", "bar")
-DASHES = (None, "6 3", "2 3", "8 3 2 3", "1 2", "10 4", "4 2 1 2")
-RADIUS = 4.0
-ROW_HEIGHT = 24.0
-CHAR_WIDTH = 6.6  # of the 12 px font of labels, on average
+from vla_eval.page.svg import PALETTE, inline_svg, own_style, text_width_px
+
+COLORS = tuple(PALETTE[name] for name in ("c0", "c1", "c2", "c3", "c4", "c5", "ink"))
+MARKERS = (("o", 8), ("s", 7.5), ("^", 9), ("D", 7), ("X", 9), ("v", 9), ("P", 9))  # with their sizes, px
+DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (8, 3, 2, 3, 2, 3), (10, 4), (4, 2, 1, 2))  # px on, px off
+REFERENCES: Mapping[str, tuple[str, tuple[float, ...]]] = MappingProxyType(
+    {"chance": (PALETTE["muted"], (5, 3)), "ceiling": (PALETTE["ink"], (1.5, 3))}
+)
+RATE_TICKS = (0, 0.25, 0.5, 0.75, 1)
+PX = 1 / 72  # inches, as matplotlib counts
+ROW_HEIGHT_PX = 24
+FOREST_WIDTH_PX = 320  # with its labels it is still legible on a phone
+CURVES_SIZE_PX = (320, 180)
+SIGN_SIZE_PX = (26, 16)
 
 LineKind = Literal["solid", "chance", "ceiling"]
 
@@ -35,7 +47,7 @@ class Series:
 
     Attributes:
         name: in words.
-        color: number of the colour and of the marker.
+        color: number of the color and of the marker.
         points: in order of x.
         kind: `chance` and `ceiling` are lines of reference, without markers.
         is_step: y stays as it is until the next x.
@@ -61,173 +73,147 @@ class Bar:
     ceiling: float | None
 
 
-def forest(bars: Sequence[Bar], *, title: str, description: str) -> Markup:
+class Chart(NamedTuple):
+    """A drawing and its title, which is not part of it."""
+
+    title: str
+    svg: Markup
+
+
+def forest(bars: Sequence[Bar], *, title: str, description: str) -> Chart:
     """Draw rates with intervals, one below the other, chance and ceiling as ticks.
 
     Args:
         bars: from the top; a rate of None is said in words.
-        title: of the plot, for those who do not see it.
-        description: what it shows, likewise.
+        title: of the plot.
+        description: what it shows, for those who do not see it.
     """
-    left = 16 + CHAR_WIDTH * max(len(bar.label) for bar in bars)
-    width, height = left + 420, ROW_HEIGHT * len(bars) + 34
-
-    def x_of(rate: float) -> float:
-        return left + rate * 400
-
-    parts = []
-    bottom = ROW_HEIGHT * len(bars) + 6
-    for tick in (0, 0.25, 0.5, 0.75, 1):
-        parts.append(element("line", x1=x_of(tick), x2=x_of(tick), y1=4, y2=bottom, class_="grid"))
-        parts.append(_label(f"{tick:g}", x_of(tick), bottom + 16, anchor="middle"))
-    for index, bar in enumerate(bars):
-        y = ROW_HEIGHT * (index + 0.5) + 4
-        parts.append(_label(bar.label, left - 10, y + 4, anchor="end"))
-        for rate, kind in ((bar.chance, "chance"), (bar.ceiling, "ceiling")):
-            if rate is not None:
-                parts.append(
-                    element("line", x1=x_of(rate), x2=x_of(rate), y1=y - 9, y2=y + 9, class_=f"mark {kind}")
-                )
-        if bar.value is None:
-            parts.append(_label("no result", x_of(0) + 6, y + 4, anchor="start"))
-            continue
-        if bar.low is not None and bar.high is not None:
-            parts.append(_whisker(bar.color, x1=x_of(bar.low), x2=x_of(bar.high), y1=y, y2=y))
-        parts.append(_marker(bar.color, x_of(bar.value), y))
-    return _svg(parts, width=width, height=height, title=title, description=description)
+    labels = [_printable(bar.label) for bar in bars]
+    with own_style():
+        left = 16 + max(text_width_px(label) for label in labels)
+        figure, axes = _plot(
+            FOREST_WIDTH_PX, ROW_HEIGHT_PX * len(bars), left=left, right=20, top=4, bottom=26
+        )
+        axes.set(xlim=(0, 1), ylim=(len(bars) - 0.5, -0.5))
+        axes.set_xticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
+        axes.set_yticks(range(len(bars)), labels)
+        axes.tick_params(axis="y", pad=10)  # room for a marker at 0
+        axes.grid(visible=False, axis="y")
+        for y, bar in enumerate(bars):
+            for name, rate in (("chance", bar.chance), ("ceiling", bar.ceiling)):
+                if rate is not None:
+                    _reference(axes, name, [rate, rate], [y - 0.4, y + 0.4])
+            if bar.value is None:
+                axes.text(0.015, y, "no result", va="center_baseline")
+            else:
+                if bar.low is not None and bar.high is not None:
+                    axes.plot([bar.low, bar.high], [y, y], color=_color(bar.color), gid="whisker")
+                _marker(axes, bar.color, bar.value, y)
+        return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
 
 
 def curves(
     series: Sequence[Series], *, title: str, description: str, x_title: str, x_ticks: Sequence[float]
-) -> Markup:
+) -> Chart:
     """Draw rates in [0, 1] over a number, one line per series.
 
     Args:
         series: at least one point in all.
-        title: of the plot, for those who do not see it.
-        description: what it shows, likewise.
+        title: of the plot.
+        description: what it shows, for those who do not see it.
         x_title: what x is, with its unit.
         x_ticks: in increasing order; the first and the last are the ends of the axis.
     """
-    left, top, width, height, first, last = 40.0, 10.0, 320.0, 180.0, x_ticks[0], x_ticks[-1]
-
-    def x_of(value: float) -> float:
-        return left + 10 + (value - first) / ((last - first) or 1) * (width - 20)
-
-    def y_of(rate: float) -> float:
-        return top + (1 - rate) * height
-
-    parts = []
-    for tick in (0, 0.25, 0.5, 0.75, 1):
-        parts.append(element("line", x1=left, x2=left + width, y1=y_of(tick), y2=y_of(tick), class_="grid"))
-        parts.append(_label(f"{tick:g}", left - 6, y_of(tick) + 4, anchor="end"))
-    for value in x_ticks:
-        parts.append(_label(f"{value:g}", x_of(value), top + height + 18, anchor="middle"))
-    parts.append(_label(x_title, left + width / 2, top + height + 36, anchor="middle"))
-    for one in sorted(series, key=lambda each: each.kind == "solid"):  # lines of reference behind
-        placed = [p._replace(x=x_of(p.x), y=y_of(p.y)) for p in one.points]
-        parts.append(_line(one, placed))
-        if one.kind != "solid" or one.is_step:
-            continue
-        for point in placed:
-            if point.low is not None and point.high is not None:
-                low, high = y_of(point.low), y_of(point.high)
-                parts.append(_whisker(one.color, x1=point.x, x2=point.x, y1=low, y2=high))
-            parts.append(_marker(one.color, point.x, point.y))
-    return _svg(
-        parts, width=left + width + 10, height=top + height + 44, title=title, description=description
-    )
+    with own_style():
+        figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
+        margin = (x_ticks[-1] - x_ticks[0] or 1) * 0.03
+        axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
+        axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks])
+        axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
+        axes.grid(visible=False, axis="x")
+        for one in sorted(series, key=lambda each: each.kind == "solid"):  # lines of reference behind
+            _draw_series(axes, one)
+        return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
 
 
-def legend(names: Sequence[tuple[str, int]], *, lines: bool = False, references: bool = True) -> Markup:
-    """Return what colour, marker or dash stands for what.
-
-    Args:
-        names: name and number of the colour.
-        lines: show dash patterns instead of markers.
-        references: also explain the lines of chance and ceiling.
-    """
-    items = []
-    for name, color in names:
-        sign = (
-            element(
-                "line",
-                x1=1,
-                x2=25,
-                y1=8,
-                y2=8,
-                class_=f"curve c{color % N_COLORS}",
-                stroke_dasharray=DASHES[color % N_COLORS],
-            )
-            if lines
-            else _marker(color, 13, 8)
-        )
-        items.append(element("li", _sign(sign), name))
-    for name in ("chance", "ceiling") if references else ():
-        items.append(
-            element("li", _sign(element("line", x1=1, x2=25, y1=8, y2=8, class_=f"curve {name}")), name)
-        )
-    return element("ul", *items, class_="legend")
+def sign(color: int, *, is_line: bool) -> Markup:
+    """Return a line, or a marker, as it stands for a series."""
+    if is_line:
+        return _sign([0.04, 0.96], color=_color(color), linestyle=(0, _dashes(color)))
+    shape, size = MARKERS[color % len(MARKERS)]
+    style = {"marker": shape, "markersize": size, "markeredgewidth": 0, "linestyle": "none"}
+    return _sign([0.5], color=_color(color), **style)
 
 
-def _sign(content: Markup) -> Markup:
-    return element("svg", content, width=26, height=16, aria_hidden="true")
+def reference_sign(name: str) -> Markup:
+    """Return the line of `chance` or of `ceiling`."""
+    color, dashes = REFERENCES[name]
+    return _sign([0.04, 0.96], color=color, linestyle=(0, dashes))
 
 
-def _svg(parts: Sequence[str], *, width: float, height: float, title: str, description: str) -> Markup:
-    picture = element(
-        "svg",
-        *parts,
-        viewBox=f"0 0 {width:.0f} {height:.0f}",
-        width=round(width),
-        height=round(height),
-        role="img",
-        aria_label=f"{title}. {description}",
-    )
-    return element("figure", element("figcaption", title), picture)
+def _sign(xs: Sequence[float], **style: Any) -> Markup:  # Any: matplotlib's properties of a line
+    with own_style():
+        figure = Figure(figsize=(SIGN_SIZE_PX[0] * PX, SIGN_SIZE_PX[1] * PX), frameon=False)
+        figure.add_artist(Line2D(xs, [0.5] * len(xs), **style))
+        return inline_svg(figure, label=None)
 
 
-def _label(text: str, x: float, y: float, *, anchor: str) -> Markup:
-    return element("text", text, x=x, y=y, text_anchor=anchor)
+def _plot(
+    width: float, height: float, *, left: float, right: float, top: float, bottom: float
+) -> tuple[Figure, Axes]:
+    """Return axes of a size in px, with room around them."""
+    whole = (left + width + right, top + height + bottom)
+    figure = Figure(figsize=(whole[0] * PX, whole[1] * PX), frameon=False)
+    axes = figure.add_axes((left / whole[0], bottom / whole[1], width / whole[0], height / whole[1]))
+    axes.patch.set_visible(False)
+    return figure, axes
 
 
-def _whisker(color: int, **ends: float) -> Markup:
-    return element("line", **ends, class_=f"whisker c{color % N_COLORS}")
-
-
-def _line(series: Series, placed: Sequence[Point]) -> Markup:
-    corners = [(p.x, p.y) for p in placed]
+def _draw_series(axes: Axes, series: Series) -> None:
+    xs, ys = [point.x for point in series.points], [point.y for point in series.points]
+    if series.kind != "solid":
+        _reference(axes, series.kind, xs, ys)
+        return
+    style = (0, _dashes(series.color))
+    draw = "steps-post" if series.is_step else "default"
+    axes.plot(xs, ys, color=_color(series.color), linestyle=style, drawstyle=draw, gid="curve")
     if series.is_step:
-        corners = [
-            corner
-            for before, point in zip((placed[0], *placed), placed, strict=False)
-            for corner in ((point.x, before.y), (point.x, point.y))
-        ]
-    style = f"curve c{series.color % N_COLORS}" if series.kind == "solid" else f"curve {series.kind}"
-    dash = DASHES[series.color % N_COLORS] if series.kind == "solid" else None
-    return element(
-        "polyline",
-        points=" ".join(f"{x:.1f},{y:.1f}" for x, y in corners),
-        class_=style,
-        stroke_dasharray=dash,
+        return
+    for point in series.points:
+        if point.low is not None and point.high is not None:
+            ends = [point.low, point.high]
+            axes.plot([point.x, point.x], ends, color=_color(series.color), gid="whisker")
+        _marker(axes, series.color, point.x, point.y)
+
+
+def _reference(axes: Axes, name: str, xs: Sequence[float], ys: Sequence[float]) -> None:
+    color, dashes = REFERENCES[name]
+    axes.plot(xs, ys, color=color, linestyle=(0, dashes), gid=name)
+
+
+def _marker(axes: Axes, color: int, x: float, y: float) -> None:
+    shape, size = MARKERS[color % len(MARKERS)]
+    axes.plot(
+        [x],
+        [y],
+        color=_color(color),
+        linestyle="none",
+        marker=shape,
+        markersize=size,
+        markeredgecolor=PALETTE["paper"],
+        markeredgewidth=1,
+        gid="marker",
     )
 
 
-def _marker(color: int, x: float, y: float) -> Markup:
-    style, r = f"marker c{color % N_COLORS}", RADIUS
-    shape = MARKERS[color % N_COLORS]
-    if shape == "circle":
-        return element("circle", cx=x, cy=y, r=r, class_=style)
-    outline = {
-        "square": ((-r, -r), (r, -r), (r, r), (-r, r)),
-        "triangle": ((0, -1.2 * r), (1.2 * r, r), (-1.2 * r, r)),
-        "down": ((0, 1.2 * r), (1.2 * r, -r), (-1.2 * r, -r)),
-        "diamond": ((0, -1.4 * r), (1.4 * r, 0), (0, 1.4 * r), (-1.4 * r, 0)),
-        "bar": ((-1.4 * r, -0.6 * r), (1.4 * r, -0.6 * r), (1.4 * r, 0.6 * r), (-1.4 * r, 0.6 * r)),
-        "cross": (
-            *((-r, -1.5 * r), (0, -0.5 * r), (r, -1.5 * r), (1.5 * r, -r), (0.5 * r, 0), (1.5 * r, r)),
-            *((r, 1.5 * r), (0, 0.5 * r), (-r, 1.5 * r), (-1.5 * r, r), (-0.5 * r, 0), (-1.5 * r, -r)),
-        ),
-    }[shape]
-    path = "M" + "L".join(f"{x + dx:.1f} {y + dy:.1f}" for dx, dy in outline) + "Z"
-    return element("path", d=path, class_=style)
+def _color(number: int) -> str:
+    return COLORS[number % len(COLORS)]
+
+
+def _dashes(number: int) -> tuple[float, ...] | None:
+    return DASHES[number % len(DASHES)] or None
+
+
+def _printable(text: str) -> str:
+    """Return text with a sign for each character that no XML can hold, such as a control character."""
+    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

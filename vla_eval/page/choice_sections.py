@@ -1,7 +1,10 @@
-"""The section of the report page on choices: what was right, what was chosen, and what went wrong."""
+"""What the page shows of choices: what was right, what was chosen, and what went wrong."""
 
-from vla_eval.page.markup import UNKNOWN, Markup, details, element, joined, paragraph, section, table
+from dataclasses import dataclass
+from typing import NamedTuple
+
 from vla_eval.page.material import Material
+from vla_eval.page.tables import UNKNOWN, Column, PageTable
 from vla_eval.results.choices import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
 from vla_eval.tasks.item_names import item_names
 
@@ -22,16 +25,57 @@ EXPLANATIONS: dict[Cause, str] = {
     "could_not_move": f"the arm was never {MOVED_M * 100:.0f} cm from where it began",
 }
 KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
+DARKEST = 0.65  # opacity of the most frequent cell
 
 
-def choices_section(material: Material) -> Markup:
-    """Show for each row with candidates what came of the choice."""
-    title = "Target and choice"
+class Explanation(NamedTuple):
+    """A cause, by its title, and the rule behind it."""
+
+    title: str
+    rule: str
+
+
+class MatrixCell(NamedTuple):
+    """How many episodes, how dark (0 to 1), and whether target and choice are the same."""
+
+    n_episodes: int
+    opacity: float
+    is_right: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matrix:
+    """Episodes by target (rows) and first choice (columns)."""
+
+    kind: str
+    names: tuple[str, ...]
+    choices: tuple[str, ...]
+    rows: tuple[tuple[MatrixCell, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """The choices of all rows with candidates.
+
+    Attributes:
+        explanations: of the causes.
+        table: episodes by cause.
+        missing: what the records do not say.
+        matrices: by the name of each row.
+    """
+
+    explanations: tuple[Explanation, ...]
+    table: PageTable
+    missing: tuple[str, ...]
+    matrices: dict[str, tuple[Matrix, ...]]
+
+
+def choices(material: Material) -> Choices | None:
+    """Return the choices behind the results; None if no row has candidates."""
     reports = [(row, report_choices(material.group_of(row))) for row in material.table.rows]
     found = [(row, report) for row, report in reports if report is not None]
     if not found:
-        said = "No task of this table has candidates to choose among, or no episode of one has a result."
-        return section("choices", title, paragraph(said))
+        return None
     rows = [
         [
             material.name_of(row, with_task=True),
@@ -41,43 +85,37 @@ def choices_section(material: Material) -> Markup:
         ]
         for row, report in found
     ]
-    titles = ["policy", *(TITLES[cause] for cause in CAUSES), "habit of place", "habit of item"]
-    numeric = [False, *[True] * len(CAUSES), False, False]
-    matrices = [
-        details(material.name_of(row, with_task=True), *_matrices(report, row.task)) for row, report in found
-    ]
-    return section(
-        "choices",
-        title,
-        element(
-            "ul",
-            *(element("li", element("b", TITLES[cause]), f": {EXPLANATIONS[cause]}.") for cause in CAUSES),
-            class_="notes",
+    return Choices(
+        explanations=tuple(Explanation(TITLES[cause], EXPLANATIONS[cause]) for cause in CAUSES),
+        table=PageTable(
+            columns=(
+                Column("policy"),
+                *(Column(TITLES[cause], "number") for cause in CAUSES),
+                Column("habit of place"),
+                Column("habit of item"),
+            ),
+            rows=tuple(map(tuple, rows)),
+            caption="Episodes by cause",
         ),
-        paragraph(
-            "Habit: whether wrong choices go to one place (or item) more often than 1/(N-1), the share if "
-            "all wrong ones were alike; exact binomial test, p times N. A policy that guesses evenly has "
-            "forgotten but has no habit.",
-            muted=True,
-        ),
-        table(titles, rows, numeric=numeric, caption="Episodes by what came of the choice"),
-        _missing([report for _, report in found]),
-        *matrices,
+        missing=_missing([report for _, report in found]),
+        matrices={
+            material.name_of(row, with_task=True): _matrices(report, row.task) for row, report in found
+        },
     )
 
 
-def _missing(reports: list[ChoiceReport]) -> Markup:
+def _missing(reports: list[ChoiceReport]) -> tuple[str, ...]:
     said = []
     if not all(report.reach_is_known for report in reports):
         said.append(
             "Some records (of an earlier version) do not say how far the arm went: there, “could not move” "
-            "cannot be told from “never chose”."
+            "cannot be distinguished from “never chose”."
         )
     if any(not report.confusion["place"] and report.confusion["item"] for report in reports):
         said.append("Some records do not say where the candidates lay: there, no habit of place can be seen.")
     if any(not report.confusion["item"] for report in reports):
         said.append("Where several candidates are right at once there is no single target, and no matrix.")
-    return joined(paragraph(text, muted=True) for text in said)
+    return tuple(said)
 
 
 def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
@@ -91,41 +129,31 @@ def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
     return f"{kind} {_names(report, kind, task)[habit.index]}: {share} of the wrong choices ({luck})"
 
 
-def _matrices(report: ChoiceReport, task: str) -> list[Markup]:
-    kinds: tuple[Kind, ...] = ("item", "place")
-    drawn = [_matrix(report, kind, task) for kind in kinds if report.confusion[kind]]
-    if not drawn:
-        return [paragraph("No single target was recorded for these episodes.")]
-    return [element("div", *drawn, class_="plots")]
-
-
 def _names(report: ChoiceReport, kind: Kind, task: str) -> tuple[str, ...]:
     return item_names(task if kind == "item" else "", report.n_candidates)
 
 
-def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Markup:
+def _matrices(report: ChoiceReport, task: str) -> tuple[Matrix, ...]:
+    kinds: tuple[Kind, ...] = ("item", "place")
+    return tuple(_matrix(report, kind, task) for kind in kinds if report.confusion[kind])
+
+
+def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:
     counts = report.confusion[kind]
     most = max(counts.values())
     names = _names(report, kind, task)
     chosen: list[int | None] = [*range(report.n_candidates), None]
-    head = element(
-        "tr",
-        element("th", "target ↓ chosen →", scope="col"),
-        *(element("th", "none" if i is None else names[i], scope="col") for i in chosen),
-    )
-    body = [
-        element(
-            "tr",
-            element("th", names[target], scope="row"),
-            *(_cell(counts.get((target, choice), 0), most, is_right=target == choice) for choice in chosen),
-        )
+    rows = [
+        [
+            MatrixCell(n, DARKEST * n / most, target == choice)
+            for choice in chosen
+            for n in (counts.get((target, choice), 0),)
+        ]
         for target in range(report.n_candidates)
     ]
-    caption = f"Episodes by {KIND_NAMES[kind]}: target (rows) and first choice (columns)"
-    whole = element("table", element("caption", caption), element("thead", head), element("tbody", *body))
-    return element("div", whole, class_="heat scroll", role="region", tabindex=0, aria_label=caption)
-
-
-def _cell(n: int, most: int, *, is_right: bool) -> Markup:
-    shade = f"background:rgba(var(--heat),{0.65 * n / most:.2f})" if n else None
-    return element("td", str(n), style=shade, class_="right" if is_right else None)
+    return Matrix(
+        kind=KIND_NAMES[kind],
+        names=names,
+        choices=tuple("none" if i is None else names[i] for i in chosen),
+        rows=tuple(map(tuple, rows)),
+    )

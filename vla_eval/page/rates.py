@@ -1,22 +1,26 @@
-"""The sections of the report page that show success: the table, by task, by K, paired, and over time."""
+"""What the page shows of success: the table, by task, by K, paired, and over time."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from markupsafe import Markup
 
 from vla_eval.errors import ReportError
-from vla_eval.page.charts import Bar, LineKind, Point, Series, curves, forest, legend
-from vla_eval.page.markup import (
-    UNKNOWN,
-    Markup,
-    details,
-    element,
-    joined,
-    paragraph,
-    section,
-    table,
-    with_code,
+from vla_eval.page.charts import (
+    Bar,
+    Chart,
+    LineKind,
+    Point,
+    Series,
+    curves,
+    forest,
+    reference_sign,
+    sign,
 )
 from vla_eval.page.material import Material, key_of
+from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
 from vla_eval.results.table import Row
@@ -25,22 +29,44 @@ from vla_eval.results.table_formats import table_cells
 N_STEP_TICKS = 5
 
 
-def table_section(material: Material) -> Markup:
-    """Show the table that `mikasa-vla report` prints, each row with its JSON."""
+class Sign(NamedTuple):
+    """One entry of a legend."""
+
+    name: str
+    svg: Markup
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plots:
+    """Charts that share a legend; no chart if there is nothing to draw."""
+
+    legend: tuple[Sign, ...]
+    charts: tuple[Chart, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sweep:
+    """The table of `mikasa-vla compare`; where there is none, `refusal` says why."""
+
+    table: PageTable | None
+    notes: tuple[str, ...] = ()
+    refusal: str = ""
+
+
+def results_table(material: Material) -> PageTable:
+    """Return the table that `mikasa-vla report` prints, each row with its JSON."""
     columns, rows = table_cells(material.table)
-    shown = table(
-        [column.title for column in columns],
-        rows,
-        numeric=[column.is_number for column in columns],
+    return PageTable(
+        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in columns),
+        rows=tuple(map(tuple, rows)),
         caption="Success by task, policy and K (actions executed per inference)",
-        row_data=[json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows],
+        row_data=tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows),
     )
-    return section("table", "Results", shown, _notes(material.table.notes))
 
 
-def success_section(material: Material) -> Markup:
-    """Show success once by task, with intervals, chance and ceiling."""
-    plots = []
+def success_plots(material: Material) -> Plots:
+    """Draw success once by task, with intervals, chance and ceiling."""
+    charts = []
     for task in material.tasks:
         bars = [
             Bar(
@@ -55,25 +81,14 @@ def success_section(material: Material) -> Markup:
             for row in material.rows_of(task)
         ]
         described = "; ".join(f"{bar.label}: {_rate(bar.value)} ({_interval(bar)})" for bar in bars)
-        plots.append(forest(bars, title=f"{task}: success once", description=described))
-    return section(
-        "success",
-        "Success by task",
-        paragraph(
-            "Success at any step of the episode, with its 95 % interval. The broken tick is chance, what a "
-            "perfect arm without memory gets; the dotted one is the ceiling, the expert that is told the "
-            "answer. A policy whose interval holds the chance tick has not been shown to remember.",
-            muted=True,
-        ),
-        legend([]),
-        element("div", *plots, class_="plots"),
-    )
+        charts.append(forest(bars, title=f"{task}: success once", description=described))
+    return Plots(legend=_reference_signs(), charts=tuple(charts))
 
 
-def chunk_section(material: Material) -> Markup:
-    """Show success against n_action_steps, with lines of chance and ceiling."""
-    plots: list[Markup] = []
-    names: dict[str, int] = {}
+def chunk_plots(material: Material) -> Plots:
+    """Draw success against n_action_steps, with lines of chance and ceiling."""
+    charts: list[Chart] = []
+    colors: dict[str, int] = {}
     for task in material.tasks:
         rows = [row for row in material.rows_of(task) if row.success_once is not None]
         sizes = sorted({row.n_action_steps for row in rows})
@@ -81,71 +96,63 @@ def chunk_section(material: Material) -> Markup:
             own = [row for row in rows if row.variant == variant]
             if len({row.n_action_steps for row in own}) < 2:
                 continue
-            names |= {row.policy: material.colors[row.policy] for row in own}
-            title = f"{task}: success against K" + (f", {variant}" if variant else "")
-            plots.append(
+            colors |= {row.policy: material.colors[row.policy] for row in own}
+            described = "; ".join(f"{material.name_of(row)}: {_rate(row.success_once)}" for row in own)
+            charts.append(
                 curves(
                     _by_chunk(material, own),
-                    title=title,
-                    description=_values(material, own),
+                    title=f"{task}: success against K" + (f", {variant}" if variant else ""),
+                    description=described,
                     x_title="K, actions executed per inference",
                     x_ticks=sizes,
                 )
             )
-    if not plots:
-        said = paragraph("Only one n_action_steps (K) was evaluated per task: there is nothing to draw.")
-        return section("chunks", "Success against n_action_steps", said)
-    return section(
-        "chunks",
-        "Success against n_action_steps",
-        legend(list(names.items())),
-        element("div", *plots, class_="plots"),
-        _sweep(material),
+    return Plots(legend=(*_signs(colors, is_line=False), *_reference_signs()), charts=tuple(charts))
+
+
+def chunk_sweep(material: Material) -> Sweep:
+    """Return the comparison of chunk lengths on the same episodes."""
+    try:
+        sweep = compare_runs(material.runs)
+    except ReportError as exc:
+        return Sweep(table=None, refusal=str(exc))
+    titles, rows = sweep_cells(sweep)
+    n_texts = titles.index("episodes")
+    columns = (
+        Column(title, "number" if i >= n_texts or title == "K" else "text") for i, title in enumerate(titles)
     )
+    table = PageTable(columns=tuple(columns), rows=tuple(map(tuple, rows)))
+    return Sweep(table=table, notes=tuple(sweep_notes(sweep)))
 
 
-def paired_section(material: Material) -> Markup:
-    """Show each policy against the baseline, on the same episodes."""
-    title = "Paired comparison"
+def paired_table(material: Material) -> PageTable | None:
+    """Return the counts of each policy against the baseline; None if none is compared."""
     if not material.pairs:
-        why = (
-            f"No policy shares episodes with the baseline '{material.table.baseline}'."
-            if material.table.baseline
-            else "There is no baseline among these policies: run `random` too, or name one with --baseline."
-        )
-        return section("paired", title, paragraph(why))
+        return None
     rows = []
     for row in material.table.rows:
         pairs = material.pairs.get(key_of(row))
         if pairs is None or row.paired_difference is None:
             continue
+        counts = (pairs.n_pairs, pairs.both, pairs.only_first, pairs.only_second, pairs.neither)
         rows.append(
             [
                 material.name_of(row, with_task=True),
                 f"{row.baseline} K={row.baseline_n_action_steps}",
-                *map(str, (pairs.n_pairs, pairs.both, pairs.only_first, pairs.only_second, pairs.neither)),
+                *map(str, counts),
                 f"{row.paired_difference:+.2f}",
                 _p(row.paired_p_raw),
                 _p(row.paired_p),
             ]
         )
-    titles = ("policy", "against", "pairs", "both", "only it", "only the baseline", "neither")
-    return section(
-        "paired",
-        title,
-        paragraph(
-            "The same episodes (task, run, seed) for both. p: exact McNemar test, two-sided; Holm's "
-            f"correction over all {material.table.n_comparisons} comparisons of this table.",
-            muted=True,
-        ),
-        table((*titles, "difference", "p", "p (Holm)"), rows, numeric=[False, False, *[True] * 8]),
-    )
+    counted = ("pairs", "both", "only it", "only the baseline", "neither")
+    return page_table(rows, text=("policy", "against"), numbers=(*counted, "difference", "p", "p (Holm)"))
 
 
-def steps_section(material: Material) -> Markup:
-    """Show how soon success comes: the share of episodes that have succeeded by each step."""
-    plots: list[Markup] = []
-    names: dict[str, int] = {}
+def steps_plots(material: Material) -> Plots:
+    """Draw how soon success comes: the share of episodes that have succeeded by each step."""
+    charts: list[Chart] = []
+    colors: dict[str, int] = {}
     for task, size, variant in _settings(material):
         rows = [
             row
@@ -156,9 +163,9 @@ def steps_section(material: Material) -> Markup:
         horizon = max((point.x for one in series for point in one.points), default=0)
         if not horizon:
             continue
-        names |= {row.policy: material.colors[row.policy] for row in rows}
+        colors |= {row.policy: material.colors[row.policy] for row in rows}
         means = "; ".join(f"{material.name_of(row)}: {_steps(row)}" for row in rows)
-        plots.append(
+        charts.append(
             curves(
                 series,
                 title=f"{task}, K={size}" + (f", {variant}" if variant else ""),
@@ -167,19 +174,15 @@ def steps_section(material: Material) -> Markup:
                 x_ticks=[round(horizon * i / (N_STEP_TICKS - 1)) for i in range(N_STEP_TICKS)],
             )
         )
-    if not plots:
-        return section("steps", "Steps to success", paragraph("No episode has a result yet."))
-    return section(
-        "steps",
-        "Steps to success",
-        paragraph(
-            "Share of episodes that have succeeded by each control step; failures count in the denominator, "
-            "errors do not.",
-            muted=True,
-        ),
-        legend(list(names.items()), lines=True, references=False),
-        element("div", *plots, class_="plots"),
-    )
+    return Plots(legend=_signs(colors, is_line=True), charts=tuple(charts))
+
+
+def _signs(colors: dict[str, int], *, is_line: bool) -> tuple[Sign, ...]:
+    return tuple(Sign(name, sign(color, is_line=is_line)) for name, color in colors.items())
+
+
+def _reference_signs() -> tuple[Sign, ...]:
+    return tuple(Sign(name, reference_sign(name)) for name in ("chance", "ceiling"))
 
 
 def _settings(material: Material) -> list[tuple[str, int, str | None]]:
@@ -194,16 +197,19 @@ def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
             name=policy,
             color=material.colors[policy],
             points=tuple(
-                Point(r.n_action_steps, r.success_once or 0.0, r.ci_low, r.ci_high)
+                Point(r.n_action_steps, r.success_once, r.ci_low, r.ci_high)
                 for r in rows
                 if r.policy == policy and r.success_once is not None
             ),
         )
         for policy in dict.fromkeys(row.policy for row in rows)
     ]
-    kinds: tuple[LineKind, ...] = ("chance", "ceiling")
-    for kind in kinds:
-        known = {r.n_action_steps: getattr(r, kind) for r in rows if getattr(r, kind) is not None}
+    kinds: dict[LineKind, Callable[[Row], float | None]] = {
+        "chance": lambda row: row.chance,
+        "ceiling": lambda row: row.ceiling,
+    }
+    for kind, rate_of in kinds.items():
+        known = {r.n_action_steps: rate for r in rows if (rate := rate_of(r)) is not None}
         if known:
             points = tuple(Point(size, rate) for size, rate in sorted(known.items()))
             series.append(Series(name=kind, color=0, points=points, kind=kind))
@@ -217,31 +223,6 @@ def _cumulative(material: Material, row: Row) -> Series:
     points = [Point(0, 0.0), *(Point(step, (i + 1) / len(results)) for i, step in enumerate(steps))]
     points.append(Point(end, points[-1].y))
     return Series(name=row.policy, color=material.colors[row.policy], points=tuple(points), is_step=True)
-
-
-def _sweep(material: Material) -> Markup:
-    try:
-        sweep = compare_runs(material.runs)
-    except ReportError as exc:
-        return paragraph(f"No paired comparison of chunk lengths: {exc}", muted=True)
-    titles, rows = sweep_cells(sweep)
-    first_numbers = titles.index("episodes")
-    numeric = [i >= first_numbers or titles[i] == "K" for i in range(len(titles))]
-    return details(
-        "Chunk lengths compared on the same episodes",
-        table(titles, rows, numeric=numeric),
-        _notes(sweep_notes(sweep)),
-    )
-
-
-def _notes(notes: Sequence[str]) -> Markup:
-    if not notes:
-        return joined(())
-    return element("ul", *(element("li", with_code(note)) for note in notes), class_="notes")
-
-
-def _values(material: Material, rows: Sequence[Row]) -> str:
-    return "; ".join(f"{material.name_of(row)}: {_rate(row.success_once)}" for row in rows)
 
 
 def _interval(bar: Bar) -> str:

@@ -10,10 +10,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vla_eval.decoding import decode
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.policies.checkpoint_json import get_text
+from vla_eval.policies.checkpoint_json import read_json as read_json  # where most look for it
 from vla_eval.shipped import search_folders
 
 CONFIG_FILE = "config.json"
@@ -119,36 +120,56 @@ def checkpoint_name(path: Path) -> str:
 def checkpoint_sha256(path: Path) -> str:
     """Return a digest of all files that the policy's actions depend on, the base of an adapter included."""
     folder = find_checkpoint(path)
-    digest = hashlib.sha256()
-    for name, file in _hashed_files(folder):
-        digest.update(f"{name}\0{file_sha256(file)}\n".encode())
-    base = adapter_base(folder)
-    if base is not None and base.is_dir():
-        digest.update(f"base\0{checkpoint_sha256(base)}\n".encode())
-    return digest.hexdigest()
+    below: str | None = None
+    for part in reversed([folder, *adapter_bases(folder)]):
+        digest = hashlib.sha256()
+        for name, file in _hashed_files(part):
+            digest.update(f"{name}\0{file_sha256(file)}\n".encode())
+        if below is not None:
+            digest.update(f"base\0{below}\n".encode())
+        below = digest.hexdigest()
+    assert below is not None  # there is at least the folder itself
+    return below
 
 
 def adapter_base(folder: Path) -> Path | None:
-    """Return where the checkpoint that a LoRA adapter was trained on lies; None for a whole model."""
-    if not (folder / ADAPTER_CONFIG_FILE).is_file():
-        return None
-    base = read_json(folder / ADAPTER_CONFIG_FILE).get("base_model_name_or_path")
-    return Path(str(base)) if base else None
-
-
-def read_json(path: Path) -> dict[str, Any]:  # Any: JSON of another program
-    """Return the mapping that a JSON file holds.
+    """Return where the checkpoint that a LoRA adapter was trained on lies; None for a whole model.
 
     Raises:
-        CheckpointError: it is missing or something else.
+        CheckpointError: the adapter's description is damaged.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as exc:
-        raise CheckpointError(f"{path}: cannot be read as JSON ({exc}). Fetch the checkpoint again.") from exc
-    if not isinstance(data, dict):
-        raise CheckpointError(f"{path}: expected a mapping, found {data!r:.60}.")
-    return data
+    file = folder / ADAPTER_CONFIG_FILE
+    if not file.is_file():
+        return None
+    base = get_text(read_json(file), "base_model_name_or_path", where=str(file))
+    return Path(base) if base else None
+
+
+def adapter_bases(folder: Path, *, base_checkpoint: str | None = None) -> list[Path]:
+    """Return the checkpoints below a LoRA adapter that are there, nearest first; none for a whole model.
+
+    Args:
+        folder: of the adapter.
+        base_checkpoint: where its base lies; None: where it was in training.
+
+    Raises:
+        CheckpointError: one is its own base, or its base's.
+    """
+    if not (folder / ADAPTER_CONFIG_FILE).is_file():
+        return []
+    chain = [folder]
+    base = Path(base_checkpoint) if base_checkpoint else adapter_base(folder)
+    while base is not None and base.is_dir():
+        found = find_checkpoint(base)
+        if found.resolve() in [part.resolve() for part in chain]:
+            raise CheckpointError(
+                f"{chain[-1] / ADAPTER_CONFIG_FILE}: expected the base of the adapter, found {found}, which "
+                "is the adapter itself or stands on it. Name the base's folder with `base_checkpoint` in "
+                "the recipe's args."
+            )
+        chain.append(found)
+        base = adapter_base(found)
+    return chain[1:]
 
 
 def write_facts(folder: Path, facts: TrainingFacts) -> None:

@@ -12,19 +12,16 @@ from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     checkpoint_sha256,
-    file_sha256,
     find_checkpoint,
     read_facts,
-    read_json,
 )
+from vla_eval.policies.checkpoint_json import get_mapping, get_text
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
+from vla_eval.policies.saved_processor import SavedStep, read_saved_processor
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 
 LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
-PPO_EXPERT = "ppo_expert"
-PPO_FILES = ("config.json", "expert.safetensors")
-"""What the actions of a learned expert depend on; the rest of its folder is for people."""
 
 NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
     "MEAN_STD": ("mean", "std"),
@@ -54,13 +51,7 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
         CheckpointError: the weights are not there.
     """
     checkpoint = args.get("checkpoint")
-    if not isinstance(checkpoint, str):
-        return {}
-    if adapter == PPO_EXPERT:
-        return {
-            f"checkpoints/{policy}/{name}": _expert_file_sha256(Path(checkpoint) / name) for name in PPO_FILES
-        }
-    if adapter not in LEROBOT_CHECKPOINTS:
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
         return {}
     folder = find_checkpoint(Path(checkpoint))
     hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
@@ -102,37 +93,42 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
 
 def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:
     used: dict[str, dict[str, list[float]]] = {}
-    for step in read_json(folder / processor).get("steps", []):
-        file = step.get("state_file")
-        if file is None or step.get("registry_name") not in LEROBOT_STEPS | OWN_STEPS:
+    for step in read_saved_processor(folder / processor).steps:
+        file = step.state_file
+        if file is None or step.registry_name not in LEROBOT_STEPS | OWN_STEPS:
             continue
-        state = _numbers(folder / file)
+        state = _numbers(file)
         for field, name, key in _names(step):
             if key not in state:
                 raise CheckpointError(
-                    f"{folder / file}: has no statistic '{name}' of '{field}', by which {processor} "
+                    f"{file}: has no statistic '{name}' of '{field}', by which {processor} "
                     f"normalises. Fetch the complete checkpoint."
                 )
             used.setdefault(field, {})[name] = state[key]
     return used
 
 
-def _names(step: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+def _names(step: SavedStep) -> Iterator[tuple[str, str, str]]:
     """Yield field, statistic and the name of its tensor for all that a step uses."""
-    config = step.get("config", {})
-    if step["registry_name"] in OWN_STEPS:
-        for field, spec in config.get("fields", {}).items():
-            if spec["kind"] not in STATISTICS:
+    config, where = step.config, step.where
+    if step.registry_name in OWN_STEPS:
+        known = {str(kind): names for kind, names in STATISTICS.items()}
+        fields = get_mapping(config, "fields", where=where)
+        for field in fields:
+            kind = get_text(get_mapping(fields, field, where=where), "kind", where=where)
+            if kind not in known:
                 raise CheckpointError(
-                    f"{step['registry_name']} normalises '{field}' by '{spec['kind']}', known are "
-                    f"{', '.join(STATISTICS)}. Use the version of mikasa-vla-eval that made the checkpoint."
+                    f"{where}: {step.name} normalises '{field}' by '{kind}', known are "
+                    f"{', '.join(known)}. Use the version of mikasa-vla-eval that made the checkpoint."
                 )
-            for name in STATISTICS[spec["kind"]]:
+            for name in known[kind]:
                 yield field, name, f"{field}/{name}"
         return
-    for field, feature in config.get("features", {}).items():
-        mode = config.get("norm_map", {}).get(feature["type"], "IDENTITY")
-        for name in NEEDED_STATISTICS.get(mode, ()):
+    features, norm_map = (get_mapping(config, key, where=where) for key in ("features", "norm_map"))
+    for field in features:
+        kind = get_text(get_mapping(features, field, where=where), "type", where=where)
+        mode = get_text(norm_map, kind or "", where=where)
+        for name in NEEDED_STATISTICS.get(mode or "IDENTITY", ()):
             yield field, name, f"{field}.{name}"
 
 
@@ -146,9 +142,3 @@ def _numbers(file: Path) -> dict[str, list[float]]:
             f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
         ) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}
-
-
-def _expert_file_sha256(path: Path) -> str:
-    if not path.is_file():
-        raise CheckpointError(f"{path}: expected a file of `mikasa-vla train-expert`, found none.")
-    return file_sha256(path)

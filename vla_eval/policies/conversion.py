@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
+from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import read_weights
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
@@ -119,7 +120,8 @@ def write_checkpoint(
     """
     with folder_when_whole(out) as partial:
         policy.config.tokenizer_name = str(_copy_tokenizer(source, partial / TOKENIZER_FOLDER))
-        processors = make_processors()
+        with no_foreign_code(policy.config.type):
+            processors = make_processors()
         steps = (step for step in processors[0].steps if hasattr(step, "input_tokenizer"))
         check_tokenizer(next(steps).input_tokenizer)
         policy.config.tokenizer_name = str(out / TOKENIZER_FOLDER)

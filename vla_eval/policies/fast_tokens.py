@@ -17,6 +17,7 @@ from transformers import PreTrainedTokenizerFast
 from transformers.utils import cached_file
 
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.checkpoint_json import read_json
 
 SETTINGS_FILE = "processor_config.json"
 CLASS = "UniversalActionProcessor"
@@ -62,7 +63,7 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
     """
     try:
         file = Path(str(cached_file(name, SETTINGS_FILE)))
-        settings = json.loads(file.read_text(encoding="utf-8"))
+        settings = read_json(file)
         tokenizer: Any = PreTrainedTokenizerFast
         loaded = tokenizer.from_pretrained(name)
     except (OSError, ValueError) as exc:
@@ -76,7 +77,14 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
             f"the action tokenizer '{name}' is a '{found}'; expected a '{CLASS}', the only one that is read "
             "here as data. Code that comes with a tokenizer is not run."
         )
-    return FastActionTokenizer(loaded, scale=float(settings["scale"]), min_token=int(settings["min_token"]))
+    scale, min_token = settings.get("scale"), settings.get("min_token")
+    has_truth_value = isinstance(scale, bool) or isinstance(min_token, bool)
+    if has_truth_value or not isinstance(scale, int | float) or not isinstance(min_token, int):
+        raise CheckpointError(
+            f"{file}: expected numbers 'scale' and 'min_token', found {scale!r:.60} and {min_token!r:.60}. "
+            "Fetch the action tokenizer again."
+        )
+    return FastActionTokenizer(loaded, scale=float(scale), min_token=min_token)
 
 
 class FastProcessors:

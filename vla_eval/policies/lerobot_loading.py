@@ -5,8 +5,9 @@ answer a failed load with random weights. Here every parameter is compared with 
 Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
 """
 
+import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -27,15 +28,18 @@ import vla_eval.policies.octo.configuration_octo
 import vla_eval.policies.openvla.configuration_openvla
 import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError, unknown_name
+from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
     ADAPTER_WEIGHTS_FILE,
     CONFIG_FILE,
     WEIGHTS_FILE,
     adapter_base,
+    adapter_bases,
     find_checkpoint,
     read_json,
 )
+from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
@@ -100,7 +104,8 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
     """Return the policy's configuration, set to the wanted device and precision."""
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
-    cls = config_class(str(kind), where=str(folder / CONFIG_FILE))
+    where = str(folder / CONFIG_FILE)
+    cls = config_class(str(kind), where=where)
     data["device"] = options.device
     if options.dtype is not None:
         if "dtype" not in data:
@@ -110,13 +115,14 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
             )
         data["dtype"] = options.dtype
     data = with_local_files(data, folder, tokenizer=options.tokenizer)
+    check_config(cls, data, where=where)
     try:
         config = draccus.decode(cls, data)
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
         raise CheckpointError(
-            f"{folder / CONFIG_FILE}: not the configuration of a '{kind}' policy of the installed lerobot: "
-            f"{exc}"
+            f"{where}: not the configuration of a '{kind}' policy of the installed lerobot: {exc!s:.1000}"
         ) from exc
+    check_features(config, where=where)
     return config
 
 
@@ -141,7 +147,7 @@ def config_class(kind: str, *, where: str) -> Any:
     register_third_party_plugins()
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
-        error = unknown_name("LeRobot policy type", kind, known, where=where)
+        error = unknown_name("LeRobot policy type", kind[:100], known, where=where)
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
         )
@@ -155,15 +161,24 @@ def config_class(kind: str, *, where: str) -> Any:
 
 
 def make_empty_policy(config: Any, **kwargs: Any) -> Any:
-    """Return a policy with the weights that its constructor gives it."""
+    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer."""
     try:
-        return get_policy_class(config.type)(config, **kwargs)
+        with no_foreign_code(config.type):
+            return get_policy_class(config.type)(config, **kwargs)
     except ImportError as exc:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
         ) from exc
-    except (OSError, RuntimeError) as exc:
+    except OSError as exc:
         raise_plainly(exc, config.type)
+    except (RuntimeError, ValueError, OverflowError, MemoryError) as exc:
+        if isinstance(exc, RuntimeError) and exc.__cause__ is not None:
+            raise_plainly(exc, config.type)
+        raise CheckpointError(
+            f"a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
+            f"{exc!s:.500} Expected sizes that belong together and fit into memory; fetch the checkpoint "
+            "again."
+        ) from exc
 
 
 def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
@@ -263,21 +278,39 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 
 def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
     """Load a LoRA adapter on top of the checkpoint that it was trained on."""
-    from peft import PeftModel, get_peft_model_state_dict  # optional extra of lerobot
+    from peft import get_peft_model_state_dict  # optional extra of lerobot
 
-    base = Path(options.base_checkpoint) if options.base_checkpoint else adapter_base(folder)
-    if base is None or not base.is_dir():
+    bases = adapter_bases(folder, base_checkpoint=options.base_checkpoint)
+    if not bases:
+        base = options.base_checkpoint or adapter_base(folder)
         raise CheckpointError(
             f"{folder}: a LoRA adapter needs the checkpoint it was trained on, which was at {base} and is "
             f"not there. Name its folder with `base_checkpoint` in the recipe's args."
         )
-    weights = read_weights(folder / ADAPTER_WEIGHTS_FILE)
+    file = folder / ADAPTER_WEIGHTS_FILE
+    config, weights = read_adapter_config(folder / ADAPTER_CONFIG_FILE), read_weights(file)
     # What the adapter was trained with in full comes with it: the base need not have it.
-    names = read_json(folder / ADAPTER_CONFIG_FILE).get("modules_to_save") or ()
+    names = config.modules_to_save or ()
     beside = [start for start in getattr(policy, "new_in_finetuning", ()) if start.split(".")[-2] in names]
-    filled = fill_policy(policy, find_checkpoint(base), options, may_be_new=beside)
-    begin_from(filled, find_checkpoint(base))
-    wrapped = PeftModel.from_pretrained(filled, str(folder), is_trainable=True)
+    named = dataclasses.replace(options, base_checkpoint=None)  # the adapter's base, not that of its base
+    filled = fill_policy(policy, bases[0], named, may_be_new=beside)
+    begin_from(filled, bases[0])
+    wrapped = _with_adapter(filled, config, weights, where=str(file))
     # peft, too, leaves out what does not fit.
-    check_same(get_peft_model_state_dict(wrapped), weights, where=str(folder / ADAPTER_WEIGHTS_FILE))
+    check_same(get_peft_model_state_dict(wrapped), weights, where=str(file))
+    return wrapped
+
+
+def _with_adapter(policy: Any, config: Any, weights: Mapping[str, Tensor], *, where: str) -> Any:
+    """Put a LoRA adapter on a policy; peft reads no file for it."""
+    from peft import PeftModel, set_peft_model_state_dict
+
+    try:
+        wrapped: Any = PeftModel(policy, config)
+        set_peft_model_state_dict(wrapped, dict(weights))
+    except (ValueError, RuntimeError, KeyError) as exc:
+        raise CheckpointError(
+            f"{where}: the adapter does not fit its base: {exc!s:.500} Name the base's folder with "
+            "`base_checkpoint` in the recipe's args."
+        ) from exc
     return wrapped

@@ -10,20 +10,19 @@ from lerobot.configs import NormalizationMode
 from lerobot.policies import make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 
-from vla_eval.errors import CheckpointError
+from vla_eval.errors import CheckpointError, VlaEvalError
 from vla_eval.policies.checkpoint import (
     ACTION_TOKENIZER_FOLDER,
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     TOKENIZER_FOLDER,
-    read_json,
 )
 from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
+from vla_eval.policies.processor_door import processors_through_the_door
+from vla_eval.policies.saved_processor import read_saved_processor
 from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 
 TOKENIZER_STEP, ACTION_TOKENIZER_STEP = "tokenizer_processor", "action_tokenizer_processor"
-PROCESSOR_PACKAGES = ("lerobot", "lerobot_", "vla_eval")
-"""Where a processor step that is named by its import path may come from; others are never imported."""
 
 
 def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tuple[Any, Any]:
@@ -38,8 +37,7 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
         CheckpointError: one is missing, or names code or a tokenizer that is not there.
     """
     register_steps(type(config))
-    described = {name: checked_steps(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)}
-    before, after = described[PREPROCESSOR_FILE], described[POSTPROCESSOR_FILE]
+    before, after = (step_names(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE))
     overrides: dict[str, dict[str, Any]] = {}
     if "device_processor" in before:
         overrides["device_processor"] = {"device": config.device}
@@ -53,18 +51,17 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
         {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
     )
     try:
-        return make_pre_post_processors(  # type: ignore[no-any-return]
-            config,
-            pretrained_path=str(folder),
-            preprocessor_overrides=overrides,
-            postprocessor_overrides=after_overrides,
-        )
-    except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
-        raise CheckpointError(
-            f"{folder}: the processors cannot be made: {exc} Name a local folder with `tokenizer` in the "
-            f"recipe's args if it is the tokenizer that is missing; nothing is downloaded unless "
-            f"HF_HUB_OFFLINE=0 is set."
-        ) from exc
+        with processors_through_the_door():
+            return make_pre_post_processors(  # type: ignore[no-any-return]
+                config,
+                pretrained_path=str(folder),
+                preprocessor_overrides=overrides,
+                postprocessor_overrides=after_overrides,
+            )
+    except VlaEvalError:
+        raise  # ours say what to do
+    except Exception as exc:  # whatever a family does with its processors once they are made
+        raise CheckpointError(f"{folder}: the processors cannot be made: {exc}") from exc
 
 
 def register_steps(cls: type) -> None:
@@ -121,24 +118,13 @@ def _tokenizer(folder: Path, named: str | None) -> str | None:
     return str(own) if own.is_dir() else None
 
 
-def checked_steps(path: Path) -> tuple[str, ...]:
-    """Return the names of a saved processor's steps.
+def step_names(path: Path) -> tuple[str, ...]:
+    """Return what lerobot addresses the steps of a saved processor by.
 
     Raises:
-        CheckpointError: the file is missing, or names code that is no processor's.
+        CheckpointError: the file is missing or damaged.
     """
-    steps = read_json(path).get("steps", [])
-    names = []
-    for step in steps:
-        name, imported = step.get("registry_name"), step.get("class")
-        if name is None and not str(imported).startswith(PROCESSOR_PACKAGES):
-            # lerobot would import and call whatever is named here.
-            raise CheckpointError(
-                f"{path}: names the code '{imported}', which is neither lerobot's nor a lerobot plugin's. "
-                f"It is not run. If it is yours, register the step with ProcessorStepRegistry."
-            )
-        names.append(str(name))
-    return tuple(names)
+    return read_saved_processor(path).names()
 
 
 def save_tokenizers(preprocessor: Any, folder: Path) -> None:

@@ -13,6 +13,8 @@ from vla_eval.policies.checkpoint import (
     read_json,
     weights_file,
 )
+from vla_eval.policies.checkpoint_json import get_count, get_text
+from vla_eval.policies.config_check import MAX_ACTIONS
 from vla_eval.recipes import PolicyRecipe, Recipe, find_recipe, list_recipes, load_recipe
 
 LEROBOT_ADAPTER = "lerobot"
@@ -44,7 +46,8 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
         return load_recipe("policies", name, PolicyRecipe)
     folder = find_checkpoint(Path(name))
     config = read_json(folder / CONFIG_FILE)
-    n_action_steps = config.get("n_action_steps")
+    where = str(folder / CONFIG_FILE)
+    n_action_steps = get_count(config, "n_action_steps", maximum=MAX_ACTIONS, where=where)
     weights = weights_file(folder)
     is_big = weights is not None and weights.stat().st_size >= BIG_CHECKPOINT_BYTES
     return Recipe(
@@ -53,10 +56,10 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
         sha256=checkpoint_sha256(folder),
         value=PolicyRecipe(
             version=1,
-            description=f"A LeRobot checkpoint of type {config.get('type')}.",
+            description=f"A LeRobot checkpoint of type {get_text(config, 'type', where=where)}.",
             adapter=LEROBOT_ADAPTER,
             args={"checkpoint": str(folder)},
-            default_n_action_steps=n_action_steps if isinstance(n_action_steps, int) else 1,
+            default_n_action_steps=n_action_steps or 1,
             max_workers=1 if is_big else None,
         ),
     )

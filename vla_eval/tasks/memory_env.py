@@ -19,7 +19,6 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.common import flatten_state_dict
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
@@ -352,13 +351,6 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         elif self.PROMPT_DIMS:
             extra["task_cue"] = self.prompt()
         return extra
-
-    def state_vector(self) -> torch.Tensor:
-        """Return (B, D): what `obs_mode="state"` observes, in whatever mode the environment runs."""
-        extra = {"tcp_pose": self.agent.tcp.pose.raw_pose, **self._privileged_extra()}
-        observed = {"agent": self._get_obs_agent(), "extra": extra}
-        flat: torch.Tensor = flatten_state_dict(observed, use_torch=True, device=self.device)
-        return flat
 
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         """Return the task's entries of the state observation; never part of a visual observation."""

@@ -10,6 +10,7 @@ a test notices if one is gone):
 - `update_policy`: all noise of a step is drawn from (run seed, step, process), so that a run that was
   killed goes on exactly as it would have; a batch may go through the network in parts; metrics are
   written.
+- `load_training_state`: a damaged state is an error that says what to do; it is safetensors and JSON.
 - `save_checkpoint`: a checkpoint appears whole or not at all, and carries what it was trained on; it is
   then shown to whoever evaluates it.
 """
@@ -41,7 +42,7 @@ from vla_eval.policies.checkpoint import (
     write_facts,
 )
 from vla_eval.policies.lerobot_loading import LoadOptions, begin_from, fill_policy, raise_plainly
-from vla_eval.policies.lerobot_processors import checked_steps, save_tokenizers, tokenizer_overrides
+from vla_eval.policies.lerobot_processors import save_tokenizers, step_names, tokenizer_overrides
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.micro_batches import InMicroBatches
 
@@ -52,6 +53,7 @@ REPLACED = (
     "make_optimizer_and_scheduler",
     "make_train_eval_datasets",
     "update_policy",
+    "load_training_state",
     "save_checkpoint",
     "init_logging",
     "inside_slurm",
@@ -156,7 +158,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
     def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, **kwargs: Any) -> Any:
         if pretrained_path:
             folder = Path(pretrained_path)
-            steps = checked_steps(folder / PREPROCESSOR_FILE)
+            steps = step_names(folder / PREPROCESSOR_FILE)
             found = tokenizer_overrides(folder, policy_cfg, steps, tokenizer=hooks.tokenizer)
             kwargs["preprocessor_overrides"] = {**kwargs["preprocessor_overrides"], **found}
             _override_our_steps(folder, policy_cfg, kwargs)
@@ -188,6 +190,15 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
             _write_metrics(hooks, step, tracker, answer[1] or {})
         return answer
 
+    def load_training_state(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return originals["load_training_state"](checkpoint_dir, *args, **kwargs)
+        except Exception as exc:  # lerobot, torch and safetensors raise what they like
+            raise TrainingError(
+                f"{checkpoint_dir}: the state of the training cannot be read ({exc!r:.300}). Remove this "
+                "checkpoint's folder to go on from the one before it, or use another --out."
+            ) from exc
+
     def save_checkpoint(checkpoint_dir: Path, **kwargs: Any) -> None:
         partial = checkpoint_dir.with_name(f"{PARTIAL_PREFIX}{checkpoint_dir.name}")
         originals["save_checkpoint"](checkpoint_dir=partial, **kwargs)
@@ -216,6 +227,7 @@ def _replacements(module: Any, hooks: LoopHooks) -> dict[str, Callable[..., Any]
         make_optimizer_and_scheduler,
         make_train_eval_datasets,
         update_policy,
+        load_training_state,
         save_checkpoint,
         init_logging,
         inside_slurm,
@@ -258,7 +270,7 @@ def _override_our_steps(folder: Path, config: Any, kwargs: dict[str, Any]) -> No
         ("preprocessor_overrides", PREPROCESSOR_FILE, "normalizer_processor", ENCODER_STEP),
         ("postprocessor_overrides", POSTPROCESSOR_FILE, "unnormalizer_processor", DECODER_STEP),
     ):
-        names = checked_steps(folder / file)
+        names = step_names(folder / file)
         overrides = dict(kwargs.get(overrides_name) or {})
         if ours not in names or lerobots not in overrides:
             continue

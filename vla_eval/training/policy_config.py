@@ -23,6 +23,7 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.policies.config_check import check_config
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.recipe import FinetuneRecipe
@@ -51,7 +52,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     check_names("field", recipe.policy, known, where=f"finetune.policy ({recipe.type})")
     data: dict[str, Any] = {}
     if recipe.base_checkpoint is not None:
-        data = _base_config(recipe)
+        of_this_base_alone = getattr(cls, "not_of_base", ())
+        data = {key: value for key, value in _base_config(recipe).items() if key not in of_this_base_alone}
     if recipe.tokenizer is not None and "text_tokenizer_name" in known:
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
@@ -159,6 +161,7 @@ def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
             f"'{recipe.type}'."
         )
     data = with_local_files(data, folder, tokenizer=recipe.tokenizer)
+    check_config(config_class(recipe.type, where="finetune.type"), data, where=str(folder / CONFIG_FILE))
     return {**data, "use_peft": False, "pretrained_path": None}
 
 

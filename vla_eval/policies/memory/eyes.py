@@ -1,32 +1,19 @@
 """How the positive control looks: places in a picture, what stands out among them, what is like another."""
 
-import functools
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.memory.sizes import APART, HALVES, KNOWN, PLACE, QUARTERS, RGB, SPOTS, NetworkSizes
+from vla_eval.policies.steps.precision import in_float32
 
 # How much differences count when something is looked for, to begin with. Colours in [-1, 1]: a maroon cube
 # beside the red one that is asked for differs by about 1 in one of three, and gets e^-40 of the attention.
 COUNT_APART, COUNT_LOOKS, COUNT_OTHERS = 4.0, 40.0, -3.0  # before softplus
 LEAST_COLOR_VARIANCE = 1e-3  # colours in [-1, 1]: less than this is noise of the picture
-
-
-def in_float32[**P, R](method: Callable[P, R]) -> Callable[P, R]:
-    """Keep autocast out: convolutions gain from bfloat16, but places and small steps of memory would lose."""
-
-    @functools.wraps(method)
-    def kept(*args: P.args, **kwargs: P.kwargs) -> R:
-        module: Any = args[0]
-        with torch.autocast(next(module.parameters()).device.type, enabled=False):
-            return method(*args, **kwargs)
-
-    return kept
 
 
 class Places(NamedTuple):
@@ -81,7 +68,7 @@ class Eye(nn.Module):
     @in_float32
     def _known(self, pictures: Tensor) -> Tensor:
         """(N, 3, H, W) in [-1, 1] to (N, P · QUARTERS, KNOWN), place by place."""
-        colors = functional.avg_pool2d(pictures.float(), self.patch_px // SPOTS)
+        colors = functional.avg_pool2d(pictures, self.patch_px // SPOTS)
         apart = standing_out(colors)
         quarters = functional.max_pool2d(apart, SPOTS // HALVES, return_indices=True)[1]
         edge = quarters.shape[-1] // HALVES

@@ -19,9 +19,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
-from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, Places, StandingOut, in_float32
+from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, Places, StandingOut
 from vla_eval.policies.memory.goal_layer import GoalLayer
 from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, STATE, NetworkSizes
+from vla_eval.policies.steps.precision import in_float32
 
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
 INSISTENCE = 5.0

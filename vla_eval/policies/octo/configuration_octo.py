@@ -54,7 +54,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         gripper_encoding, gripper_decoding: see `Gripper`.
         normalize_gripper: whether the gripper is normalised, too; the original leaves it alone.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
-            scheduler_decay_steps: AdamW (decay on kernels alone), warm-up, cosine to 0.
+            scheduler_decay_steps: AdamW (decay on `flax_names.is_kernel` alone), warm-up, cosine to 0.
     """
 
     cameras: dict[str, str] = field(

@@ -9,6 +9,7 @@ from torch import Tensor
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.conversion import check_free, folder_when_whole
+from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.policies.lerobot_processors import save_tokenizers
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
@@ -51,7 +52,8 @@ def convert(
     statistics = read_statistics(source if source.is_dir() else source.parent, dataset=dataset)
     policy = make_empty_policy(config)
     put_weights(policy, _with_shared(policy, from_flax(read_parameters(source))), where=str(source))
-    before, after = make_mikasa_octo_pre_post_processors(config, {ACTION_KEY: dict(statistics)})
+    with no_foreign_code(config.type):
+        before, after = make_mikasa_octo_pre_post_processors(config, {ACTION_KEY: dict(statistics)})
     with folder_when_whole(out) as partial:
         policy.save_pretrained(partial)
         before.save_pretrained(partial)

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.steps.precision import in_float32
+
 NORM_EPSILON = 1e-6  # flax's default
 SCHEDULE_OFFSET = 0.008
 MAX_BETA = 0.999
@@ -100,6 +102,7 @@ class DiffusionHead(nn.Module):
         """Diffusion steps."""
         return self.sizes.diffusion_steps
 
+    @in_float32
     def forward(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
         """Return the noise (…, F) that it believes to be in noisy actions.
 
@@ -116,6 +119,7 @@ class DiffusionHead(nn.Module):
             x = block(x)
         return self.last(functional.silu(x))  # type: ignore[no-any-return]
 
+    @in_float32
     def loss(self, condition_BWD: Tensor, targets: "Targets", draws: "Draws") -> Tensor:
         """Return the squared error of the told noise, summed over an action's dimensions, at each step."""
         schedule = self.schedule()
@@ -127,6 +131,7 @@ class DiffusionHead(nn.Module):
         mean: Tensor = (errors * counts).mean() / counts.mean().clamp(min=LEAST_SHARE)
         return mean * self.sizes.action
 
+    @in_float32
     def sample(self, condition_BD: Tensor, noise: Tensor) -> Tensor:
         """Return chunks (B, chunk, action), normalised.
 

@@ -113,6 +113,11 @@ _RULES: tuple[_Rule, ...] = (
     _Rule(T5 + r"(?P<rest>.+)\.embedding", r"language.\g<rest>.weight", _same),
     _Rule(T5 + r"(?P<rest>.+)\.weight", r"language.\g<rest>.weight", _same),
 )
+_KERNELS = tuple(
+    re.compile("[^.]+".join(re.escape(part) for part in re.split(r"\\g<\w+>", rule.name)))
+    for rule in _RULES
+    if rule.pattern.endswith("kernel") and not rule.pattern.startswith(T5)
+)
 _COMPILED = tuple((re.compile(rule.pattern), rule) for rule in _RULES)
 
 
@@ -150,6 +155,15 @@ def our_name(key: str) -> str:
     if found is None:
         raise CheckpointError(f"'{key}' is no tensor of the Octo that is built here.")
     return found.name
+
+
+def is_kernel(name: str) -> bool:
+    """Return whether a parameter of our network is a `kernel` of the original: what its optimizer decays.
+
+    Source: https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/utils/
+    train_utils.py#L314-L317.
+    """
+    return any(pattern.fullmatch(name) for pattern in _KERNELS)
 
 
 def _rule(key: str) -> _Rule | None:

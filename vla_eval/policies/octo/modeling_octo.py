@@ -16,6 +16,7 @@ from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.octo.configuration_octo import TRAINED, TYPE, MikasaOctoConfig
 from vla_eval.policies.octo.diffusion_head import Targets, draw
+from vla_eval.policies.octo.flax_names import is_kernel
 from vla_eval.policies.octo.language import PromptEmbeddings, make_text_encoder
 from vla_eval.policies.octo.network import OctoNetwork
 from vla_eval.policies.octo.transformer import Window
@@ -66,8 +67,7 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
         others: list[Tensor] = []
         for name, parameter in self.named_parameters():
             if parameter.requires_grad:
-                is_kernel = parameter.ndim > 1 and name.endswith(".weight")
-                (kernels if is_kernel else others).append(parameter)
+                (kernels if is_kernel(name) else others).append(parameter)
         return [{"params": kernels}, {"params": others, "weight_decay": 0.0}]
 
     def reset(self) -> None:

@@ -50,7 +50,10 @@ def read_parameters(folder: Path) -> dict[str, Tensor]:
         )
     (file,) = files
     if file.suffix == ".safetensors":
-        return dict(load_file(file))
+        try:
+            return dict(load_file(file))
+        except Exception as exc:  # safetensors raises its own class, which is no public name
+            raise CheckpointError(f"{file}: cannot be read as safetensors ({exc}). Fetch it again.") from exc
     tree = unpack(file.read_bytes(), where=str(file))
     if not isinstance(tree, dict):
         raise CheckpointError(f"{file}: expected a tree of parameters, found {type(tree).__name__}.")
@@ -192,7 +195,12 @@ def unpack(data: bytes, *, where: str) -> Any:
         CheckpointError: it is something else, damaged, or has arrays in several parts.
     """
     reader = _Reader(data, where)
-    value = reader.value()
+    try:
+        value = reader.value()
+    except (ValueError, TypeError, RecursionError, AttributeError) as exc:  # of text, types and shapes
+        raise CheckpointError(
+            f"{where}: not flax's msgpack: {exc!s:.200}. Fetch the checkpoint again."
+        ) from exc
     if not reader.done():
         raise CheckpointError(f"{where}: not flax's msgpack: something follows its end.")
     if isinstance(value, dict) and any(CHUNKED in key for key in _flat(value)):

@@ -172,7 +172,15 @@ def _pickled(source: Path, name: str, *, allowed: bool) -> dict[str, Tensor]:
         raise CheckpointError(
             f"{found[-1]}: pickled tensors are read only with allow_pickled. Use it for files you trust."
         )
-    tensors = torch.load(found[-1], map_location="cpu", weights_only=True)
+    try:
+        tensors = torch.load(found[-1], map_location="cpu", weights_only=True)
+    except Exception as exc:  # torch and pickle raise what they like
+        raise CheckpointError(
+            f"{found[-1]}: expected pickled tensors and nothing else, found what torch refuses to read "
+            f"({exc!s:.300}). Fetch the file again, from where you trust it."
+        ) from exc
+    if not isinstance(tensors, dict) or not all(isinstance(value, Tensor) for value in tensors.values()):
+        raise CheckpointError(f"{found[-1]}: expected tensors by name, found {type(tensors).__name__}.")
     return {f"{name}.{key.removeprefix('module.')}": value for key, value in tensors.items()}
 
 

@@ -8,6 +8,8 @@ names of the original, so that its checkpoints fit.
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.steps.precision import in_float32
+
 N_BLOCKS = 2
 
 
@@ -52,6 +54,7 @@ class L1Head(nn.Module):
         self.chunk = chunk
         self.model = ResidualMlp(n_in=action * llm_width, width=llm_width, n_out=action)
 
+    @in_float32
     def forward(self, hidden: Tensor) -> Tensor:
         """(B, chunk · action, llm) to normalised actions (B, chunk, action), float32."""
         hidden = hidden.to(self.model.fc1.weight.dtype)
@@ -67,6 +70,7 @@ class ProprioProjector(nn.Module):
         self.fc1 = nn.Linear(proprio, llm_width)
         self.fc2 = nn.Linear(llm_width, llm_width)
 
+    @in_float32
     def forward(self, proprio: Tensor) -> Tensor:
         """Return the token."""
         token: Tensor = self.fc2(functional.gelu(self.fc1(proprio.to(self.fc1.weight.dtype))))

@@ -20,6 +20,7 @@ from transformers import (
 )
 
 from vla_eval.policies.openvla.sizes import NetworkSizes
+from vla_eval.policies.steps.precision import in_float32
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what DINOv2 was trained with
 SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
@@ -44,9 +45,10 @@ class FusedVision(nn.Module):
         self.register_buffer("mean", means, persistent=False)
         self.register_buffer("std", stds, persistent=False)
 
+    @in_float32
     def normalised(self, pictures: Tensor) -> Tensor:
         """Return (2, N, 3, H, W): what DINOv2 sees and what SigLIP sees of (N, 3, H, W) in [0, 1]."""
-        return (pictures.float() - self.mean) / self.std
+        return (pictures - self.mean) / self.std
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return (B, C · P, D), the patches of a sample's pictures one after the other.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import RecipeError
+from vla_eval.policies.steps.precision import in_float32
 
 
 def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
@@ -28,12 +29,14 @@ def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
     return torch.tensor([[focal_px, 0, width_px / 2], [0, focal_px, height_px / 2], [0, 0, 1]])
 
 
+@in_float32
 def resized_intrinsics(matrix: Tensor, *, height_px: int, width_px: int, to_px: int) -> Tensor:
     """Return the matrix of pictures that were resized to `to_px` by `to_px`."""
     factors = torch.tensor([to_px / width_px, to_px / height_px, 1.0], dtype=matrix.dtype)
     return matrix * factors.to(matrix.device)[:, None]
 
 
+@in_float32
 def back_projected(depth: Tensor, matrices: Tensor, *, cell_px: float) -> Tensor:
     """Return points (B, rows, columns, 3) in the camera's frame, one at the middle of each cell.
 

@@ -76,7 +76,9 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
         grid: edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion.
         base_grid: those of the base, if they were others; set by a fine-tuning.
         prefix_attention: what pictures and prompt attend to, see `sizes.Attention`.
-        inference_attention: the same for inference; None: as in training.
+        inference_attention: the same for inference; None becomes that of training. A converted checkpoint has
+            `bidirectional`, because the original predicts so, though its scripts train with `causal`. What is
+            fine-tuned here predicts as it was trained, whatever its base does.
         train_spatial_embeddings: train the embeddings of the action tokens.
         train_word_embeddings: train Gemma's own embeddings, and what tells the tokens.
         sizes: sizes that differ from the published model's, see `NetworkSizes`.
@@ -129,10 +131,11 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
     def __post_init__(self) -> None:
         """Check what can be checked without a dataset."""
         super().__post_init__()
+        self.inference_attention = self.inference_attention or self.prefix_attention
         for name, value, known in (
             ("action_grid", self.action_grid, GRIDS),
             ("prefix_attention", self.prefix_attention, ATTENTIONS),
-            ("inference_attention", self.inference_attention or self.prefix_attention, ATTENTIONS),
+            ("inference_attention", self.inference_attention, ATTENTIONS),
             ("dtype", self.dtype, DTYPES),
         ):
             if value not in known:
@@ -161,6 +164,8 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
             )
         check_names("picture", self.pictures, self.image_features, where=f"policy.pictures ({TYPE})")
 
+    not_of_base = ("inference_attention",)  # a fine-tuning does not take it over
+
     @property
     def reads_state(self) -> bool:
         """Whether the policy has any use for `observation.state`: it has none."""
@@ -177,7 +182,7 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
 
     def attention(self, *, training: bool) -> Attention:
         """Return what pictures and prompt attend to."""
-        name: Any = self.prefix_attention if training else self.inference_attention or self.prefix_attention
+        name: Any = self.prefix_attention if training else self.inference_attention
         chosen: Attention = name  # checked in `__post_init__`
         return chosen
 

@@ -28,46 +28,19 @@ from vla_eval.policies.conversion import (
 )
 from vla_eval.policies.spatialvla.action_grid import AXES
 from vla_eval.policies.spatialvla.configuration_spatialvla import MikasaSpatialVLAConfig
-from vla_eval.policies.spatialvla.ego3d import CELLS, N_FREQUENCIES
+from vla_eval.policies.spatialvla.described import GRID_PARTS, PROCESSOR_FILE, check_described
 from vla_eval.policies.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.policies.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
 from vla_eval.policies.spatialvla.prompt import finished, prompt_text
-from vla_eval.policies.spatialvla.sizes import NetworkSizes
+from vla_eval.policies.spatialvla.sizes import Attention, NetworkSizes
 from vla_eval.policies.spatialvla.weight_names import EMBEDDINGS, HEAD, to_ours
 from vla_eval.policies.weights import put_weights
 
-PROCESSOR_FILE = "processor_config.json"
 Head = Literal["tied", "own"]
-GRID_PARTS = {name: "translation" if index < 3 else "rotation" for index, name in enumerate(AXES)}
-# What config.json says of parts, (section, key) -> our size; compared where it is there.
-DESCRIBED: Mapping[tuple[str, str], str] = {
-    ("vision_config", "hidden_size"): "siglip_width",
-    ("vision_config", "num_hidden_layers"): "siglip_depth",
-    ("vision_config", "num_attention_heads"): "siglip_heads",
-    ("vision_config", "intermediate_size"): "siglip_mlp",
-    ("vision_config", "image_size"): "image_px",
-    ("vision_config", "patch_size"): "patch_px",
-    ("text_config", "hidden_size"): "llm_width",
-    ("text_config", "num_hidden_layers"): "llm_depth",
-    ("text_config", "num_attention_heads"): "llm_heads",
-    ("text_config", "num_key_value_heads"): "llm_kv_heads",
-    ("text_config", "head_dim"): "llm_head_width",
-    ("text_config", "intermediate_size"): "llm_mlp",
-    ("", "action_token_begin_idx"): "first_action_token",
-    ("", "image_token_index"): "image_token",
-    ("", "spatial_token_num"): "n_action_tokens",
-}
-FIXED = {
-    "n_freqs": N_FREQUENCIES,
-    "ego3d_patch_reso": CELLS,
-    "use_vision_zoe": True,
-    "use_spatial_token": True,
-}
-# What of ZoeDepth no tensor's shape tells.
-DEPTH_BEHAVIOUR = (
-    *("attractor_alpha", "attractor_gamma", "attractor_kind", "bin_centers_type", "min_temp", "max_temp"),
-    *("readout_type", "num_attractors", "reassemble_factors", "bin_configurations", "hidden_act"),
-)
+ORIGINALS_INFERENCE: Attention = "bidirectional"
+"""What the prefix attends to when the original predicts, however it was trained: unless flash attention is
+asked for, its mask hides no token of the prompt where there are no labels. Source: https://github.com/
+SpatialVLA/SpatialVLA/blob/e48075326a92116adaaf1232cf01471f15f09a73/model/modeling_spatialvla.py#L258-L306."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,9 +83,8 @@ def convert_spatialvla(source: Path, out: Path, options: ConvertOptions) -> Path
     weights = read_safetensors(source)
     has_own_head = _settle_head(source, described, weights, options.head)
     config = _config(source, processor, options, has_own_head=has_own_head)
-    _check_described(source, described, config.network_sizes())
+    check_described(source, config.network_sizes())
     policy = MikasaSpatialVLAPolicy(config)
-    _check_depth(source, described, policy)
     named = {f"network.{name}": value for name, value in to_ours(weights).items()}
     put_weights(policy, named, where=str(source), cast=True)
     statistics = read_statistics(source, processor, config, options.unnorm_key)
@@ -194,6 +166,7 @@ def _config(
     config: MikasaSpatialVLAConfig = make(
         chunk_size=chunk,
         n_action_steps=chunk,
+        inference_attention=ORIGINALS_INFERENCE,
         pictures=list(options.pictures),
         grid=read_grid(source, processor),
         sizes={**options.sizes, "llm_own_head": int(has_own_head)},
@@ -206,39 +179,6 @@ def _config(
     }
     config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
     return config
-
-
-def _check_described(source: Path, described: Mapping[str, Any], sizes: NetworkSizes) -> None:
-    expected: dict[tuple[str, str], object] = {
-        key: getattr(sizes, name) for key, name in DESCRIBED.items()
-    } | {("", name): value for name, value in FIXED.items()}
-    problems = []
-    for (section, key), value in expected.items():
-        found = (described.get(section) or {} if section else described).get(key, value)
-        if found != value:
-            problems.append(f"{section or CONFIG_FILE}.{key}: expected {value}, found {found}")
-    _refuse(source, problems)
-
-
-def _check_depth(source: Path, described: Mapping[str, Any], policy: MikasaSpatialVLAPolicy) -> None:
-    found = described.get("vision_zoe_config") or {}
-    expected = policy.network.depth.zoe.config.to_dict()
-    problems = [
-        f"vision_zoe_config.{name}: expected {expected[name]}, found {found[name]}"
-        for name in DEPTH_BEHAVIOUR
-        if name in found and _plain(found[name]) != _plain(expected[name])
-    ]
-    _refuse(source, problems)
-
-
-def _plain(value: Any) -> Any:
-    """Return what JSON would make of it: no tuples."""
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _refuse(source: Path, problems: list[str]) -> None:
-    if problems:
-        raise CheckpointError(f"{source}: not the published SpatialVLA:\n  " + "\n  ".join(problems))
 
 
 def _check_tokenizer(source: Path, tokenizer: Any, sizes: NetworkSizes) -> None:

@@ -13,6 +13,7 @@ from torch.nn import functional
 from transformers import BeitConfig, ZoeDepthConfig, ZoeDepthForDepthEstimation
 
 from vla_eval.policies.spatialvla.sizes import NetworkSizes
+from vla_eval.policies.steps.precision import in_float32
 
 PAD_PX = 31
 """Pixels that are mirrored at each edge, whatever the picture's size. It is ZoeDepth's own padding,
@@ -64,24 +65,32 @@ class DepthModel(nn.Module):
         return depth.float()
 
 
+@in_float32
 def shown_pictures(pictures: Tensor, size_px: int) -> Tensor:
     """Return (N, 3, size, size), float32: what the depth model sees of pictures in [0, 1]."""
-    padded = functional.pad(pictures.float(), (PAD_PX,) * 4, mode="reflect")
+    padded = functional.pad(pictures, (PAD_PX,) * 4, mode="reflect")
     resized = functional.interpolate(padded, size=(size_px, size_px), mode="bicubic", align_corners=True)
     return (resized - MEAN) / STD
 
 
+@in_float32
 def cut_depth(depth: Tensor, picture_px: int) -> Tensor:
     """Return the depth (N, picture_px, picture_px) of the pictures without their padding."""
     padded_px = picture_px + 2 * PAD_PX
     resized = functional.interpolate(
-        depth.float()[:, None], size=(padded_px, padded_px), mode="bicubic", align_corners=True
+        depth[:, None], size=(padded_px, padded_px), mode="bicubic", align_corners=True
     )
     return resized[:, 0, PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
 
 
 def zoe_depth(sizes: NetworkSizes) -> Any:
     """Return transformers' ZoeDepth with random weights."""
+    model: Any = ZoeDepthForDepthEstimation
+    return model(zoe_config(sizes))
+
+
+def zoe_config(sizes: NetworkSizes) -> Any:
+    """Return transformers' configuration of it."""
     make_eye: Any = BeitConfig
     eye = make_eye(
         image_size=sizes.depth_px,
@@ -94,7 +103,7 @@ def zoe_depth(sizes: NetworkSizes) -> Any:
         out_features=[f"stage{sizes.depth_layers * quarter // 4}" for quarter in (1, 2, 3, 4)],
     )
     make: Any = ZoeDepthConfig
-    config = make(
+    return make(
         backbone_config=eye,
         neck_hidden_sizes=[sizes.depth_neck // share for share in NECK_SHARES],
         fusion_hidden_size=sizes.depth_fusion,
@@ -107,5 +116,3 @@ def zoe_depth(sizes: NetworkSizes) -> Any:
         ],
         **ROUTER,
     )
-    model: Any = ZoeDepthForDepthEstimation
-    return model(config)

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from vla_eval.policies.spatialvla.camera import back_projected
 from vla_eval.policies.spatialvla.sizes import NetworkSizes
+from vla_eval.policies.steps.precision import in_float32
 
 CELLS = 2  # per patch and direction
 N_FREQUENCIES = 8  # 1, 2, 4 … 128, in radians per half metre
@@ -42,6 +43,7 @@ class Ego3DEncoding(nn.Module):
         return answer
 
 
+@in_float32
 def patch_points(depth: Tensor, matrices: Tensor, sizes: NetworkSizes) -> Tensor:
     """Return (N, P, 12): x, y, z of the cells of each patch, row by row, in metres."""
     n_side = sizes.image_px // sizes.patch_px
@@ -51,6 +53,7 @@ def patch_points(depth: Tensor, matrices: Tensor, sizes: NetworkSizes) -> Tensor
     return by_patch.reshape(len(depth), n_side * n_side, CELLS * CELLS * 3)
 
 
+@in_float32
 def frequencies(points: Tensor) -> Tensor:
     """Return (…, 204): each coordinate, centred and scaled, its sines and its cosines, one after the other.
 
@@ -60,6 +63,6 @@ def frequencies(points: Tensor) -> Tensor:
         points: (…, 12) metres.
     """
     centre = torch.tensor(CENTRE_M * (points.shape[-1] // 3), device=points.device)
-    coordinates = (points.float() - centre) / SCALE_M
+    coordinates = (points - centre) / SCALE_M
     angles = coordinates[..., None] * 2.0 ** torch.arange(N_FREQUENCIES, device=points.device)
     return torch.cat([coordinates[..., None], angles.sin(), angles.cos()], dim=-1).flatten(-2)

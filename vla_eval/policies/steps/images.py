@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import RecipeError
+from vla_eval.policies.steps.precision import in_float32
 
 MAX_LEVEL = 255.0
 LANCZOS_RADIUS = 3.0
@@ -32,6 +33,7 @@ class Size(NamedTuple):
     width_px: int
 
 
+@in_float32
 def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
     """Return the pictures in another size, rounded to whole levels; those of that size are left alone.
 
@@ -44,6 +46,7 @@ def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
     return _whole_levels(_resized(images, size))
 
 
+@in_float32
 def resize_bicubic(images: Tensor, size: Size) -> Tensor:
     """Return the pictures in another size, bit for bit as PIL's BICUBIC does it with whole levels.
 
@@ -63,6 +66,7 @@ def resize_bicubic(images: Tensor, size: Size) -> Tensor:
     return (rows @ along + 0.5).floor().clamp(0, MAX_LEVEL).to(images.dtype)
 
 
+@in_float32
 def resize_and_centre_crop(images: Tensor, size: Size, area: float) -> Tensor:
     """Resize, then crop the middle, as Octo's evaluation does: levels are rounded and cut once, at the end.
 
@@ -130,6 +134,7 @@ class Boxes(NamedTuple):
     width: Tensor
 
 
+@in_float32
 def crop_and_resize(images: Tensor, boxes: Boxes) -> Tensor:
     """Return the crops (B, …, 3, H, W), enlarged to the pictures' own size, bilinear, corners aligned.
 
@@ -152,6 +157,7 @@ def _crop_weights(start: Tensor, length: Tensor, n_px: int) -> Tensor:
     return (1 - (places[..., None] - steps).abs()).clamp(min=0)
 
 
+@in_float32
 def centre_crop(images: Tensor, area: float) -> Tensor:
     """Return the middle of the pictures, this share of their area, enlarged to their size, in whole levels.
 
@@ -196,6 +202,7 @@ class Augmentation:
         return sum(self.crop_area) / 2 if self.crop_area is not None else 1.0
 
 
+@in_float32
 def augment(images: Tensor, spec: Augmentation) -> Tensor:
     """Return changed pictures; draws from torch's global generator, which the training loop seeds.
 

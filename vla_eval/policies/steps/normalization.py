@@ -1,8 +1,15 @@
 """Normalise vectors dimension by dimension, and back. Knows torch, nothing of lerobot or of policies.
 
 Statistics are never missing without an error: what is to be normalised must have them, of the right size
-and finite. A dimension that does not vary is 0 after normalisation and its one value afterwards, so that
-no rounding error is blown up.
+and finite. A dimension that does not vary is treated as the originals do it:
+
+- `mean_std` (Octo) divides by the deviation plus epsilon, whatever it is: the one value becomes 0. Source:
+  https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/data/utils/data_utils.py#L243
+- `q01_q99` (OpenVLA-OFT, SpatialVLA) makes it 0 where the extremes are equal. Equal quantiles are not enough:
+  a dimension that moves once in a hundred frames is -1 at rest and +1 where it moves. Source:
+  https://github.com/SpatialVLA/SpatialVLA/blob/e48075326a92116adaaf1232cf01471f15f09a73/data/utils/data_utils.py#L81
+  and openvla-oft, prismatic/vla/datasets/rlds/utils/data_utils.py (commit 213c5ff). There the rule also holds
+  for what the mask leaves alone; here it does not, or a gripper that is always open would be closed.
 """
 
 from collections.abc import Mapping
@@ -13,14 +20,10 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
-from vla_eval.policies.steps.step_names import STATISTICS, NormalizationKind
+from vla_eval.policies.steps.precision import in_float32
+from vla_eval.policies.steps.step_names import EXTREMES, STATISTICS, NormalizationKind
 
-EPSILON = 1e-8
-"""Added to what is divided by. Source: octo, octo/data/utils/data_utils.py:243 at
-https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/data/utils/data_utils.py#L243
-and openvla-oft, prismatic/vla/datasets/rlds/utils/data_utils.py:67 (commit 213c5ff)."""
-CONSTANT_SPREAD = 1e-6
-"""A dimension with less spread than this (in its own unit) does not vary: float32 has no more digits."""
+EPSILON = 1e-8  # added to what is divided by, in all of the originals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,19 +53,6 @@ class Normalization:
             raise RecipeError("normalization.clip is for q01_q99: mean_std has no range to cut to.")
 
 
-class _Affine(NamedTuple):
-    """x -> (x - shift) / divisor, where varies; 0 where not; x where not masked.
-
-    All of shape (D,) and of the type and device of what is normalised.
-    """
-
-    mask: Tensor
-    varies: Tensor
-    shift: Tensor
-    divisor: Tensor
-    factor: Tensor  # for the way back; the originals leave epsilon out of it for mean_std
-
-
 class Normalizer:
     """A `Normalization` with its statistics.
 
@@ -78,44 +68,61 @@ class Normalizer:
     def __init__(self, spec: Normalization, statistics: Mapping[str, Any], *, where: str) -> None:
         self.spec = spec
         self._where = where
-        self._first, self._second = (
-            _checked(name, statistics, n_dims=len(spec.mask), where=where) for name in STATISTICS[spec.kind]
-        )
+        names = [*STATISTICS[spec.kind], *(name for name in EXTREMES[spec.kind] if name in statistics)]
+        self._statistics = {
+            name: _checked(name, statistics, n_dims=len(spec.mask), where=where) for name in names
+        }
 
     @property
     def statistics(self) -> dict[str, Tensor]:
         """What was used, as float32 of shape (D,) by name."""
-        first, second = STATISTICS[self.spec.kind]
-        return {first: self._first.clone(), second: self._second.clone()}
+        return {name: values.clone() for name, values in self._statistics.items()}
 
+    @in_float32
     def normalize(self, values: Tensor) -> Tensor:
         """Return values (…, D), normalised; for training targets and for the state."""
-        affine = self._affine(values)
-        scaled = torch.where(affine.varies, (values - affine.shift) / affine.divisor, 0.0)
+        mask, first, second = self._for(values)
+        if self.spec.kind == "mean_std":
+            return torch.where(mask, (values - first) / (second + EPSILON), values)
+        scaled = 2 * (values - first) / (second - first + EPSILON) - 1
         if self.spec.clip:
             scaled = scaled.clamp(-1, 1)
-        return torch.where(affine.mask, scaled, values)
+        scaled = torch.where(self._is_constant().to(values.device), 0.0, scaled)
+        return torch.where(mask, scaled, values)
 
+    @in_float32
     def unnormalize(self, values: Tensor) -> Tensor:
         """Return normalised values (…, D) in the unit of the data; for predicted actions."""
-        affine = self._affine(values)
-        scaled = torch.where(affine.varies, values * affine.factor, 0.0) + affine.shift
-        return torch.where(affine.mask, scaled, values)
+        mask, first, second = self._for(values)
+        if self.spec.kind == "mean_std":
+            return torch.where(mask, values * second + first, values)
+        return torch.where(mask, 0.5 * (values + 1) * (second - first) + first, values)
 
-    def _affine(self, values: Tensor) -> _Affine:
+    def _is_constant(self) -> Tensor:
+        """Return (D,) bool; checkpoints from before the extremes were kept have quantiles alone."""
+        low, high = EXTREMES["q01_q99"]
+        if low in self._statistics and high in self._statistics:
+            return self._statistics[low] == self._statistics[high]
+        return self._statistics["q01"] == self._statistics["q99"]
+
+    def _for(self, values: Tensor) -> "_Parts":
         if values.shape[-1:] != (len(self.spec.mask),):
             raise CheckpointError(
                 f"{self._where}: expected {len(self.spec.mask)} dimensions, found shape "
                 f"{tuple(values.shape)}."
             )
         first, second = (
-            statistic.to(values.device, values.dtype) for statistic in (self._first, self._second)
+            self._statistics[name].to(values.device, values.dtype) for name in STATISTICS[self.spec.kind]
         )
-        mask = torch.tensor(self.spec.mask, device=values.device)
-        if self.spec.kind == "mean_std":
-            return _Affine(mask, second > CONSTANT_SPREAD, first, second + EPSILON, second)
-        half = (second - first + EPSILON) / 2
-        return _Affine(mask, second - first > CONSTANT_SPREAD, (first + second) / 2, half, half)
+        return _Parts(torch.tensor(self.spec.mask, device=values.device), first, second)
+
+
+class _Parts(NamedTuple):
+    """Mask and the two statistics, (D,), of the type and device of what is normalised."""
+
+    mask: Tensor
+    first: Tensor
+    second: Tensor
 
 
 def mask_all_but(n_dims: int, *, left_alone: tuple[int, ...] = ()) -> tuple[bool, ...]:

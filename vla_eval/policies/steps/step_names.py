@@ -14,3 +14,6 @@ STATISTICS: Mapping[NormalizationKind, tuple[str, str]] = {
     "q01_q99": ("q01", "q99"),
 }
 """Kind of normalisation -> the statistics that it takes."""
+
+EXTREMES: Mapping[NormalizationKind, tuple[str, ...]] = {"mean_std": (), "q01_q99": ("min", "max")}
+"""Kind of normalisation -> what is also used where it is known: it tells which dimensions never vary."""

@@ -1,0 +1,148 @@
+"""Random JSON in the place of a checkpoint's: it is accepted, or refused with a message. Loads no model."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lerobot.policies.act.configuration_act import ACTConfig
+from safetensors.numpy import save_file
+
+from vla_eval.errors import VlaEvalError
+from vla_eval.policies import lerobot_loading
+from vla_eval.policies.adapter_config import read_adapter_config
+from vla_eval.policies.checkpoint import checkpoint_sha256
+from vla_eval.policies.checkpoint_notes import normalization_notes
+from vla_eval.policies.lerobot_loading import LoadOptions, read_config
+from vla_eval.policies.processor_door import resolve_step
+from vla_eval.policies.recipe import load_policy_recipe
+from vla_eval.policies.saved_processor import check_paths, read_saved_processor
+
+CONFIG, PREPROCESSOR, ADAPTER = "config.json", "policy_preprocessor.json", "adapter_config.json"
+NASTY = st.sampled_from(
+    (
+        *("", ".", "..", "/", "~", "\0", "\ud800", "a" * 5000, "../x.safetensors", "state.safetensors"),
+        *("os.system", "lerobot.x", "lerobot.processor.pipeline.ProcessorStep", "normalizer_processor"),
+        *("act", "LORA"),
+    )
+)
+LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.sampled_from([10**9, 10**30])
+    | st.floats()
+    | st.text(max_size=8)
+) | NASTY
+NAMES = NASTY | st.text(max_size=8)
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(NAMES, inner, max_size=4),
+    max_leaves=8,
+)
+FEATURE = {"type": "STATE", "shape": [3]}
+VALID_CONFIG: dict[str, Any] = {
+    "type": "act",
+    "n_action_steps": 4,
+    "chunk_size": 8,
+    "input_features": {"observation.state": FEATURE},
+    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+}
+VALID_STEP: dict[str, Any] = {
+    "registry_name": "normalizer_processor",
+    "config": {"features": {"observation.state": FEATURE}, "norm_map": {"STATE": "MEAN_STD"}},
+    "state_file": "state.safetensors",
+}
+VALID_ADAPTER: dict[str, Any] = {"peft_type": "LORA", "r": 4, "target_modules": ["q"], "lora_alpha": 8}
+ACT_FIELDS = sorted(ACTConfig.__dataclass_fields__)
+
+
+def changed(valid: dict[str, Any], names: list[str]) -> st.SearchStrategy[dict[str, Any]]:
+    """Return valid data of which some fields are replaced, or of which nothing is left."""
+    some = st.dictionaries(st.sampled_from(names) | NAMES, VALUES, max_size=3)
+    return some.map(lambda change: {**valid, **change}) | some
+
+
+def written(data: object) -> bytes:
+    """Return JSON as Python writes it, with its NaN, infinities and halves of surrogate pairs."""
+    return json.dumps(data).encode()
+
+
+STEPS = changed(VALID_STEP, ["registry_name", "class", "config", "state_file", "name"])
+FILES = {
+    CONFIG: changed(VALID_CONFIG, ACT_FIELDS),
+    PREPROCESSOR: st.fixed_dictionaries({"steps": st.lists(STEPS, max_size=3) | VALUES}),
+    ADAPTER: changed(VALID_ADAPTER, [*VALID_ADAPTER, "base_model_name_or_path", "bias", "megatron_core"]),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkpoint as far as reading goes."""
+    # It looks through all installed packages: a tenth of a second per case.
+    monkeypatch.setattr(lerobot_loading, "register_third_party_plugins", lambda: None)
+    for name in ("model.safetensors", "state.safetensors"):
+        save_file({}, tmp_path / name)
+    for name, data in ((CONFIG, VALID_CONFIG), (PREPROCESSOR, {"steps": []})):
+        (tmp_path / name).write_bytes(written(data))
+    (tmp_path / "policy_postprocessor.json").write_bytes(written({"steps": []}))
+    return tmp_path
+
+
+def accepted_or_refused(ask: Callable[[], object]) -> bool:
+    """Return whether it is accepted; what the command line would not print as one message is a failure."""
+    try:
+        ask()
+    except VlaEvalError as exc:
+        assert str(exc).strip()
+        assert len(str(exc)) < 10_000
+        str(exc).encode("utf-8")  # the command line can print it
+        return False
+    return True
+
+
+def read_processor(folder: Path) -> None:
+    for step in read_saved_processor(folder / PREPROCESSOR).steps:
+        resolve_step(step)
+        check_paths(step, step.config, folder)
+
+
+QUESTIONS: dict[str, tuple[Callable[[Path], object], ...]] = {
+    CONFIG: (
+        lambda folder: load_policy_recipe(str(folder)),
+        lambda folder: read_config(folder, LoadOptions(device="cpu")),
+    ),
+    PREPROCESSOR: (
+        read_processor,
+        lambda folder: normalization_notes("lerobot", {"checkpoint": str(folder)}),
+    ),
+    ADAPTER: (checkpoint_sha256, lambda folder: read_adapter_config(folder / ADAPTER)),
+}
+
+
+@pytest.mark.parametrize("name", [CONFIG, PREPROCESSOR, ADAPTER])
+def test_what_is_valid_is_accepted(folder: Path, name: str) -> None:
+    valid = {CONFIG: VALID_CONFIG, PREPROCESSOR: {"steps": []}, ADAPTER: VALID_ADAPTER}[name]
+    (folder / name).write_bytes(written(valid))
+    assert all(accepted_or_refused(lambda ask=ask: ask(folder)) for ask in QUESTIONS[name])
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("name", [CONFIG, PREPROCESSOR, ADAPTER])
+def test_other_json_is_accepted_or_refused_with_a_message(folder: Path, name: str, data: Any) -> None:
+    (folder / name).write_bytes(written(data.draw(FILES[name] | VALUES)))
+    for ask in QUESTIONS[name]:
+        accepted_or_refused(lambda ask=ask: ask(folder))
+
+
+@given(content=st.binary(max_size=64) | st.text(alphabet='{}[]",:0123456789eE.-ntf\\ux', max_size=64))
+@pytest.mark.parametrize("name", [CONFIG, PREPROCESSOR, ADAPTER])
+def test_other_bytes_are_accepted_or_refused_with_a_message(
+    folder: Path, name: str, content: bytes | str
+) -> None:
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    for ask in QUESTIONS[name]:
+        accepted_or_refused(lambda ask=ask: ask(folder))

@@ -1,0 +1,60 @@
+"""Tables as the page's templates show them. Knows nothing of results or of HTML."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+UNKNOWN = "—"
+LONGEST_WORD = 30  # characters: a cell with more is prose, and may be broken into lines
+
+ColumnKind = Literal["text", "number", "code"]
+
+
+class Column(NamedTuple):
+    """A column: its title, and how its cells are set."""
+
+    title: str
+    kind: ColumnKind = "text"
+
+    def css_class(self, cell: str) -> str | None:
+        """Return the class of one of its cells."""
+        if self.kind == "number":
+            return "number"
+        return "prose" if self.kind == "code" or len(cell) > LONGEST_WORD else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PageTable:
+    """A table whose first column names its rows.
+
+    Attributes:
+        columns: at least one.
+        rows: the cells of each row, as many as there are columns.
+        caption: what the table is, for those who cannot see what surrounds it.
+        row_data: for each row what it is made of, as JSON; empty if nobody asks.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str | None = None
+    row_data: tuple[str, ...] = ()
+
+
+def page_table(
+    rows: Sequence[Sequence[str]],
+    *,
+    text: Sequence[str] = (),
+    numbers: Sequence[str] = (),
+    code: Sequence[str] = (),
+    caption: str | None = None,
+) -> PageTable:
+    """Return a table whose columns of text come first, then numbers, then code, by their titles."""
+    return PageTable(
+        columns=(
+            *(Column(title) for title in text),
+            *(Column(title, "number") for title in numbers),
+            *(Column(title, "code") for title in code),
+        ),
+        rows=tuple(tuple(row) for row in rows),
+        caption=caption,
+    )
