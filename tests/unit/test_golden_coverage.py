@@ -64,7 +64,7 @@ def test_every_value_of_spatialvla_is_compared() -> None:
         vision.test_points_in_space_position_encoding_and_features(camera)
     vision.test_every_picture_has_a_camera_of_its_own()
     vision.test_siglips_last_state()
-    for index in range(len(network.ALL)):
+    for index in range(network.N_PROMPTS):
         inference.test_logits_tokens_and_actions(index)
     inference.test_two_pictures()
     for name, pictures in network.TRAININGS:

@@ -85,13 +85,13 @@ def test_an_episode_executes_what_the_original_predicts(converted: Path) -> None
     env = StoredFrames({name: pictures for name in ("base_camera", "hand_camera")})
     policy = make_lerobot(context(env, golden.CHUNK), checkpoint=str(converted), device="cpu")
     policy._loaded.policy.network.depth = StoredDepth()
-    for index in range(len(pictures)):
+    for index, prompt in enumerate(golden.config()["prompts"]):
         shown = int(values[f"infer{index}.image_index"])
         env._frames = {name: pictures[shown : shown + 1] for name in env._frames}
         found = executed(
             env,
             policy,
-            golden.config()["prompts"][index],
+            prompt,
             n_action_steps=golden.CHUNK,
             n_steps=golden.CHUNK,
         )
