@@ -136,8 +136,9 @@ def word_tokenizer() -> Any:
     question = ("What", "action", "should", "the", "robot", "take", "to", "pick", "?")
     words = ("<s>", "In", ":", *question, "\n", "Out", ":")
     ids = values()["in.prompt1_input_ids"][0].tolist()
-    special = {"<unk>": 0, "</s>": SIZES.stop_token, "<pad>": SIZES.pad_token}
-    tokenizer: Any = Tokenizer(models.WordLevel({**special, **dict(zip(words, ids, strict=True))}, "<unk>"))
+    named = {**dict(zip(words, ids, strict=True)), "</s>": SIZES.stop_token, "<pad>": SIZES.pad_token}
+    others = {f"<{n}>": n for n in range(SIZES.pad_token) if n not in named.values()}
+    tokenizer: Any = Tokenizer(models.WordLevel({**others, **named}, "<0>"))
     tokenizer.normalizer = normalizers.Replace("nothing", "")
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
         [
@@ -150,8 +151,8 @@ def word_tokenizer() -> Any:
         single="<s> $A", special_tokens=[("<s>", SIZES.bos_token)]
     )
     make: Any = PreTrainedTokenizerFast
-    named = {"unk_token": "<unk>", "bos_token": "<s>", "eos_token": "</s>", "pad_token": "<pad>"}
-    return make(tokenizer_object=tokenizer, **named)
+    special = {"unk_token": "<0>", "bos_token": "<s>", "eos_token": "</s>", "pad_token": "<pad>"}
+    return make(tokenizer_object=tokenizer, **special)
 
 
 def write_published(folder: Path) -> Path:
