@@ -2,46 +2,71 @@
 
 import functools
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from tests.unit.golden_values import GoldenValues
 from vla_eval.policies.openvla.network import OpenVLANetwork, Prompts
-from vla_eval.policies.openvla.sizes import NetworkOptions, NetworkSizes
+from vla_eval.policies.openvla.sizes import N_BINS, NetworkOptions, NetworkSizes
+from vla_eval.policies.openvla.vision import DINO_MLP_RATIO
 from vla_eval.policies.openvla.weight_names import to_ours
 from vla_eval.policies.weights import put_weights
 
 FOLDER = Path(__file__).parents[1] / "golden" / "openvla_oft"
 TOLERANCE = 2e-5  # absolute, float32 on CPU; from the README of the golden files
-SIZES = NetworkSizes(
-    image_px=56,
-    dino_width=32,
-    dino_depth=3,
-    dino_heads=2,
-    siglip_width=48,
-    siglip_depth=3,
-    siglip_heads=3,
-    siglip_mlp=96,
-    llm_width=32,
-    llm_depth=2,
-    llm_heads=4,
-    llm_mlp=64,
-)
-PROPRIO = 8
 
 
 @functools.cache
-def values() -> dict[str, Tensor]:
-    return load_file(FOLDER / "io.safetensors")
+def values() -> GoldenValues:
+    return GoldenValues(FOLDER / "io.safetensors")
 
 
 @functools.cache
 def config() -> dict[str, Any]:
     data: dict[str, Any] = json.loads((FOLDER / "config.json").read_text())
     return data
+
+
+def sizes_of(described: Mapping[str, Any]) -> dict[str, int]:
+    """Return what the fixture's description says of sizes and tokens."""
+    dino, siglip, llm, tokens = (described[name] for name in ("dino", "siglip", "llm", "tokens"))
+    assert described["n_action_bins"] == N_BINS and dino["mlp_ratio"] == DINO_MLP_RATIO
+    # The first bin is the last of the tokenizer's tokens, the last one follows `action_token_begin_idx`.
+    return {
+        "image_px": described["image_size"],
+        "patch_px": described["patch_size"],
+        "dino_width": dino["embed_dim"],
+        "dino_depth": dino["depth"],
+        "dino_heads": dino["num_heads"],
+        "dino_registers": dino["register_tokens"],
+        "siglip_width": siglip["embed_dim"],
+        "siglip_depth": siglip["depth"],
+        "siglip_heads": siglip["num_heads"],
+        "siglip_mlp": int(siglip["embed_dim"] * siglip["mlp_ratio"]),
+        "llm_width": llm["hidden_size"],
+        "llm_depth": llm["num_hidden_layers"],
+        "llm_heads": llm["num_attention_heads"],
+        "llm_mlp": llm["intermediate_size"],
+        "vocabulary": llm["vocab_size"],
+        "text_vocabulary": tokens["action_token_begin_idx"] + 1 + N_BINS,
+        "bos_token": tokens["bos"],
+        "stop_token": tokens["stop"],
+        "pad_token": tokens["pad"],
+        "empty_token": tokens["empty"],
+    }
+
+
+SMALL = sizes_of(config())
+SIZES = NetworkSizes(**SMALL)
+CHUNK: int = config()["num_actions_chunk"]
+ACTION: int = config()["action_dim"]
+PROPRIO: int = config()["proprio_dim"]
+UNNORM_KEY = "tiny"
 
 
 @functools.cache
@@ -61,7 +86,7 @@ def original_weights() -> dict[str, Tensor]:
 
 
 def network(**options: Any) -> OpenVLANetwork:
-    made = OpenVLANetwork(SIZES, NetworkOptions(**options))
+    made = OpenVLANetwork(SIZES, NetworkOptions(**{"chunk": CHUNK, "action": ACTION, **options}))
     ours = to_ours(original_weights(), SIZES)
     wanted = made.state_dict()
     extra = ("action_head.", "proprio_projector.")
@@ -71,7 +96,7 @@ def network(**options: Any) -> OpenVLANetwork:
 
 
 def pictures(n_cameras: int) -> Tensor:
-    """Return (2, cameras, 3, 56, 56) in [0, 1]."""
+    """Return (samples, cameras, 3, edge, edge) in [0, 1]."""
     return values()["in.images"][:, :n_cameras].permute(0, 1, 4, 2, 3).float() / 255
 
 
@@ -86,7 +111,10 @@ def prompts(*names: str) -> Prompts:
 
 def training_prompts() -> Prompts:
     ids, labels = values()["train.input_ids"], values()["train.labels"]
-    rows = [row[: int((label != -100).nonzero()[0])].tolist() for row, label in zip(ids, labels, strict=True)]
+    ignored = config()["tokens"]["ignore_index"]
+    rows = [
+        row[: int((label != ignored).nonzero()[0])].tolist() for row, label in zip(ids, labels, strict=True)
+    ]
     return padded(rows)
 
 
@@ -95,3 +123,54 @@ def padded(rows: list[list[int]]) -> Prompts:
     ids = torch.tensor([[*row, *[SIZES.pad_token] * (longest - len(row))] for row in rows])
     lengths = torch.tensor([len(row) for row in rows])[:, None]
     return Prompts(ids, torch.arange(longest) < lengths)
+
+
+def word_tokenizer() -> Any:
+    """Return a tokenizer of words that makes the stored prompts of the sentences "pick" and "nothing".
+
+    The second stored prompt has no instruction, which ours refuse: the word for it is taken out here.
+    """
+    from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
+    from transformers import PreTrainedTokenizerFast
+
+    question = ("What", "action", "should", "the", "robot", "take", "to", "pick", "?")
+    words = ("<s>", "In", ":", *question, "\n", "Out", ":")
+    ids = values()["in.prompt1_input_ids"][0].tolist()
+    named = {**dict(zip(words, ids, strict=True)), "</s>": SIZES.stop_token, "<pad>": SIZES.pad_token}
+    others = {f"<{n}>": n for n in range(SIZES.pad_token) if n not in named.values()}
+    tokenizer: Any = Tokenizer(models.WordLevel({**others, **named}, "<0>"))
+    tokenizer.normalizer = normalizers.Replace("nothing", "")
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Split(" ", "removed"),
+            pre_tokenizers.Split("\n", "isolated"),
+            pre_tokenizers.Punctuation("isolated"),
+        ]
+    )
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single="<s> $A", special_tokens=[("<s>", SIZES.bos_token)]
+    )
+    make: Any = PreTrainedTokenizerFast
+    special = {"unk_token": "<0>", "bos_token": "<s>", "eos_token": "</s>", "pad_token": "<pad>"}
+    return make(tokenizer_object=tokenizer, **special)
+
+
+def write_published(folder: Path) -> Path:
+    """Write a folder as the OFT scripts leave it, with the stored weights; return it."""
+    heads = ("action_head", "proprio_projector")
+    weights = original_weights()
+    names = sorted(name for name in weights if not name.startswith(heads))
+    for index, part in enumerate((names[::2], names[1::2])):
+        save_file({name: weights[name].contiguous() for name in part}, folder / f"model-{index}.safetensors")
+    for head in heads:
+        tensors = {
+            f"module.{name.removeprefix(f'{head}.')}": x
+            for name, x in weights.items()
+            if name.startswith(head)
+        }
+        torch.save(tensors, folder / f"{head}--50000_checkpoint.pt")
+    statistics = {"action": config()["action_statistics"], "proprio": config()["proprio_statistics"]}
+    (folder / "dataset_statistics.json").write_text(json.dumps({UNNORM_KEY: statistics}))
+    (folder / "config.json").write_text(json.dumps({"model_type": "openvla"}))
+    word_tokenizer().save_pretrained(str(folder))
+    return folder

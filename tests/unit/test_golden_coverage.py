@@ -3,12 +3,21 @@
 Here and not at the end of the other tests: those run in several processes, and in any selection.
 """
 
+from pathlib import Path
+
+import pytest
 from safetensors.torch import load_file
 
-from tests.unit import spatialvla_golden
+from tests.unit import openvla_golden, spatialvla_golden
 from tests.unit import test_octo_parity as octo
 from tests.unit import test_octo_policy as octo_policy
 from tests.unit import test_octo_whole_path as octo_whole_path
+from tests.unit import test_openvla_convert as openvla_convert
+from tests.unit import test_openvla_network as openvla_network
+from tests.unit import test_openvla_paper_compat as openvla_paper_compat
+from tests.unit import test_openvla_policy as openvla_policy
+from tests.unit import test_openvla_tokens as openvla_tokens
+from tests.unit import test_openvla_whole_path as openvla_whole_path
 from tests.unit import test_policy_steps as steps
 from tests.unit import test_spatialvla_network as network
 from tests.unit import test_spatialvla_policy as policy
@@ -70,3 +79,38 @@ def test_every_value_of_spatialvla_is_compared() -> None:
     policy.TestPictures().test_the_originals_are_the_same()
     steps.TestNormalizer().test_q01_q99_is_that_of_the_original_and_back_what_was_not_cut()
     assert spatialvla_golden.values().unread() == OF_CONVERSION
+
+
+def test_every_value_of_openvla_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    openvla_golden.values.cache_clear()
+    published = tmp_path / "published"
+    published.mkdir()
+    openvla_golden.write_published(published)
+    inference, training = openvla_network.TestInference(), openvla_network.TestTraining()
+    for n_cameras in (1, 2):
+        inference.test_features_and_tokens_of_the_pictures(n_cameras)
+    inference.test_the_pictures_are_normalised_for_either_eye()
+    inference.test_a_raw_image_is_resized_and_normalised_as_by_the_originals_processor()
+    for case in openvla_network.CASES:
+        inference.test_hidden_states_and_actions(*case)
+    for name, n_cameras, proprio in openvla_network.TRAININGS:
+        training.test_loss_and_gradients_of_a_padded_batch(name, n_cameras, proprio)
+    training.test_the_sequence_of_a_padded_batch_is_the_originals()
+    openvla_tokens.test_decoding_all_at_once_is_the_originals()
+    openvla_policy.TestNormalization().test_actions_and_state_are_normalised_as_in_the_originals_training()
+    openvla_paper_compat.test_pictures_go_through_jpeg_of_quality_95()
+    actions = openvla_convert.test_normalised_numbers_become_the_originals_actions_and_the_gripper_maniskills
+    actions(published, tmp_path / "actions")
+    openvla_convert.test_the_state_is_normalised_by_the_originals_mask(published, tmp_path / "state")
+    whole = openvla_whole_path
+    for case in whole.CASES:
+        with monkeypatch.context() as patch:
+            whole.test_an_episode_executes_what_the_original_predicts(published, tmp_path / case, patch, case)
+    for is_cropped, name in ((False, "resized"), (True, "center_cropped")):
+        whole.test_an_image_of_another_size_is_resized_and_cropped_as_by_the_original(
+            published, tmp_path / name, is_cropped, name
+        )
+    for case in ("img1.prompt1", "img2.prompt1", "img2.prompt2.proprio"):
+        out = tmp_path / f"loss-{case}"
+        whole.test_the_loss_of_the_policy_and_its_parts_are_the_originals(published, out, case)
+    assert openvla_golden.values().unread() == set()

@@ -98,7 +98,13 @@ class TestOriginal:
                 save_file(kept, folder / "params.safetensors")
             else:
                 (folder / "checkpoint").write_bytes(packed(tree))
-            convert(folder, tmp_path / f"{layout}-out", fields=golden_fields(), dataset="bridge")
+            convert(
+                folder,
+                tmp_path / f"{layout}-out",
+                gripper="unit_open",
+                fields=golden_fields(),
+                dataset="bridge",
+            )
         first, second = (load_file(tmp_path / f"{x}-out" / "model.safetensors") for x in ("one", "two"))
         assert first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
         # safetensors keeps one of the two names of T5's embeddings.
@@ -113,7 +119,13 @@ class TestOriginal:
         write_statistics(tmp_path, bridge_dataset=0.0, fractal=0.0)
         save_file({"x": torch.zeros(1)}, tmp_path / "params.safetensors")
         with pytest.raises(CheckpointError, match="Did you mean 'bridge_dataset'"):
-            convert(tmp_path, tmp_path / "out", fields=TINY, dataset="bridge_datset")
+            convert(tmp_path, tmp_path / "out", gripper="unit_open", fields=TINY, dataset="bridge_datset")
+
+    def test_the_gripper_has_to_be_said(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        arguments = ["convert-octo", str(tmp_path), "--size", "small", "--out", str(tmp_path / "out")]
+        assert main(["checkpoint", *arguments]) == 1
+        said = capsys.readouterr().err
+        assert "encode the gripper (--gripper), found nothing" in said and "Traceback" not in said
 
     def test_a_tensor_that_lacks_or_has_another_shape_is_named(self, tmp_path: Path) -> None:
         flat = golden_weights()
@@ -122,7 +134,7 @@ class TestOriginal:
         save_file(flat, tmp_path / "params.safetensors")
         write_statistics(tmp_path, bridge=0.0)
         with pytest.raises(CheckpointError) as error:
-            convert(tmp_path, tmp_path / "out", fields=golden_fields(), dataset="bridge")
+            convert(tmp_path, tmp_path / "out", gripper="unit_open", fields=golden_fields(), dataset="bridge")
         assert "1 missing: network.transformer.readout_positions" in str(error.value)
         assert "network.transformer.projections.wrist.bias (expected (32,), found (3,))" in str(error.value)
 
@@ -130,7 +142,7 @@ class TestOriginal:
         (tmp_path / "manifest.ocdbt").touch()
         write_statistics(tmp_path, bridge=0.0)
         with pytest.raises(CheckpointError, match="flatten_dict"):
-            convert(tmp_path, tmp_path / "out", fields=TINY, dataset="bridge")
+            convert(tmp_path, tmp_path / "out", gripper="unit_open", fields=TINY, dataset="bridge")
 
     @pytest.mark.parametrize("data", [b"\xc1", b"\xdf\x00\x00\x00\x02", packed({"a": 1}) + b"\x00"])
     def test_damaged_msgpack_is_an_error(self, data: bytes) -> None:
@@ -145,7 +157,7 @@ def test_from_a_converted_base_only_the_head_changes_and_the_statistics_are_the_
     original.mkdir()
     save_file(golden_weights(), original / "params.safetensors")
     write_statistics(original, bridge=0.25)
-    convert(original, base, fields=golden_fields(), dataset="bridge")
+    convert(original, base, gripper="maniskill", fields=golden_fields(), dataset="bridge")
     short = {"steps": 1, "batch_size": 2, "save_every_steps": 1, "log_every_steps": 1, "num_workers": 0}
     finetune(
         FinetuneConfig(

@@ -52,7 +52,7 @@ def sentence(ids: Tensor) -> str:
 def converted(folder: Path, *, window: int) -> Path:
     fields = {**golden_fields(), "window": window}
     # The stored frames have the model's size, so that nothing is resized; pictures are not cropped.
-    fields |= {"augment": False, "gripper_encoding": "unit_open"}
+    fields |= {"augment": False}
     fields["t5"]["vocabulary"] = CONFIG["t5"]["vocab_size"]
     (folder / "original").mkdir()
     (folder / "original" / "params.safetensors").write_bytes((GOLDEN / "weights.safetensors").read_bytes())
@@ -60,7 +60,13 @@ def converted(folder: Path, *, window: int) -> Path:
     action = {"mean": [MEAN] * n_dims, "std": [DEVIATION] * n_dims}
     (folder / "original" / "dataset_statistics.json").write_text(json.dumps({"action": action}))
     tokenizer = write_tokenizer(folder / "tokenizer")
-    out = convert(folder / "original", folder / "ours", fields=fields, tokenizer=str(tokenizer))
+    out = convert(
+        folder / "original",
+        folder / "ours",
+        fields=fields,
+        gripper="unit_open",
+        tokenizer=str(tokenizer),
+    )
     config = json.loads((out / "config.json").read_text())
     for camera, field in config["cameras"].items():  # frames here are as small as the model's
         px = CONFIG["cameras"][camera]["image_size"]

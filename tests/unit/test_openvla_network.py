@@ -13,6 +13,7 @@ from tests.unit.openvla_golden import TOLERANCE
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.policies.openvla.sizes import NetworkOptions, NetworkSizes
 from vla_eval.policies.openvla.weight_names import to_original, to_ours, unused
+from vla_eval.policies.steps.images import Size, resize_bicubic
 
 CASES = [
     ("img1.prompt1", 1, "prompt1", False),
@@ -32,6 +33,16 @@ def close(told: Tensor, expected: Tensor, *, atol: float = TOLERANCE) -> None:
 @functools.cache
 def made(*, proprio: bool = False) -> OpenVLANetwork:
     return golden.network(proprio=golden.PROPRIO if proprio else 0)
+
+
+def gradients_by_original_name(network: OpenVLANetwork) -> dict[str, Tensor]:
+    ours = {key: value.grad for key, value in network.named_parameters() if value.grad is not None}
+    gradients = to_original(ours)
+    # Weights of the class token and of its position are added up, since the original has only their sum;
+    # the gradient of a sum is that of either part.
+    name = "embeddings.cls_token"
+    gradients["vision_backbone.featurizer.cls_token"] = ours[f"vision.dino.{name}"]
+    return gradients
 
 
 def proprio_of(rows: slice, *, proprio: bool) -> Tensor | None:
@@ -56,6 +67,12 @@ class TestInference:
     def test_the_pictures_are_normalised_for_either_eye(self) -> None:
         both = made().vision.normalised(golden.pictures(1)[0])
         close(both.flatten(0, 2), golden.values()["mid.pixel_values_sample0_image0"][0].flatten(0, 0))
+
+    def test_a_raw_image_is_resized_and_normalised_as_by_the_originals_processor(self) -> None:
+        raw = golden.values()["pre.raw_image"].permute(2, 0, 1).float()
+        edge = golden.SIZES.image_px
+        pixels = made().vision.normalised(resize_bicubic(raw, Size(edge, edge))[None] / 255)
+        close(pixels.flatten(0, 2), golden.values()["pre.pixel_values"])
 
     @pytest.mark.parametrize(("name", "n_cameras", "prompt", "proprio"), CASES)
     def test_hidden_states_and_actions(self, name: str, n_cameras: int, prompt: str, proprio: bool) -> None:
@@ -98,16 +115,28 @@ class TestTraining:
         close(hidden, values[f"{name}.hidden"])
         close(actions, values[f"{name}.predicted_actions"])
         close(loss, values[f"{name}.l1_loss"][0])
-        gradients = to_original(
-            {key: value.grad for key, value in network.named_parameters() if value.grad is not None}
-        )
+        gradients = gradients_by_original_name(network)
+        stored = [key for key in values if key.startswith(f"{name}.grad.")]
+        assert stored
+        for key in stored:
+            close(gradients[key.removeprefix(f"{name}.grad.").removeprefix("vla.")], values[key])
         names = golden.config()["gradient_norm_order"][name]
         for key, norm in zip(names, values[f"{name}.grad_norms"], strict=True):
-            key = key.removeprefix("vla.")
-            if f"{name}.grad.vla.{key}" in values:
-                close(gradients[key], values[f"{name}.grad.vla.{key}"])
-            if key in gradients and "featurizer" not in key and "embed_tokens" not in key:
-                torch.testing.assert_close(gradients[key].norm(), norm, rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(gradients[key.removeprefix("vla.")].norm(), norm, rtol=1e-4, atol=1e-6)
+
+    def test_the_sequence_of_a_padded_batch_is_the_originals(self) -> None:
+        network, values, prompts = made(), golden.values(), golden.training_prompts()
+        labels, is_action = values["train.labels"], values["train.action_mask_shifted"]
+        n_tokens = golden.CHUNK * golden.ACTION
+        tokens = values["train.input_ids"][:, 1:][is_action].reshape(len(labels), n_tokens)
+        ids, ours, is_real = network._text(prompts, tokens)
+        assert torch.equal(ids, values["train.input_ids"])
+        assert torch.equal(is_real, values["train.attention_mask"])
+        assert torch.equal(ours[:, 1:], is_action)
+        # What is learned with a token head: the actions and the stop token behind them.
+        stop = ours.roll(1, dims=1) & ~ours & (ids == golden.SIZES.stop_token)
+        is_learned = labels != golden.config()["tokens"]["ignore_index"]
+        assert torch.equal(ours | stop, is_learned) and torch.equal(ids[is_learned], labels[is_learned])
 
 
 class TestTraps:
@@ -131,7 +160,9 @@ class TestTraps:
 
     @pytest.mark.parametrize("eye", ["dino", "siglip"])
     def test_a_final_norm_over_the_features(self, network: OpenVLANetwork, eye: str) -> None:
-        name, width = ("layernorm", 32) if eye == "dino" else ("post_layernorm", 48)
+        sizes = golden.SIZES
+        name = "layernorm" if eye == "dino" else "post_layernorm"
+        width = sizes.dino_width if eye == "dino" else sizes.siglip_width
         setattr(getattr(network.vision, eye), name, nn.LayerNorm(width))
         assert self.difference(network) > VISIBLE
 
@@ -194,7 +225,9 @@ class TestWeightNames:
             "norm",
             "attn_pool",
         }
-        assert all("blocks.2." in name for name in left_out if "blocks" in name)
+        dino, siglip = (golden.SIZES.dino_depth - 1, golden.SIZES.siglip_depth - 1)
+        last = (f".featurizer.blocks.{dino}.", f".fused_featurizer.blocks.{siglip}.")
+        assert all(any(part in name for part in last) for name in left_out if "blocks" in name)
 
 
 @pytest.mark.slow

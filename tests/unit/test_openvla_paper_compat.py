@@ -1,20 +1,17 @@
 """The switches that reproduce the paper's public evaluation, and that nothing happens without them."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from safetensors.torch import load_file
 
+from tests.unit import openvla_golden as golden
 from vla_eval.core import ActionChunk, Observation, ObservationWindow
 from vla_eval.errors import UnknownNameError
 from vla_eval.policies.openvla.paper_compat import PaperCompatPolicy, jpeg_round_trip, make_openvla
 from vla_eval.specs import PolicySpec
-
-GOLDEN = Path(__file__).parents[1] / "golden" / "openvla_oft" / "io.safetensors"
 
 
 class Counting:
@@ -33,7 +30,7 @@ class Counting:
 
 
 def window() -> ObservationWindow:
-    image = load_file(GOLDEN)["data.image"].numpy()
+    image = golden.values()["data.image"].numpy()
     return ObservationWindow(slot=0, frames=(Observation(step=0, images={"base": image}, state={}),))
 
 
@@ -61,11 +58,11 @@ def test_the_gripper_is_inverted_about_one_half() -> None:
 def test_pictures_go_through_jpeg_of_quality_95() -> None:
     policy: Any = Counting()
     PaperCompatPolicy(policy, ["jpeg"], n_action_steps=4).act(window())
-    theirs = load_file(GOLDEN)["data.jpeg_decoded"].float()
+    theirs = golden.values()["data.jpeg_decoded"].float()
     difference = (torch.from_numpy(policy.seen[0]).float() - theirs).abs()
     # TensorFlow's encoder is another one: at most 19 levels apart on this picture, by the golden README.
     assert float(difference.max()) <= 19
-    raw = load_file(GOLDEN)["data.image"].float()
+    raw = golden.values()["data.image"].float()
     assert float(difference.mean()) < 0.5 * float((raw - theirs).abs().mean())
 
 

@@ -19,6 +19,7 @@ from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_
 from vla_eval.policies.openvla.prompt import BYTE_SIZES, finished, prompt_text
 from vla_eval.policies.openvla.sizes import network_sizes
 from vla_eval.policies.steps.byte_tokenizer import byte_tokenizer
+from vla_eval.policies.steps.normalization import Normalization, Normalizer
 from vla_eval.policies.steps.trainable import check_lora, trainable
 from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.training.dataset import training_dataset
@@ -109,6 +110,24 @@ class TestConfiguration:
     def test_the_published_sizes_are_the_default(self) -> None:
         sizes = network_sizes({})
         assert (sizes.n_patches, sizes.vision_width, sizes.llm_width) == (256, 2176, 4096)
+
+
+class TestNormalization:
+    def test_actions_and_state_are_normalised_as_in_the_originals_training(self) -> None:
+        values = golden.values()
+        actions = {name: values[f"data.norm.{name}"] for name in ("q01", "q99", "min", "max")}
+        mask = tuple(values["data.norm.mask"].tolist())
+        # The original's extremes, of actions; all of the state varies.
+        assert bool((actions["min"] == actions["max"]).any())
+        proprio = {name: values[f"data.norm.proprio_{name}"] for name in ("q01", "q99")}
+        for name, statistics, kept in (
+            ("actions", actions, mask),
+            ("proprio", proprio, (True,) * golden.PROPRIO),
+        ):
+            spec = Normalization(kind="q01_q99", mask=kept, clip=True)
+            found = Normalizer(spec, statistics, where="golden").normalize(values[f"data.norm.{name}"])
+            expected = values["data.norm.normalised" if name == "actions" else "data.norm.proprio_normalised"]
+            torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
 class TestPolicy:

@@ -22,7 +22,7 @@ ROWS = [[1, 512, 29901, 29871], [1, 512, 29901, 1724, 3158, 881, 29871]]
 
 
 @functools.cache
-def made(head: str, chunk: int = 8) -> OpenVLANetwork:
+def made(head: str, chunk: int = golden.CHUNK) -> OpenVLANetwork:
     return golden.network(head=head, chunk=chunk)
 
 
@@ -42,12 +42,32 @@ def test_an_action_comes_back_within_half_a_bin_and_the_outermost_tokens_are_the
 
 
 def test_decoding_all_at_once_is_the_originals() -> None:
+    network, values = made("parallel_tokens"), golden.values()
+    inputs = Inputs(golden.pictures(2)[:1], golden.prompts("prompt1"))
     with torch.no_grad():
-        told = parallel_actions(
-            made("parallel_tokens"), Inputs(golden.pictures(2)[:1], golden.prompts("prompt1"))
-        )
-    expected = golden.values()["infer.img2.prompt1.discrete.actions_normalized"]
-    torch.testing.assert_close(told[0], expected, atol=golden.TOLERANCE, rtol=0)
+        hidden, told = network.action_states(network.sequence(inputs)), parallel_actions(network, inputs)
+    for found, name in ((hidden, "hidden"), (told[0], "actions_normalized")):
+        expected = values[f"infer.img2.prompt1.discrete.{name}"]
+        torch.testing.assert_close(found, expected, atol=golden.TOLERANCE, rtol=0)
+
+
+def test_the_loss_of_tokens_all_at_once_is_the_originals_with_the_stop_token() -> None:
+    network, chunk = made("parallel_tokens"), golden.values()["train.actions"]
+    inputs = Inputs(golden.pictures(2), golden.training_prompts())
+    with torch.no_grad():
+        loss = token_loss(network, inputs, chunk, torch.ones(chunk.shape[:2]))
+        sequence = network.sequence(inputs)
+        logits = network.llm.lm_head(network.hidden(sequence))
+    # The original labels all that follows a prompt, the stop token included, and transformers predicts each
+    # label one position before it; the rest is left out (-100).
+    tokens = TEXT - np.digitize(chunk.flatten(1).numpy().clip(-1, 1), np.linspace(-1, 1, 256))
+    labels = torch.full(logits.shape[:2], -100)
+    for row, (first, answer) in enumerate(zip(sequence.first_action, tokens, strict=True)):
+        labels[row, first : first + len(answer) + 1] = torch.tensor([*answer, golden.SIZES.stop_token])
+    n_labels = golden.CHUNK * golden.ACTION + 1  # and stop
+    assert (labels != -100).sum(dim=1).tolist() == [n_labels] * len(chunk)
+    expected = functional.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
+    torch.testing.assert_close(loss, expected)
 
 
 class TestOneAfterTheOther:

@@ -113,6 +113,14 @@ class TestNormalizer:
         with pytest.raises(CheckpointError, match=message):
             Normalizer(Normalization(kind="mean_std", mask=(True,)), stats, where="x")
 
+    def test_what_the_mask_leaves_alone_is_cut_only_on_demand(self) -> None:
+        statistics, values = {"q01": [0, 0], "q99": [2, 2]}, torch.tensor([3.0, 3.0])
+        for clip_unmasked, expected in ((False, [1.0, 3.0]), (True, [1.0, 1.0])):
+            spec = Normalization(kind="q01_q99", mask=(True, False), clip=True, clip_unmasked=clip_unmasked)
+            assert Normalizer(spec, statistics, where="x").normalize(values).tolist() == expected
+        with pytest.raises(RecipeError, match="expected clip, too"):
+            Normalization(kind="q01_q99", mask=(True,), clip_unmasked=True)
+
     def test_an_unknown_kind_is_answered_by_a_suggestion(self) -> None:
         with pytest.raises(RecipeError, match="Did you mean 'mean_std'"):
             Normalization(kind="mean_sdt", mask=(True,))  # type: ignore[arg-type]

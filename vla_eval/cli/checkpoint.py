@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.cli import checkpoint_openvla, checkpoint_spatialvla
+from vla_eval.cli.checkpoint_arguments import add_gripper
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
@@ -33,6 +34,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     convert.add_argument("--size", choices=("small", "base"), required=True, help="which Octo it is")
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
     convert.add_argument("--dataset-name", metavar="NAME", help="whose statistics, where there are several")
+    add_gripper(convert)
     checkpoint_openvla.add_parsers(actions)
     checkpoint_spatialvla.add_parsers(actions)
     for sub in (verify, convert):
@@ -70,6 +72,7 @@ def _convert(args: argparse.Namespace) -> list[str]:
         Path(args.out),
         fields=SIZES[args.size],
         dataset=args.dataset_name,
+        gripper=args.gripper,
         tokenizer=args.tokenizer,
     )
     return [str(out)]

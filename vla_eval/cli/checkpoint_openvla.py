@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any, get_args
 
+from vla_eval.cli.checkpoint_arguments import add_gripper
 from vla_eval.policies.openvla.sizes import Head
 
 CONVERT, MERGE = "convert-openvla", "merge"
@@ -17,9 +18,10 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     convert.add_argument("--head", choices=get_args(Head), default="tokens", help="tokens: a plain OpenVLA")
     convert.add_argument("--chunk", type=int, default=1, metavar="K", help="actions of a chunk (1)")
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
-    convert.add_argument("--gripper", default="maniskill", metavar="NAME", help="its encoding (maniskill)")
+    convert.add_argument("--image-aug", choices=("yes", "no"), help="trained with augmentation (as named)")
     convert.add_argument("--proprio", type=int, default=0, metavar="N", help="numbers of proprioception (0)")
     convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="fields of the pictures, in order")
+    add_gripper(convert)
     convert.add_argument("--allow-pickled", action="store_true", help="read heads that are pickled tensors")
     merge = actions.add_parser(MERGE, help="put a LoRA adapter into its base", allow_abbrev=False)
     merge.add_argument("path", metavar="PATH", help="the adapter's checkpoint, or a run of ours")
@@ -43,6 +45,7 @@ def run(args: argparse.Namespace) -> list[str]:
         chunk_size=args.chunk,
         unnorm_key=args.unnorm_key,
         gripper=args.gripper,
+        image_augmentation=None if args.image_aug is None else args.image_aug == "yes",
         proprio=args.proprio,
         allow_pickled=args.allow_pickled,
         **named,

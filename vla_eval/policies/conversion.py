@@ -13,8 +13,10 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
+from vla_eval.policies.checkpoint_json import shown
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import read_weights
+from vla_eval.policies.steps.gripper import ENCODINGS, GripperEncoding
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 
@@ -85,6 +87,45 @@ def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | 
             f"{', '.join(known) or 'none'}."
         )
     return known[unnorm_key]
+
+
+def stated_gripper(source: Path, stated: str | None) -> GripperEncoding:
+    """Return how a published policy encodes the gripper, which none of its files says.
+
+    Statistics do not tell: from 0 to 1 may be from closed to open, or from open to closed.
+
+    Args:
+        source: the checkpoint, for messages.
+        stated: by whoever converts it.
+
+    Raises:
+        CheckpointError: nobody has said it, or there is no such encoding.
+    """
+    for encoding in ENCODINGS:
+        if stated == encoding:
+            return encoding
+    found = "nothing." if stated is None else f"'{stated}'.{did_you_mean(stated, ENCODINGS)}"
+    raise CheckpointError(
+        f"{source}: expected how its data encode the gripper (--gripper), found {found} Its files do not "
+        "say it, and another encoding would execute “closed” as half open. unit_open: 0 closed to 1 open, as "
+        "in Open X-Embodiment and so in the published OpenVLA and Octo; unit_closed: the opposite; "
+        "maniskill: -1 closed to 1 open; negated: -1 open to 1 closed."
+    )
+
+
+def read_mask(source: Path, what: str, statistics: Mapping[str, Any], n_dims: int) -> tuple[bool, ...]:
+    """Return which dimensions are normalised; all, where the statistics do not say it.
+
+    Raises:
+        CheckpointError: the mask has another size or holds something else.
+    """
+    mask = statistics.get("mask", [True] * n_dims)
+    is_mask = isinstance(mask, list) and all(isinstance(value, bool) for value in mask)
+    if not is_mask or len(mask) != n_dims:
+        raise CheckpointError(
+            f"{source}: mask of {what}: expected {n_dims} times true or false, found {shown(mask)}."
+        )
+    return tuple(mask)
 
 
 def check_mask(source: Path, what: str, statistics: Mapping[str, Any], expected: tuple[bool, ...]) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
-from vla_eval.policies.conversion import check_free, folder_when_whole
+from vla_eval.policies.conversion import check_free, folder_when_whole, stated_gripper
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.policies.lerobot_processors import save_tokenizers
@@ -31,6 +31,7 @@ def convert(
     out: Path,
     *,
     fields: dict[str, Any],
+    gripper: str | None,
     dataset: str | None = None,
     tokenizer: str | None = None,
 ) -> Path:
@@ -40,6 +41,7 @@ def convert(
         source: the original's folder: parameters and `dataset_statistics.json`.
         out: a folder that is not there yet.
         fields: of `MikasaOctoConfig`, such as `SIZES["small"]`.
+        gripper: how the checkpoint's data encode it, see `steps.gripper`; None is refused: no file says it.
         dataset: which statistics, where there are several.
         tokenizer: folder of T5's tokenizer; None: the one that the configuration names, from the cache.
 
@@ -48,7 +50,8 @@ def convert(
     """
     check_free(out)
     named = {"tokenizer_name": tokenizer} if tokenizer is not None else {}
-    config = octo_config({**fields, **named})
+    encoding = stated_gripper(source, gripper)
+    config = octo_config({**fields, **named, "gripper_encoding": encoding})
     statistics = read_statistics(source if source.is_dir() else source.parent, dataset=dataset)
     policy = make_empty_policy(config)
     put_weights(policy, _with_shared(policy, from_flax(read_parameters(source))), where=str(source))

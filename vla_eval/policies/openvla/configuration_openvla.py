@@ -166,7 +166,10 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         }
         if self.use_proprio:
             n_state = int(self.robot_state_feature.shape[0])
-            fields[STATE_KEY] = Normalization(kind="q01_q99", mask=mask_all_but(n_state), clip=True)
+            # In an evaluation the original cuts the whole state: experiments/robot/openvla_utils.py#L669.
+            fields[STATE_KEY] = Normalization(
+                kind="q01_q99", mask=mask_all_but(n_state), clip=True, clip_unmasked=True
+            )
         return fields
 
     @property

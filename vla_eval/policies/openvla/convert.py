@@ -5,6 +5,7 @@ tensors (`action_head--50000_checkpoint.pt`), which are read only if that is all
 torch's reader that builds nothing but tensors.
 """
 
+import dataclasses
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,26 +17,31 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
-from vla_eval.errors import CheckpointError
+from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
+from vla_eval.policies.checkpoint_json import get_mapping, wrong_type
 from vla_eval.policies.conversion import (
     Statistics,
     check_free,
-    check_mask,
     chosen_statistics,
+    read_mask,
     read_safetensors,
+    stated_gripper,
     write_checkpoint,
 )
-from vla_eval.policies.openvla.configuration_openvla import MikasaOpenVLAConfig
+from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, MikasaOpenVLAConfig
 from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
 from vla_eval.policies.openvla.prompt import prompt_text
 from vla_eval.policies.openvla.sizes import NetworkSizes
 from vla_eval.policies.openvla.weight_names import to_ours
+from vla_eval.policies.steps.normalization import Normalization
+from vla_eval.policies.steps.processor_steps import check_gripper_mask
 from vla_eval.policies.weights import put_weights
 
 STATISTICS_FILE = "dataset_statistics.json"
 BACKBONES = {"vision_backbone_id": "dinosiglip-vit-so-224px", "llm_backbone_id": "llama2-7b-pure"}
+AUGMENTED_RUN = "image_aug"  # in the names that the original gives to runs with augmentation
 KNOWN_INSTRUCTION = "pick"
 KNOWN_IDS = (1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304, 5839, 29973, 13, 3744, 29901)
 """What the published tokenizer makes of the prompt of `KNOWN_INSTRUCTION`; from the golden files."""
@@ -52,7 +58,8 @@ class ConvertOptions:
         picture_px: edge of the pictures as a camera gives them.
         proprio: numbers of the proprioception; 0: the model has none.
         allow_pickled: read heads that are pickled tensors.
-        gripper: how the training data encode it; the published OpenVLA's is `unit_open`.
+        gripper: how the training data encode it, see `steps.gripper`; None is refused: no file says it.
+        image_augmentation: whether it was trained with it; None: as the folder's name says.
         sizes: sizes that differ from the published ones.
         dtype: of the result.
     """
@@ -64,7 +71,8 @@ class ConvertOptions:
     picture_px: int = 128
     proprio: int = 0
     allow_pickled: bool = False
-    gripper: str = "maniskill"
+    gripper: str | None = None
+    image_augmentation: bool | None = None
     sizes: dict[str, int] = field(default_factory=dict)
     dtype: str = "bfloat16"
 
@@ -84,12 +92,13 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
         _check_backbones(source, described)
-    config = _config(options)
+    config = _config(source, options)
     policy = MikasaOpenVLAPolicy(config)
     weights = read_original(source, options, config.network_sizes())
     where = str(source)
     put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)
     statistics = read_statistics(source, described, config, options.unnorm_key)
+    fields = read_normalizations(source, statistics, config) if statistics is not None else None
 
     def check_tokenizer(tokenizer: Any) -> None:
         if not options.sizes:
@@ -99,7 +108,7 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
         source,
         out,
         policy,
-        lambda: make_mikasa_openvla_pre_post_processors(config, statistics),
+        lambda: make_mikasa_openvla_pre_post_processors(config, statistics, fields=fields),
         check_tokenizer=check_tokenizer,
     )
 
@@ -126,20 +135,69 @@ def read_statistics(
     """Return field -> statistics of the training data; None if there are several and none is chosen.
 
     Raises:
-        CheckpointError: they are missing, not of that name, or normalised otherwise than ours.
+        CheckpointError: they are missing, or not of that name.
     """
     file = source / STATISTICS_FILE
-    known = read_json(file) if file.is_file() else dict(described.get("norm_stats") or {})
+    known = read_json(file) if file.is_file() else get_mapping(described, "norm_stats", where=str(source))
     chosen = chosen_statistics(source, known, unnorm_key)
     if chosen is None:
         return None
+    if not isinstance(chosen, dict):
+        raise wrong_type(str(source), unnorm_key or "statistics", "a mapping", chosen)
     wanted = {ACTION_KEY: "action", **({STATE_KEY: "proprio"} if config.use_proprio else {})}
-    for ours, theirs in wanted.items():
-        check_mask(source, theirs, chosen.get(theirs) or {}, config.normalizations()[ours].mask)
-    return {ours: chosen[theirs] for ours, theirs in wanted.items() if theirs in chosen}
+    return {ours: get_mapping(chosen, theirs, where=str(source)) for ours, theirs in wanted.items()}
 
 
-def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
+def read_normalizations(
+    source: Path, statistics: Statistics, config: MikasaOpenVLAConfig
+) -> dict[str, Normalization]:
+    """Return how fields are normalised: as ours, with the masks of the statistics.
+
+    Raises:
+        CheckpointError: a mask has another size, or the gripper is normalised in an encoding of its own.
+    """
+    fields = {
+        key: dataclasses.replace(spec, mask=read_mask(source, key, statistics[key], len(spec.mask)))
+        for key, spec in config.normalizations().items()
+        if key in statistics
+    }
+    try:
+        check_gripper_mask(fields.get(ACTION_KEY), config.gripper_spec())
+    except RecipeError as exc:
+        raise CheckpointError(
+            f"{source}: expected a mask of the action that leaves the gripper alone, or --gripper maniskill, "
+            f"found a normalised gripper encoded as '{config.gripper}'."
+        ) from exc
+    return fields
+
+
+def settle_augmentation(source: Path, stated: bool | None) -> bool:
+    """Return whether the model was trained with augmentation, and so sees the centre crop in evaluation.
+
+    No file says it, but the original's name of a run does, and it asks for the crop then. Source:
+    https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/vla-scripts/finetune.py#L175
+    and experiments/robot/libero/run_libero_eval.py#L137.
+
+    Raises:
+        CheckpointError: neither the name nor anybody else says it, or they disagree.
+    """
+    is_named = AUGMENTED_RUN in source.resolve().name
+    if stated is None and not is_named:
+        raise CheckpointError(
+            f"{source}: expected whether it was trained with image augmentation (--image-aug yes or no), "
+            f"found nothing, and no '{AUGMENTED_RUN}' in its name. With it, an evaluation shows the middle "
+            f"{AUGMENTATION.centre_area:.0%} of each image: yes for the published OpenVLA-OFT, no for the "
+            "published openvla-7b."
+        )
+    if is_named and stated is False:
+        raise CheckpointError(
+            f"{source}: its name says that it was trained with image augmentation ('{AUGMENTED_RUN}'), "
+            "--image-aug says no. Leave the flag out, or name the folder otherwise."
+        )
+    return is_named or bool(stated)
+
+
+def _config(source: Path, options: ConvertOptions) -> MikasaOpenVLAConfig:
     shape = (3, options.picture_px, options.picture_px)
     make: Any = MikasaOpenVLAConfig  # lerobot, whose fields it has, is untyped
     config: MikasaOpenVLAConfig = make(
@@ -147,7 +205,8 @@ def _config(options: ConvertOptions) -> MikasaOpenVLAConfig:
         chunk_size=options.chunk_size,
         n_action_steps=options.chunk_size,
         use_proprio=options.proprio > 0,
-        gripper=options.gripper,
+        gripper=stated_gripper(source, options.gripper),
+        image_augmentation=settle_augmentation(source, options.image_augmentation),
         sizes=options.sizes,
         dtype=options.dtype,
         device="cpu",

@@ -35,22 +35,24 @@ def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
 
 
 def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts: Tensor) -> Tensor:
-    """Return the cross-entropy of the action tokens and, told one after the other, of the stop token.
+    """Return the cross-entropy of the action tokens and of the stop token behind them.
 
     Args:
         network: with a token head.
         inputs: see there.
         actions: (B, K, A) normalised.
-        counts: (B, K) float, 0 for actions that are left out.
+        counts: (B, K) float, 0 for actions that are left out; the stop token counts as the last action.
+
+    Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
+    prismatic/vla/datasets/datasets.py#L28-L69: `predict_stop_token`, whichever way the tokens are predicted.
     """
     one_by_one = network.options.head == "tokens"
     ids = to_tokens(actions.flatten(1), network.sizes.text_vocabulary)
     sequence = network.sequence(inputs, ids if one_by_one else None)
+    hidden = network.action_states(sequence, causal=one_by_one, n_more=1)
+    ids = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
     weights = counts.repeat_interleave(network.options.action, dim=1)
-    hidden = network.action_states(sequence, causal=one_by_one, n_more=int(one_by_one))
-    if one_by_one:
-        ids = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
-        weights = torch.cat([weights, weights[:, -1:]], dim=1)
+    weights = torch.cat([weights, weights[:, -1:]], dim=1)
     logits = network.llm.lm_head(hidden).float()
     losses = functional.cross_entropy(logits.flatten(0, 1), ids.flatten(), reduction="none")
     return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)

@@ -14,7 +14,14 @@ from vla_eval.policies.openvla.lora import FULL_MODULES
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
 from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
-from vla_eval.policies.steps.images import MAX_LEVEL, Size, augment, centre_crop, resize_lanczos3
+from vla_eval.policies.steps.images import (
+    MAX_LEVEL,
+    Size,
+    augment,
+    centre_crop,
+    resize_lanczos3,
+    truncated_levels,
+)
 from vla_eval.policies.steps.precision import default_dtype
 
 
@@ -68,7 +75,12 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
         return Inputs(self._pictures(batch, changed=changed), self._prompts(batch), proprio)
 
     def _pictures(self, batch: dict[str, Tensor], *, changed: bool) -> Tensor:
-        """Return (B, cameras, 3, edge, edge) in [0, 1], resized and either changed at random or cropped."""
+        """Return (B, cameras, 3, edge, edge) in [0, 1], resized and either changed at random or cropped.
+
+        Source of the whole levels: in training https://github.com/moojink/dlimp_openvla/blob/
+        040105d256bd28866cc6620621a3d5f7b6b91b46/dlimp/augmentations.py#L125, in evaluation https://github.com/
+        moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/experiments/robot/openvla_utils.py#L625.
+        """
         edge = self.network.sizes.image_px
         pictures = []
         for name in self.config.picture_fields:
@@ -76,9 +88,9 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
                 raise SpecMismatchError(f"'{TYPE}': the batch has no picture '{name}'.")
             levels = resize_lanczos3((batch[name].float() * MAX_LEVEL).round(), Size(edge, edge))
             if self.config.image_augmentation and changed:
-                levels = augment(levels[:, None], AUGMENTATION)[:, 0].round()
+                levels = truncated_levels(augment(levels[:, None], AUGMENTATION)[:, 0])
             elif self.config.image_augmentation:
-                levels = centre_crop(levels, AUGMENTATION.centre_area)
+                levels = centre_crop(levels, AUGMENTATION.centre_area, whole=truncated_levels)
             pictures.append(levels / MAX_LEVEL)
         return torch.stack(pictures, dim=1)
 

@@ -1,5 +1,6 @@
 """lerobot's processors of OpenVLA: prompt, tokens and normalised targets in, actions out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any  # lerobot is untyped
 
@@ -8,6 +9,7 @@ from lerobot.processor import ProcessorStepRegistry
 from vla_eval.policies.openvla.configuration_openvla import MikasaOpenVLAConfig
 from vla_eval.policies.openvla.prompt import prompt_text
 from vla_eval.policies.steps.language_processors import InstructionStep, language_processors
+from vla_eval.policies.steps.normalization import Normalization
 
 PROMPT_STEP = "mikasa_openvla_prompt"
 
@@ -23,7 +25,16 @@ class OpenVLAPromptStep(InstructionStep):
 
 
 def make_mikasa_openvla_pre_post_processors(
-    config: MikasaOpenVLAConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    config: MikasaOpenVLAConfig,
+    dataset_stats: dict[str, dict[str, Any]] | None = None,
+    *,
+    fields: Mapping[str, Normalization] | None = None,
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor; lerobot finds this function by its name."""
-    return language_processors(config, OpenVLAPromptStep(), dataset_stats)
+    """Return pre- and postprocessor; lerobot finds this function by its name.
+
+    Args:
+        config: of the policy.
+        dataset_stats: field -> statistics; None: they come from a checkpoint.
+        fields: how fields are normalised with foreign statistics; None: as the configuration says.
+    """
+    return language_processors(config, OpenVLAPromptStep(), dataset_stats, fields=fields)

@@ -45,6 +45,7 @@ _TO_POLICY: Mapping[GripperEncoding, _Linear] = {
     "unit_closed": _Linear(-0.5, 0.5),
     "negated": _Linear(-1.0, 0.0),
 }
+ENCODINGS: tuple[GripperEncoding, ...] = tuple(_TO_POLICY)
 DECODINGS: tuple[GripperDecoding, ...] = ("continuous", "binary", "paper_openvla")
 
 
@@ -65,7 +66,7 @@ class Gripper:
     def __post_init__(self) -> None:
         """Check the names, and that the faithful mode is used as the paper's code uses it."""
         for field, value, known in (
-            ("encoding", self.encoding, tuple(_TO_POLICY)),
+            ("encoding", self.encoding, ENCODINGS),
             ("decoding", self.decoding, DECODINGS),
         ):
             if value not in known:

@@ -11,6 +11,7 @@ sampling_kernels.h,crop_and_resize_op.cc}.
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -158,12 +159,13 @@ def _crop_weights(start: Tensor, length: Tensor, n_px: int) -> Tensor:
 
 
 @in_float32
-def centre_crop(images: Tensor, area: float) -> Tensor:
+def centre_crop(images: Tensor, area: float, *, whole: Callable[[Tensor], Tensor] = _whole_levels) -> Tensor:
     """Return the middle of the pictures, this share of their area, enlarged to their size, in whole levels.
 
     Args:
         images: (B, …, 3, H, W) in [0, 255].
         area: in (0, 1]; each side is its square root.
+        whole: makes whole levels; the nearest unless another is given.
     """
     if not 0 < area <= 1:
         raise RecipeError(f"crop area is {area}, expected a number in (0, 1].")
@@ -171,7 +173,19 @@ def centre_crop(images: Tensor, area: float) -> Tensor:
     ones = torch.ones(len(images), device=images.device)
     margin = ones * (1 - side) / 2
     boxes = Boxes(top=margin, left=margin, height=ones * side, width=ones * side)
-    return _whole_levels(crop_and_resize(images, boxes))
+    return whole(crop_and_resize(images, boxes))
+
+
+@in_float32
+def truncated_levels(images: Tensor) -> Tensor:
+    """Return whole levels as TensorFlow makes bytes of numbers in [0, 1]: 255.5 times as much, truncated.
+
+    That is not rounding: 10.9 becomes 10, and 250.1 becomes 250.
+
+    Source: https://github.com/tensorflow/tensorflow/blob/v2.19.1/tensorflow/python/ops/image_ops_impl.py
+    (`convert_image_dtype`).
+    """
+    return (images * ((MAX_LEVEL + 0.5) / MAX_LEVEL)).floor().clamp(0, MAX_LEVEL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

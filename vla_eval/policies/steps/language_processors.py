@@ -1,5 +1,6 @@
 """Processors of a policy that reads a prompt: instruction, tokens, normalised targets in, actions out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any  # lerobot is untyped
 
@@ -14,6 +15,7 @@ from lerobot.processor import (
 
 from vla_eval.errors import MissingInstructionError
 from vla_eval.policies.steps.byte_tokenizer import BYTE_TOKENIZER, byte_tokenizer
+from vla_eval.policies.steps.normalization import Normalization
 from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
 
 TASK = "task"
@@ -45,7 +47,11 @@ class InstructionStep(ComplementaryDataProcessorStep):  # type: ignore[misc]  # 
 
 
 def language_processors(
-    config: Any, prompt: InstructionStep, dataset_stats: dict[str, dict[str, Any]] | None
+    config: Any,
+    prompt: InstructionStep,
+    dataset_stats: dict[str, dict[str, Any]] | None,
+    *,
+    fields: Mapping[str, Normalization] | None = None,
 ) -> tuple[Any, Any]:
     """Return pre- and postprocessor.
 
@@ -53,6 +59,7 @@ def language_processors(
         config: of the policy, with `tokenizer_name`, `prompt_max_tokens` and `encoder_settings`.
         prompt: what makes the prompts.
         dataset_stats: field -> statistics; None: they come from a checkpoint.
+        fields: how fields are normalised with foreign statistics; None: as the configuration says.
     """
     default = make_default_policy_processor_steps(config, None)
     named = config.tokenizer_name != BYTE_TOKENIZER
@@ -64,7 +71,8 @@ def language_processors(
         padding_side="right",
         truncation=False,
     )
-    statistics = {**config.encoder_settings, "stats": dataset_stats}
+    settings = config.encoder_settings
+    statistics = {**settings, "fields": fields or settings["fields"], "stats": dataset_stats}
     processors: tuple[Any, Any] = make_policy_processor_pipelines(
         input_steps=[
             default.rename_observations,

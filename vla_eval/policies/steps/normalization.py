@@ -34,11 +34,13 @@ class Normalization:
         kind: `mean_std`: (x - mean) / std. `q01_q99`: the range between these quantiles becomes [-1, 1].
         mask: for each dimension whether it is normalised; others are left as they are.
         clip: cut to [-1, 1] after normalising; only with `q01_q99`.
+        clip_unmasked: cut dimensions that are left as they are, too.
     """
 
     kind: NormalizationKind
     mask: tuple[bool, ...]
     clip: bool = False
+    clip_unmasked: bool = False
 
     def __post_init__(self) -> None:
         """Check what a type cannot say."""
@@ -51,6 +53,8 @@ class Normalization:
             raise RecipeError("normalization.mask is empty, expected one value per dimension.")
         if self.clip and self.kind != "q01_q99":
             raise RecipeError("normalization.clip is for q01_q99: mean_std has no range to cut to.")
+        if self.clip_unmasked and not self.clip:
+            raise RecipeError("normalization.clip_unmasked is for what clip leaves out; expected clip, too.")
 
 
 class Normalizer:
@@ -88,7 +92,7 @@ class Normalizer:
         if self.spec.clip:
             scaled = scaled.clamp(-1, 1)
         scaled = torch.where(self._is_constant().to(values.device), 0.0, scaled)
-        return torch.where(mask, scaled, values)
+        return torch.where(mask, scaled, values.clamp(-1, 1) if self.spec.clip_unmasked else values)
 
     @in_float32
     def unnormalize(self, values: Tensor) -> Tensor:
