@@ -19,7 +19,7 @@ from mkdocs.structure.files import File, Files
 
 from vla_eval.cli import show
 from vla_eval.cli.main import PROGRAM, build_parser
-from vla_eval.prompts import DEFAULT_PROMPT_SET
+from vla_eval.config.prompts import DEFAULT_PROMPT_SET
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 ROOT = Path(__file__).parents[1]

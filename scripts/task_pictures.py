@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, ObservationWindow
 from vla_eval.envs.maniskill import ManiSkillEnv
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_oracle
 

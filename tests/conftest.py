@@ -9,7 +9,7 @@ import pytest
 # Read when huggingface_hub is imported.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
-from vla_eval.worker_start import worker_context  # after the line above
+from vla_eval.workers.start import worker_context  # after the line above
 
 # Whatever the first test of a process needs: what a server did not import, each worker would.
 worker_context(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
 from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.task_state import TaskStatus
 

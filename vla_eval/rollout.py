@@ -9,6 +9,7 @@ recorded on the way is in `episode_log.py`.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import (
     BatchPolicy,
     EpisodeStart,
@@ -22,8 +23,7 @@ from vla_eval.core import (
     StepResult,
 )
 from vla_eval.episode_log import EpisodeLog, check_chunk, check_instruction
-from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.specs import PolicySpec, check_compatible
 
 

@@ -10,13 +10,21 @@ from hypothesis import strategies as st
 
 from tests.fuzz.recipe_cases import changed_recipe, damaged_text, outcome, shipped, yaml_text
 from vla_eval.cli.main import main
-from vla_eval.data.recipe import DatasetRecipe
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.decoding import decode, load_yaml
+from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.config.recipes import (
+    EvalConfig,
+    Folder,
+    PolicyRecipe,
+    PromptRecipe,
+    Recipe,
+    load_recipe,
+    to_data,
+)
 from vla_eval.data.recording_plan import plan_recording
-from vla_eval.decoding import decode, load_yaml
-from vla_eval.model_table import ModelTable, finetunings, is_model_table
-from vla_eval.plan import fingerprint, make_plan
-from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, PromptRecipe, Recipe, load_recipe, to_data
-from vla_eval.training.recipe import FinetuneConfig
+from vla_eval.evaluation.grid import ModelTable, finetunings, is_model_table
+from vla_eval.evaluation.plan import fingerprint, make_plan
 
 TASK = "RememberColor3-v0"
 FEW_EPISODES = 1000  # a longer plan takes seconds and is no other

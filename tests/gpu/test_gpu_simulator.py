@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.testing import check_env
 
 pytestmark = pytest.mark.gpu

@@ -14,16 +14,16 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.policies.checkpoint import TrainingFacts
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.specs import EnvSpec
-from vla_eval.training.tiny_models import (
+from vla_eval.testing.tiny_models import (
     TINY_POLICY,
     make_tiny_pi0,
     tiny_paligemma,

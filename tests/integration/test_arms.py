@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import EpisodeStart
-from vla_eval.data.features import proprioception
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings, RenderSettings
 from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
-from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.features import proprioception
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings, rollout

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.integration.evaluation_bench import SHORT, TASK
-from vla_eval.results.store import read_run
+from vla_eval.storage.run_folder import read_run
 
 EVAL = [
     "eval",

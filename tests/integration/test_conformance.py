@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWindow, StepResult
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import ConformanceError
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_hold, make_random
 from vla_eval.specs import PolicySpec

@@ -9,8 +9,9 @@ import pytest
 from scipy.stats import binomtest
 
 from tests.integration.conftest import SAMPLE
-from vla_eval.audit import kind_of
-from vla_eval.audited import STRICT
+from vla_eval.audit.evaluations import kind_of
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,
@@ -21,12 +22,11 @@ from vla_eval.core import (
     StepResult,
 )
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies import scripted, shortcuts
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.shipped_audit import STRICT
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import TASKS
 

@@ -10,8 +10,8 @@ from tests.integration import evaluation_bench
 from tests.integration.evaluation_bench import TASK, Bench
 from vla_eval.cli.main import main
 from vla_eval.errors import RunChangedError
-from vla_eval.evaluate import default_run_folder
-from vla_eval.results.store import read_run
+from vla_eval.evaluation.evaluate import default_run_folder
+from vla_eval.storage.run_folder import read_run
 
 bench = evaluation_bench.bench
 

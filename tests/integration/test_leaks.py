@@ -8,7 +8,7 @@ import pytest
 
 from tests.integration import evaluation_bench
 from tests.integration.evaluation_bench import Bench
-from vla_eval.results.store import read_run
+from vla_eval.storage.run_folder import read_run
 
 bench = evaluation_bench.bench
 
@@ -44,7 +44,7 @@ LEAKS = {
     "codec": "import codecs; codecs.register_error('strict', lambda error: ('', error.end))",
     "encoder": "import json; json.dumps = lambda *_, **__: '{}'",
     "rng_class": "import hashlib; hashlib.sha256 = hashlib.md5",
-    "our_class": "import vla_eval.policies.chunking as c; c.ChunkExecutor.action = lambda *_: None",
+    "our_class": "import vla_eval.chunking as c; c.ChunkExecutor.action = lambda *_: None",
     "thread": "import threading; threading.Thread(target=__import__('time').sleep, args=(30,)).start()",
 }
 LEAKING_MODULE = """

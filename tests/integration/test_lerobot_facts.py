@@ -20,11 +20,11 @@ from tests.integration.small_checkpoints import (
     start,
     with_features,
 )
-from vla_eval.data.features import proprioception
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError
+from vla_eval.features import proprioception
 from vla_eval.policies.checkpoint import write_facts
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec

@@ -12,16 +12,16 @@ from safetensors.torch import load_file, save_file
 
 from tests.integration import small_checkpoints
 from tests.integration.small_checkpoints import FACTS, TASK, context_for, copied
-from vla_eval import evaluate as evaluate_module
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
+from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.policies.checkpoint import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_empty_policy, read_config
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
-from vla_eval.results.store import read_run
 from vla_eval.specs import EnvSpec
-from vla_eval.training.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
+from vla_eval.storage.run_folder import read_run
+from vla_eval.testing.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
 
 pytestmark = pytest.mark.usefixtures("no_network")
 eyes, env = small_checkpoints.eyes, small_checkpoints.env

@@ -21,14 +21,14 @@ from tests.integration.small_checkpoints import (
     window,
     with_features,
 )
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import Observation
 from vla_eval.envs.factory import make_env
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec
 from vla_eval.testing import check_policy
-from vla_eval.training.tiny_models import make_tiny_pi0
+from vla_eval.testing.tiny_models import make_tiny_pi0
 
 pytestmark = pytest.mark.usefixtures("no_network")
 eyes, env = small_checkpoints.eyes, small_checkpoints.env

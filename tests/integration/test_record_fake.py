@@ -20,6 +20,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from vla_eval.cli.main import main
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.decoding import decode
 from vla_eval.data import recording as recording_module
 from vla_eval.data import replay as replay_module
 from vla_eval.data.dataset_folder import check_dataset, open_recorded
@@ -27,7 +29,6 @@ from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
 from vla_eval.data.memory_loader import MemoryDataset
-from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.recording import RecordedDataset, record
 from vla_eval.data.recording_folder import LOCK_FILE, STATE_FOLDER
 from vla_eval.data.recording_jobs import AttemptJob, ShardJob
@@ -35,10 +36,9 @@ from vla_eval.data.recording_plan import plan_recording
 from vla_eval.data.recording_worker import RecordingRunner
 from vla_eval.data.replay_report import require_passed
 from vla_eval.data.shard_writer import ShardWriter
-from vla_eval.decoding import decode
-from vla_eval.episode_worker import Failed, Heartbeat
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
-from vla_eval.results.durable import FolderLock
+from vla_eval.evaluation.worker import Failed, Heartbeat
+from vla_eval.storage.durable import FolderLock
 from vla_eval.training.dataset import training_dataset
 
 TASK = "RememberColor3-v0"

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 from rerun.experimental import RrdReader
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
+from vla_eval.config.capture import RecordingConfig, is_wanted, may_be_wanted
+from vla_eval.config.decoding import decode
+from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.config.recipes import EvalConfig
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
-from vla_eval.decoding import decode
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RecipeError, VlaEvalError
-from vla_eval.evaluate import evaluate
-from vla_eval.plan import fingerprint
-from vla_eval.policies.chunking import ChunkingSpec
-from vla_eval.recipes import EvalConfig
-from vla_eval.results.recording_files import rrd_file, thumbnail_file, video_file
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.store import read_run
+from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.evaluation.plan import fingerprint
+from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
+from vla_eval.storage.recording_files import rrd_file, thumbnail_file, video_file
+from vla_eval.storage.run_folder import read_run
 from vla_eval.viz.arm_figure import arm_points_m
 from vla_eval.viz.rerun_log import events, n_overlapping, write_rrd
-from vla_eval.viz.settings import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.viz.tape import Tapes
 from vla_eval.viz.video import write_video
 

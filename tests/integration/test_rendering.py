@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Observation, ObservationWindow, StepResult
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings, RenderSettings
 from vla_eval.errors import RenderingError, UnknownNameError
-from vla_eval.policies.chunking import ChunkingSpec
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
 from vla_eval.tasks.catalog import task_spec

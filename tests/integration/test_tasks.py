@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import vla_eval.tasks.register  # noqa: F401  # registers the gym ids
+from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.memory_env import PARK_X_M

@@ -61,9 +61,9 @@ SERVER_SCRIPT = """
 import os, sys, time
 from multiprocessing import forkserver
 from pathlib import Path
-from vla_eval import evaluate as evaluate_module
-from vla_eval.decoding import decode
-from vla_eval.recipes import EvalConfig
+from vla_eval.evaluation import evaluate as evaluate_module
+from vla_eval.config.decoding import decode
+from vla_eval.config.recipes import EvalConfig
 
 evaluate_module.collect_environment = lambda: {"machine": "test"}
 

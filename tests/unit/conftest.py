@@ -25,7 +25,7 @@ def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_entry,
         write_lines,
     )
-    from vla_eval.data.synthetic import write_synthetic_dataset
+    from vla_eval.testing.synthetic import write_synthetic_dataset
 
     root = write_synthetic_dataset(
         tmp_path_factory.mktemp("recorded") / "RememberColor3-v0", n_episodes=4, n_frames=13
@@ -87,7 +87,7 @@ def recorded(_recorded: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def small_act() -> Iterator[None]:
     """ACT with a small network for its eyes: most of a training's time went there."""
-    from vla_eval.training.tiny_models import tiny_resnet
+    from vla_eval.testing.tiny_models import tiny_resnet
 
     with tiny_resnet():
         yield
@@ -96,8 +96,8 @@ def small_act() -> Iterator[None]:
 @pytest.fixture
 def small_act_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same in worker processes, which have to import lerobot for it."""
-    from vla_eval import evaluate
-    from vla_eval.training.tiny_models import tiny_worker_main
+    from vla_eval.evaluation import evaluate
+    from vla_eval.testing.tiny_models import tiny_worker_main
 
     monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
 

@@ -5,15 +5,15 @@ import textwrap
 from dataclasses import replace
 from pathlib import Path
 
-from vla_eval.results.records import EpisodeError, EpisodeRecord
-from vla_eval.results.store import RunDescription
+from vla_eval.records import EpisodeError, EpisodeRecord
+from vla_eval.storage.run_folder import RunDescription
 
 # What subprocesses need to append records; `{out}` and `{n}` are filled in.
 WRITER = """
     import sys
     from pathlib import Path
-    from vla_eval.results.records import EpisodeRecord
-    from vla_eval.results.store import RunDescription, RunFolder
+    from vla_eval.records import EpisodeRecord
+    from vla_eval.storage.run_folder import RunDescription, RunFolder
 
     description = RunDescription(name="t", config={}, recipes={}, environment={}, options={}, command="x")
     out, n_keys = Path(sys.argv[1]), int(sys.argv[2])

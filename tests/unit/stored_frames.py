@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, FloatArray, StepResult
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy
 from vla_eval.rollout import RolloutSettings, rollout

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from vla_eval.results.records import EpisodeError, EpisodeRecord
+from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import Row, Table
-from vla_eval.results.store import RunDescription, StoredRun
+from vla_eval.storage.run_folder import RunDescription, StoredRun
 
 COLOR, INTERCEPT = "RememberColor3-v0", "InterceptMedium-v0"
 

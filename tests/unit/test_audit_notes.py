@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.unit.stored_runs import episodes, stored
-from vla_eval import audited
-from vla_eval.audit import Counts, TaskAudit, verdict
-from vla_eval.audit_table import render_audit
-from vla_eval.audited import STRICT, protocol_of, shipped_verdicts
+from vla_eval.audit.evaluations import Counts, TaskAudit, verdict
+from vla_eval.audit.table import render_audit
+from vla_eval.results import shipped_audit as audited
 from vla_eval.results.audit_notes import audit_notes
-from vla_eval.results.store import StoredRun
+from vla_eval.results.shipped_audit import STRICT, protocol_of, shipped_verdicts
+from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import TASKS
 
 COLOR, SHELL = "RememberColor3-v0", "ShellGameTouch-v0"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval import shipped
+from vla_eval.config import shipped
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import find_checkpoint
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from vla_eval.data.recipe import DatasetRecipe
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.decoding import decode
+from vla_eval.config.recipes import EvalConfig
 from vla_eval.data.recording_plan import plan_recording
-from vla_eval.decoding import decode
 from vla_eval.errors import CheckpointError, TaskArgumentError
-from vla_eval.plan import Plan, make_plan
+from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.policies.checkpoint import TrainingFacts, write_facts
 from vla_eval.policies.checkpoint_notes import normalization_notes
-from vla_eval.recipes import EvalConfig
-from vla_eval.results.run_file import RunDescription, RunFile
+from vla_eval.storage.run_file import RunDescription, RunFile
 
 IMAGES = "observation.images.base"
 STATE = {"mean": [1, 2], "std": [3, 4], "q01": [9, 9]}

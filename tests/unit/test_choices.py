@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from vla_eval.records import EpisodeRecord
 from vla_eval.results.choices import find_habit, report_choices
 from vla_eval.results.grouping import RowGroup, RowKey, Run
-from vla_eval.results.records import EpisodeRecord
 
 KEY = RowKey("RememberColor3-v0", "p", 1, None)
 

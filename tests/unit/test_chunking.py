@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk
 from vla_eval.errors import RecipeError, SpecMismatchError
-from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
 
 
 def chunk(step: int, size: int) -> ActionChunk:

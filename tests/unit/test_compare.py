@@ -7,14 +7,14 @@ import pytest
 from scipy import stats
 
 from tests.unit.stored_runs import stored
+from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.cli.main import main
+from vla_eval.config.recipes import EvalConfig, load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
-from vla_eval.evaluate import evaluate
-from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
-from vla_eval.recipes import EvalConfig, load_recipe
+from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.power import discordance_of_independent, episodes_to_settle
-from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.sweep import Sweep, SweepRow, compare_runs
 from vla_eval.results.sweep_format import render_sweep
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from vla_eval.cli.main import build_parser, main
-from vla_eval.data.recipe import DatasetRecipe
-from vla_eval.decoding import decode
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.decoding import decode
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.config.recipes import EvalConfig, apply_overrides
 from vla_eval.errors import RecipeError
-from vla_eval.recipes import EvalConfig, apply_overrides
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
 EVAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"
 FINETUNE = "policy: act\ndataset: d\n"

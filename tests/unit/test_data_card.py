@@ -16,8 +16,8 @@ from vla_eval.data.convert import convert_to_lerobot, find_source
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.dataset_summary import ActionStatistics
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.testing.synthetic import write_synthetic_dataset
 
 
 def front_matter(text: str) -> dict[str, object]:

@@ -14,8 +14,8 @@ from vla_eval.data.import_writer import eef_of_proprio
 from vla_eval.data.imported import read_import
 from vla_eval.data.layouts import npz_files, read_npz
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.testing.synthetic import write_synthetic_dataset
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 TASK = "RememberColor3-v0"

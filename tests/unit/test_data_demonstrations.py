@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import (
     ONE_BY_ONE,
@@ -18,7 +19,6 @@ from vla_eval.data.demonstrations import (
     states_digest,
 )
 from vla_eval.data.episode_check import check_rows, check_states, psnr_db
-from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, SUCCESS_KEY, proprioception
 from vla_eval.data.manifest import (
     MIKASA_FOLDER,
     RECORDING_FILE,
@@ -32,8 +32,8 @@ from vla_eval.data.manifest import (
 )
 from vla_eval.data.replay_report import keep_report, require_passed
 from vla_eval.envs.fake import FakeEnv
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import DatasetError, RecordingError
+from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, SUCCESS_KEY, proprioception
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings

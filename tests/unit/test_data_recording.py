@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vla_eval.config.dataset import DatasetRecipe, fingerprint
+from vla_eval.config.decoding import decode
+from vla_eval.config.recipes import list_recipes, load_recipe
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.exact_statistics import count_levels, image_statistics, vector_statistics
-from vla_eval.data.features import (
+from vla_eval.data.seed_queue import SeedQueue
+from vla_eval.errors import RecipeError, RecordingError
+from vla_eval.features import (
     ACTION_KEY,
     PROPRIO_KEYS,
     STATE_KEY,
@@ -17,11 +22,6 @@ from vla_eval.data.features import (
     proprioception,
     rotation_columns,
 )
-from vla_eval.data.recipe import DatasetRecipe, fingerprint
-from vla_eval.data.seed_queue import SeedQueue
-from vla_eval.decoding import decode
-from vla_eval.errors import RecipeError, RecordingError
-from vla_eval.recipes import list_recipes, load_recipe
 from vla_eval.tasks.catalog import task_spec
 
 TASK = "RememberColor3-v0"

@@ -10,19 +10,19 @@ import torch
 from tests.unit import tiny_trainings
 from tests.unit.tiny_trainings import act, context, pi0
 from vla_eval.cli.main import main
+from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.config.recipes import PolicyRecipe, list_recipes, load_recipe
 from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, write_entry
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import make_empty_policy
-from vla_eval.recipes import PolicyRecipe, list_recipes, load_recipe
+from vla_eval.testing.tiny_models import TINY_POLICY, Family, tiny_paligemma
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.finetune import finetune
 from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
-from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import TINY_POLICY, Family, tiny_paligemma
 
 pytestmark = pytest.mark.usefixtures("small_act")
 tokenizer = tiny_trainings.tokenizer

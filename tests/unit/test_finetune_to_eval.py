@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import yaml
 
-from vla_eval import evaluate as evaluate_module
 from vla_eval.cli.main import main
+from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
-from vla_eval.results.store import read_run
-from vla_eval.training.tiny_models import (
+from vla_eval.storage.run_folder import read_run
+from vla_eval.testing.tiny_models import (
     TINY_POLICY,
     tiny_paligemma,
     tiny_worker_main,

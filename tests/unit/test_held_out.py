@@ -14,16 +14,16 @@ from safetensors.torch import load_file
 
 from tests.unit import tiny_trainings
 from vla_eval.cli.main import main
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation
+from vla_eval.config.recipes import EvalConfig
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
-from vla_eval.evaluate import evaluate
+from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.recipes import EvalConfig
-from vla_eval.results.store import read_run
+from vla_eval.storage.run_folder import read_run
 from vla_eval.training import held_out as held_out_module
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
 from vla_eval.training.held_out import check_held_out
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation
 
 pytestmark = pytest.mark.usefixtures("small_act")
 

@@ -16,8 +16,8 @@ from vla_eval.data import hub
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.hub import pull_dataset, push_dataset
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.testing.synthetic import write_synthetic_dataset
 
 REPO = "somebody/demos"
 

@@ -19,10 +19,10 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from tests.unit import tiny_trainings
-from vla_eval.data.features import dataset_features, proprioception
+from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
+from vla_eval.features import dataset_features, proprioception
 from vla_eval.lerobot_plugin import MikasaEnvConfig, MikasaGym
 from vla_eval.training.finetune import finetune
 
@@ -104,7 +104,7 @@ class TestNames:
         assert set(tensors) == {"observation.images.base", "observation.images.wrist", "observation.state"}
 
     def test_the_instruction_is_the_prompt_sets(self) -> None:
-        from vla_eval.prompts import instruction_for
+        from vla_eval.config.prompts import instruction_for
         from vla_eval.tasks.catalog import task_spec
 
         assert make_gym().task_description == instruction_for(task_spec(TASK))

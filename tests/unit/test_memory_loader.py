@@ -11,12 +11,12 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from vla_eval.bench.loader import run_loader_bench
 from vla_eval.data import frame_cache
-from vla_eval.data.loader_bench import run_loader_bench
 from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.data.opening import open_local_dataset, video_decoder
-from vla_eval.data.synthetic import write_synthetic_dataset
 from vla_eval.errors import DatasetError, StorageFullError, UnknownNameError
+from vla_eval.testing.synthetic import write_synthetic_dataset
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 # A chunk of eight actions, four frames of one camera and two states: windows as policies ask for them.

@@ -7,22 +7,22 @@ from typing import Any
 import pytest
 import torch
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.config.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import SpecMismatchError, UnknownNameError
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone, goals_missed
 from vla_eval.policies.memory.network import Answer
 from vla_eval.policies.memory.sizes import POSITION_SCALE
-from vla_eval.recipes import PolicyRecipe, load_recipe, to_data
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
 from vla_eval.training.policy_config import policy_config
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
 TASK = "RememberColor3-v0"
 TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}

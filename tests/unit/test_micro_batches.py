@@ -8,10 +8,10 @@ import pytest
 import torch
 from accelerate import Accelerator
 
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError, TrainingError
 from vla_eval.training.finetune import finetune
 from vla_eval.training.micro_batches import add_gradient
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
 
 
 class Linear(torch.nn.Module):

@@ -8,13 +8,16 @@ from typing import Any
 import pytest
 import yaml
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import build_parser, main
 from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.config.recipes import PolicyRecipe, load_recipe
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import FolderInUseError, VlaEvalError
-from vla_eval.model_table import (
+from vla_eval.evaluation.grid import (
     describe_effort,
     evaluations,
     finetunings,
@@ -23,14 +26,11 @@ from vla_eval.model_table import (
     load_model_table,
     narrow,
 )
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_oracle
-from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.results.paper_table import PAPER_TABLE
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.training.recipe import FinetuneConfig
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from tests.unit.tiny_octo import GOLDEN, TINY
 from vla_eval.cli.main import main
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.octo.convert import convert
 from vla_eval.policies.octo.flax_names import our_name
 from vla_eval.policies.octo.original import unpack
 from vla_eval.training.finetune import finetune
-from vla_eval.training.recipe import FinetuneConfig
 
 N_BYTES = 260  # 256, three special tokens, and one to spare
 

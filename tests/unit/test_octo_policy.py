@@ -16,14 +16,15 @@ from torch import Tensor
 
 from tests.unit.golden_values import GoldenValues
 from tests.unit.tiny_octo import GOLDEN, TINY
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.recipes import PolicyRecipe, load_recipe
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
-from vla_eval.data.features import ACTION_NAMES
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, MissingInstructionError
+from vla_eval.features import ACTION_NAMES
 from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.octo.configuration_octo import TRAINED, MikasaOctoConfig
@@ -31,8 +32,7 @@ from vla_eval.policies.octo.convert import octo_config
 from vla_eval.policies.octo.language import PromptEmbeddings
 from vla_eval.policies.octo.modeling_octo import MikasaOctoPolicy
 from vla_eval.policies.steps.trainable import trainable
-from vla_eval.recipes import PolicyRecipe, load_recipe
-from vla_eval.results.store import read_run
+from vla_eval.storage.run_folder import read_run
 
 TASK = "RememberColor3-v0"
 BASE, WRIST = "observation.images.base", "observation.images.wrist"

@@ -13,9 +13,9 @@ from tests.unit.stored_frames import StoredFrames, context, executed
 from tests.unit.test_octo_convert import golden_fields
 from tests.unit.test_octo_parity import CONFIG, sampling_noise
 from tests.unit.tiny_octo import GOLDEN
+from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk, FloatArray, ObservationWindow
 from vla_eval.policies import lerobot
-from vla_eval.policies.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.policies.octo.convert import convert
 from vla_eval.specs import PolicySpec
 

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from tests.unit import openvla_golden as golden
+from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.config.recipes import PolicyRecipe, load_recipe
 from vla_eval.errors import (
     MissingInstructionError,
     RecipeError,
@@ -21,10 +23,8 @@ from vla_eval.policies.openvla.sizes import network_sizes
 from vla_eval.policies.steps.byte_tokenizer import byte_tokenizer
 from vla_eval.policies.steps.normalization import Normalization, Normalizer
 from vla_eval.policies.steps.trainable import check_lora, trainable
-from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.policy_config import policy_config
-from vla_eval.training.recipe import FinetuneRecipe
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.unit import openvla_golden as golden
 from tests.unit.stored_frames import StoredFrames, context, executed
-from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies import lerobot_inputs
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla

@@ -13,13 +13,12 @@ from transformers import AutoTokenizer
 from tests.unit import tiny_trainings
 from tests.unit.test_finetune import KilledAt, run_an_episode, weights
 from tests.unit.tiny_trainings import SHORT, context
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.fast_tokens import FastActionTokenizer, load_fast_tokenizer
 from vla_eval.policies.foreign_code import no_foreign_code
-from vla_eval.training.finetune import finetune
-from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import (
+from vla_eval.testing.tiny_models import (
     TINY_POLICY,
     VOCABULARY,
     Family,
@@ -27,6 +26,7 @@ from vla_eval.training.tiny_models import (
     tiny_paligemma,
     write_tiny_fast_tokenizer,
 )
+from vla_eval.training.finetune import finetune
 
 tokenizer = tiny_trainings.tokenizer
 offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from vla_eval.config.prompts import instruction_for, instructions_for, load_prompts
 from vla_eval.errors import MissingInstructionError, RecipeError
-from vla_eval.prompts import instruction_for, instructions_for, load_prompts
 from vla_eval.tasks.catalog import TASKS, task_spec
 
 OFFICIAL = load_prompts("official_vla").value.instructions

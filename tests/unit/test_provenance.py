@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval import provenance
-from vla_eval.provenance import checkout_state, collect_environment
+from vla_eval.storage import provenance
+from vla_eval.storage.provenance import checkout_state, collect_environment
 
 
 def git(folder: Path, *arguments: str) -> None:

@@ -6,13 +6,9 @@ from typing import Any
 
 import pytest
 
-from vla_eval import shipped
-from vla_eval.decoding import decode, load_yaml
-from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError, VlaEvalError
-from vla_eval.job_queue import JobQueue
-from vla_eval.model_table import is_model_table, load_model_table
-from vla_eval.plan import fingerprint, make_plan, results_config
-from vla_eval.recipes import (
+from vla_eval.config import shipped
+from vla_eval.config.decoding import decode, load_yaml
+from vla_eval.config.recipes import (
     EvalConfig,
     PolicyRecipe,
     apply_overrides,
@@ -21,6 +17,10 @@ from vla_eval.recipes import (
     load_recipe,
     to_data,
 )
+from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError, VlaEvalError
+from vla_eval.evaluation.grid import is_model_table, load_model_table
+from vla_eval.evaluation.job_queue import JobQueue
+from vla_eval.evaluation.plan import fingerprint, make_plan, results_config
 from vla_eval.tasks.catalog import TASKS
 
 MINIMAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"

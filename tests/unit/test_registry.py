@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval import registry
 from vla_eval.errors import MissingDependencyError, UnknownNameError
-from vla_eval.registry import check_adapter, policy_adapters, policy_factory
+from vla_eval.policies import registry
+from vla_eval.policies.registry import check_adapter, policy_adapters, policy_factory
 
 
 @pytest.fixture

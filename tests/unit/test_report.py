@@ -8,8 +8,8 @@ import pytest
 from tests.unit.stored_runs import COLOR, INTERCEPT, episode, episodes, has_note, only_row, stored
 from vla_eval.errors import ReportError
 from vla_eval.results.report import build_table, render
-from vla_eval.results.run_file import Change
-from vla_eval.results.store import RunDescription, Session, StoredRun
+from vla_eval.storage.run_file import Change
+from vla_eval.storage.run_folder import RunDescription, Session, StoredRun
 
 # ------------------------------------------------------------------------------- counting
 

@@ -16,11 +16,11 @@ from vla_eval.errors import ReportError
 from vla_eval.page.build import build_page, with_code, write_page
 from vla_eval.page.charts import MARKERS, Bar, Chart, Point, Series, curves, forest, sign
 from vla_eval.page.svg import PALETTE
-from vla_eval.results.recording_files import video_file
-from vla_eval.results.records import EpisodeError, EpisodeRecord
+from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
-from vla_eval.results.store import RunDescription, RunFolder, Session, StoredRun, read_run
 from vla_eval.results.table_formats import table_cells
+from vla_eval.storage.recording_files import video_file
+from vla_eval.storage.run_folder import RunDescription, RunFolder, Session, StoredRun, read_run
 
 COLOR, INTERCEPT = "RememberColor3-v0", "InterceptMedium-v0"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

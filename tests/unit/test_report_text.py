@@ -15,7 +15,7 @@ from tests.unit.stored_runs import episode, episodes, stored
 from vla_eval.cli import report as report_verb
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.results.report import FORMATS, Format, Table, build_table, render
-from vla_eval.results.store import RunFolder
+from vla_eval.storage.run_folder import RunFolder
 
 # ------------------------------------------------------------------------------- formats
 

@@ -7,6 +7,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,
@@ -16,15 +18,13 @@ from vla_eval.core import (
     StepResult,
 )
 from vla_eval.envs.fake import FakeEnv
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import (
     InvalidActionError,
     MissingInstructionError,
     SimulationError,
     SpecMismatchError,
 )
-from vla_eval.policies.chunking import ChunkingSpec
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
 from vla_eval.tasks.layout import places_from_right

@@ -10,7 +10,7 @@ import pytest
 
 from tests.unit.run_records import describe, result, writer
 from vla_eval.errors import RunChangedError, RunFolderError
-from vla_eval.results.store import RunFolder, read_run
+from vla_eval.storage.run_folder import RunFolder, read_run
 
 # ------------------------------------------------------------------------------- one writer
 
@@ -183,7 +183,7 @@ def test_the_folder_of_run_folders_is_recognised(tmp_path: Path) -> None:
 
 def test_store_and_records_import_nothing_heavy() -> None:
     code = (
-        "import sys, vla_eval.results.store, vla_eval.results.records\n"
+        "import sys, vla_eval.storage.run_folder, vla_eval.records\n"
         "heavy = ('torch', 'sapien', 'mani_skill', 'lerobot', 'cv2', 'rerun', 'scipy', 'pandas')\n"
         "print([name for name in heavy if name in sys.modules])"
     )

@@ -17,6 +17,7 @@ from tests.unit import spatialvla_golden as golden
 from tests.unit.golden_values import GoldenFields
 from tests.unit.stored_frames import StoredFrames, context, executed
 from vla_eval.cli.main import main
+from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
@@ -32,7 +33,6 @@ from vla_eval.policies.spatialvla.weight_names import EMBEDDINGS, HEAD
 from vla_eval.policies.verify import verify_checkpoint
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.policy_config import policy_config
-from vla_eval.training.recipe import FinetuneRecipe
 
 SMALL = {**golden.SMALL, **golden.DEPTH}
 (UNNORM_KEY,) = golden.config()["statistics"]

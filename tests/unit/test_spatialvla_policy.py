@@ -11,6 +11,8 @@ from PIL import Image
 from scipy.stats import norm
 
 from tests.unit import spatialvla_golden as golden
+from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.config.recipes import PolicyRecipe, load_recipe
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import (
     MissingInstructionError,
@@ -29,10 +31,8 @@ from vla_eval.policies.spatialvla.prompt import BYTE_SIZES, finished, prompt_tex
 from vla_eval.policies.steps.byte_tokenizer import byte_tokenizer
 from vla_eval.policies.steps.images import Size, resize_bicubic
 from vla_eval.policies.steps.trainable import check_lora, trainable
-from vla_eval.recipes import PolicyRecipe, load_recipe
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.policy_config import policy_config
-from vla_eval.training.recipe import FinetuneRecipe
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 BOTH = [BASE, WRIST]

@@ -6,19 +6,19 @@ from typing import Any
 import pytest
 import torch
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
 from vla_eval.errors import CheckpointError, SpecMismatchError
 from vla_eval.policies.checkpoint import ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.merging import merge_adapter
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
-from vla_eval.training.recipe import FinetuneConfig
 
 TASK = "RememberColor3-v0"
 SHORT = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}

@@ -13,8 +13,8 @@ import pytest
 
 from tests.unit.run_records import describe, error, result, writer
 from vla_eval.errors import RunFolderError, StorageFullError
-from vla_eval.results.records import EpisodeKey, EpisodeTiming
-from vla_eval.results.store import RunFolder, read_run
+from vla_eval.records import EpisodeKey, EpisodeTiming
+from vla_eval.storage.run_folder import RunFolder, read_run
 
 # ------------------------------------------------------------------------------- what is kept
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from vla_eval.tasks.streams import Stream, generator
+from vla_eval.seeding import Stream, generator
 
 N_SEEDS = 3000
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.policies.memory.action_head import ActionHead
 from vla_eval.policies.octo.diffusion_head import DiffusionHead
 from vla_eval.policies.octo.transformer import OctoTransformer
@@ -19,7 +20,6 @@ from vla_eval.policies.spatialvla import ego3d
 from vla_eval.policies.spatialvla.network import SpatialVLANetwork
 from vla_eval.training.finetune import finetune
 from vla_eval.training.loop import autocast_dtype
-from vla_eval.training.recipe import FinetuneConfig
 
 ONE_STEP = {"steps": 1, "batch_size": 2, "save_every_steps": 1, "log_every_steps": 1, "num_workers": 0}
 BOTH = ["observation.images.base", "observation.images.wrist"]

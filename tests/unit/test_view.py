@@ -9,9 +9,9 @@ import pytest
 from rerun.experimental import RrdReader
 
 from vla_eval.cli.main import main
-from vla_eval.results.recording_files import rrd_file
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.store import RunDescription, RunFolder
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.recording_files import rrd_file
+from vla_eval.storage.run_folder import RunDescription, RunFolder
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval import worker_start
-from vla_eval.worker_start import begin, simulator_modules, worker_context, worker_environment
+from vla_eval.workers.pool import start as worker_start
+from vla_eval.workers.start import begin, simulator_modules, worker_context, worker_environment
 
 PARENT = """
 import os, sys, time
-from vla_eval.worker_start import begin, worker_context, worker_environment
-code = "from pathlib import Path; import os, time, vla_eval.episode_worker as inside;"
+from vla_eval.workers.start import begin, worker_context, worker_environment
+code = "from pathlib import Path; import os, time, vla_eval.evaluation.worker as inside;"
 code += "inside.detach(Path(os.devnull)); there.send(os.getpid()); time.sleep(600)"
 context = worker_context()
 here, there = context.Pipe()

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
+from vla_eval.testing.tiny_models import TINY_POLICY, write_tiny_tokenizer
 from vla_eval.training import finetune as finetune_module
-from vla_eval.training.recipe import FinetuneConfig
-from vla_eval.training.tiny_models import TINY_POLICY, write_tiny_tokenizer
 
 TASK = "RememberColor3-v0"
 TINY_ACT = {

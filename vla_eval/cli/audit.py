@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
-from vla_eval.decoding import decode
-from vla_eval.recipes import EvalConfig, apply_overrides
+from vla_eval.config.decoding import decode
+from vla_eval.config.recipes import EvalConfig, apply_overrides
 
 DESCRIPTION = """Play every task with the controls that need no memory, and with the oracle, and say by which
 road each can be won: without acting, by touching one candidate after another, by staying at the cue,
@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a mistyped task, a run folder of other settings, or a fault of every episode.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.audit import read_audit
-    from vla_eval.audit_table import render_audit
+    from vla_eval.audit.evaluations import read_audit
+    from vla_eval.audit.table import render_audit
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
     configs = _configs(args)
@@ -79,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
-    from vla_eval.audit import audit_configs
-    from vla_eval.audited import PROTOCOLS
+    from vla_eval.audit.evaluations import audit_configs
+    from vla_eval.results.shipped_audit import PROTOCOLS
     from vla_eval.tasks.catalog import TASKS
 
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below

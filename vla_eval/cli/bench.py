@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _loader(args: argparse.Namespace) -> int:
-    from vla_eval.data.loader_bench import CHUNK_SIZE, run_loader_bench
+    from vla_eval.bench.loader import CHUNK_SIZE, run_loader_bench
 
     root = None if args.loader == SYNTHETIC else Path(args.loader)
     report = run_loader_bench(root, n_samples=args.samples, repeats=args.repeats)
@@ -52,8 +52,8 @@ def _loader(args: argparse.Namespace) -> int:
 
 
 def _rendering(args: argparse.Namespace) -> int:
-    from vla_eval.bench import run_bench
-    from vla_eval.envs.settings import RenderSettings
+    from vla_eval.bench.rendering import run_bench
+    from vla_eval.config.environment import RenderSettings
 
     report = run_bench(
         args.task,

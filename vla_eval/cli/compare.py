@@ -43,9 +43,9 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a RUN is no run folder, or there is nothing to compare.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
-    from vla_eval.results.store import read_run
     from vla_eval.results.sweep import compare_runs
     from vla_eval.results.sweep_format import render_sweep, sweep_notes
+    from vla_eval.storage.run_folder import read_run
 
     sweep = compare_runs(
         [read_run(path) for path in args.runs],

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
-from vla_eval.decoding import decode, set_field
+from vla_eval.config.decoding import decode, set_field
+from vla_eval.config.policy import policy_name
+from vla_eval.config.recipes import EvalConfig, apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.model_table import is_model_table
-from vla_eval.policies.recipe import policy_name
-from vla_eval.recipes import EvalConfig, apply_overrides, load_recipe
+from vla_eval.evaluation.grid import is_model_table
 
 if TYPE_CHECKING:
-    from vla_eval.results.store import StoredRun
+    from vla_eval.storage.run_folder import StoredRun
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -109,8 +109,8 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
-    from vla_eval.evaluate import default_run_folder
-    from vla_eval.results.store import read_run
+    from vla_eval.evaluation.evaluate import default_run_folder
+    from vla_eval.storage.run_folder import read_run
 
     if args.config is not None and is_model_table(args.config):
         from vla_eval.cli.model_table import evaluate_table

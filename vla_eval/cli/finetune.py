@@ -6,11 +6,11 @@ import sys
 from typing import Any
 
 from vla_eval.cli.arguments import typed_command
-from vla_eval.decoding import decode, set_field
+from vla_eval.config.decoding import decode, set_field
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.config.recipes import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
-from vla_eval.model_table import is_model_table
-from vla_eval.recipes import apply_overrides, load_recipe
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe
+from vla_eval.evaluation.grid import is_model_table
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 

@@ -4,12 +4,12 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from vla_eval.data.recipe import DatasetRecipe
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.prompts import instruction_for, load_prompts
+from vla_eval.config.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
 from vla_eval.errors import RecipeError
-from vla_eval.model_table import ModelTable, is_model_table
-from vla_eval.prompts import instruction_for, load_prompts
-from vla_eval.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
-from vla_eval.registry import policy_adapters
+from vla_eval.evaluation.grid import ModelTable, is_model_table
+from vla_eval.policies.registry import policy_adapters
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 Row = Sequence[str]

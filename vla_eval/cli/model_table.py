@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
 from vla_eval.errors import FolderInUseError, RecipeError
-from vla_eval.model_table import (
+from vla_eval.evaluation.grid import (
     Finetuning,
     ModelTable,
     describe_effort,
@@ -76,7 +76,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
     """
     from vla_eval.cli.eval import check_baseline, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
-    from vla_eval.results.store import read_run
+    from vla_eval.storage.run_folder import read_run
 
     _refuse(args, EVAL_FLAGS)
     work = _work(args, rows=args.policies)
@@ -115,7 +115,7 @@ def _work(args: argparse.Namespace, *, rows: Sequence[str] | None) -> _Work:
     out = Path(args.out) if args.out else RUNS_FOLDER / (table.name + ("_tiny" if is_tiny else ""))
     if not is_tiny:
         return _Work(table, out, {})
-    from vla_eval.training.tiny_table import tiny_table
+    from vla_eval.testing.tiny_table import tiny_table
 
     tiny, adapters = tiny_table(table, out)
     return _Work(tiny, out, adapters)
@@ -191,7 +191,7 @@ def _part(args: argparse.Namespace) -> str:
 
 def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
     from vla_eval.data.recording import record
-    from vla_eval.training.tiny_table import tiny_dataset
+    from vla_eval.testing.tiny_table import tiny_dataset
 
     _say(f"{work.table.name}: tiny random models on a stand-in for the simulator. The figures mean nothing.")
     record(
@@ -208,7 +208,7 @@ def _tiny_models(work: _Work) -> Iterator[None]:
     if not work.adapters:
         yield
         return
-    from vla_eval.training.tiny_models import tiny_paligemma
+    from vla_eval.testing.tiny_models import tiny_paligemma
 
     with tiny_paligemma("pi0"):
         yield

@@ -9,10 +9,10 @@ from types import FrameType
 from typing import Any
 
 from vla_eval.cli.episode_bar import EpisodeBar
-from vla_eval.evaluate import EvaluationSummary, evaluate
-from vla_eval.plan import Plan
-from vla_eval.recipes import EvalConfig
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.config.recipes import EvalConfig
+from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
+from vla_eval.evaluation.plan import Plan
+from vla_eval.records import EpisodeRecord
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 

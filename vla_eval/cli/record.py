@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import typed_command, workers_argument
-from vla_eval.data.recipe import DatasetRecipe, fingerprint
-from vla_eval.decoding import decode
+from vla_eval.config.dataset import DatasetRecipe, fingerprint
+from vla_eval.config.decoding import decode
+from vla_eval.config.recipes import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
-from vla_eval.recipes import apply_overrides, load_recipe
 
 if TYPE_CHECKING:
     from vla_eval.data.recording import RecordedDataset

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.results.report import build_table, render
-    from vla_eval.results.store import read_run
+    from vla_eval.storage.run_folder import read_run
 
     runs = [read_run(path) for path in args.runs]
     if args.html is not None:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vla_eval.prompts import DEFAULT_PROMPT_SET, instruction_for
+from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _of_run(args: argparse.Namespace) -> list[Path]:
     from vla_eval.errors import ViewingError
-    from vla_eval.results.store import read_run
+    from vla_eval.storage.run_folder import read_run
     from vla_eval.viz.picking import Wish, pick
 
     if args.episode is not None:
@@ -77,9 +77,9 @@ def _of_run(args: argparse.Namespace) -> list[Path]:
 
 def _of_dataset(args: argparse.Namespace) -> list[Path]:
     """Write the episodes into the user's cache, from where the viewer opens them."""
-    from vla_eval.cache import cache_dir
+    from vla_eval.data.dataset_rrd import EpisodeWish, write_dataset_rrds
     from vla_eval.errors import ViewingError
-    from vla_eval.viz.dataset_rrd import EpisodeWish, write_dataset_rrds
+    from vla_eval.storage.cache import cache_dir
     from vla_eval.viz.picking import MOST_OPENED
 
     given = [flag for flag, name in RUN_FLAGS.items() if getattr(args, name) is not None]

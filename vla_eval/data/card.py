@@ -12,7 +12,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
-from vla_eval.results.durable import replace_file
+from vla_eval.storage.durable import replace_file
 from vla_eval.tasks.catalog import find_task
 
 CARD_FILE = Path("README.md")

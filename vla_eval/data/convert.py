@@ -11,13 +11,13 @@ from typing import Any  # arrays of several types
 
 import numpy as np
 
-from vla_eval.data.features import StateKind
 from vla_eval.data.import_writer import ImportWriter
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.layouts import Source, SourceEpisode, lerobot_layout, npz_files, read_npz
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.shard_writer import draft_path, publish, remove_drafts
 from vla_eval.errors import DatasetError
+from vla_eval.features import StateKind
 
 NPZ_NAME = "train_data_{}.npz"  # as the authors' recorder calls its files
 

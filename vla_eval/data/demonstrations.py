@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,
@@ -24,10 +25,9 @@ from vla_eval.core import (
 )
 from vla_eval.data.manifest import decode_actions, encode_actions
 from vla_eval.errors import RecordingError
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.seeding import Stream, generator
 from vla_eval.specs import EnvSpec, PolicySpec
-from vla_eval.tasks.streams import Stream, generator
 
 SLOT = 0
 ONE_BY_ONE = ChunkingSpec(n_action_steps=1)

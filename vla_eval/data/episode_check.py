@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.demonstrations import EpisodeLog, images_digests, states_digest
-from vla_eval.data.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY, proprioception
 from vla_eval.data.frame_table import Columns
 from vla_eval.data.manifest import RecordedEpisode, decode_actions
-from vla_eval.envs.settings import Simulator
+from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY, proprioception
 
 STATE_TOLERANCE = 1e-2  # m, rad, rad/s; for machines whose arithmetic differs in the last bits
 MIN_PSNR_DB: dict[Simulator, float] = {

@@ -6,10 +6,15 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 
 from vla_eval import __version__
+from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.core import FloatArray
 from vla_eval.data.dataset_folder import digest_file, digest_files
 from vla_eval.data.exact_statistics import count_levels, empty_histogram
-from vla_eval.data.features import (
+from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
+from vla_eval.data.layouts import CONTROL_MODES, EE_DELTA, Source, SourceEpisode
+from vla_eval.data.shard_writer import MIN_FRAMES, new_dataset, write_exact_statistics
+from vla_eval.errors import DatasetError
+from vla_eval.features import (
     ACTION_KEY,
     CAMERA_KEYS,
     DONE_KEY,
@@ -22,11 +27,6 @@ from vla_eval.data.features import (
     dataset_features,
     proprioception,
 )
-from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.layouts import CONTROL_MODES, EE_DELTA, Source, SourceEpisode
-from vla_eval.data.shard_writer import MIN_FRAMES, new_dataset, write_exact_statistics
-from vla_eval.errors import DatasetError
-from vla_eval.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.tasks.catalog import task_spec
 
 SOURCE_PROPRIO_KEY = "proprio.xyz_rpy"

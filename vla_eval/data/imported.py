@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vla_eval.config.decoding import decode
 from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest
-from vla_eval.decoding import decode
 from vla_eval.errors import DatasetError, RecipeError
-from vla_eval.results.durable import replace_file
+from vla_eval.storage.durable import replace_file
 
 IMPORT_FILE = MIKASA_FOLDER / "import.json"
 FORMAT_VERSION = 1

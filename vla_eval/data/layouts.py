@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray, ImageArray
-from vla_eval.data.features import IMAGE_SHAPE
 from vla_eval.errors import DatasetError, did_you_mean
+from vla_eval.features import IMAGE_SHAPE
 
 Layout = Literal["npz_joints", "npz_proprio", "lerobot_mikasa", "lerobot_official"]
 

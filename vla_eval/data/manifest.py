@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from vla_eval.config.decoding import decode
 from vla_eval.core import FloatArray
-from vla_eval.decoding import decode
 from vla_eval.errors import DatasetError, RecipeError
-from vla_eval.results.durable import replace_file
+from vla_eval.storage.durable import replace_file
 
 FORMAT_VERSION = 1
 """Of the files below. Raise it when a field changes its meaning; readers refuse versions they do not know."""

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from vla_eval.cache import cache_dir
 from vla_eval.core import ImageArray
 from vla_eval.data.frame_cache import EpisodeRows, FrameSource, frames_in_memory, frames_on_disk
 from vla_eval.errors import DatasetError, check_names
+from vla_eval.storage.cache import cache_dir
 
 Storage = Literal["disk", "memory"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence

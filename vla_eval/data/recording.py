@@ -14,10 +14,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, Protocol
 
+from vla_eval.config.dataset import DatasetRecipe, content_of, fingerprint, options_of
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
-from vla_eval.data.recipe import DatasetRecipe, content_of, fingerprint, options_of
 from vla_eval.data.recording_folder import RecordingFolder
 from vla_eval.data.recording_jobs import (
     AttemptJob,
@@ -31,14 +31,14 @@ from vla_eval.data.recording_jobs import (
 )
 from vla_eval.data.recording_plan import RecordingPlan, plan_recording
 from vla_eval.data.seed_queue import SeedQueue, Selection
-from vla_eval.episode_worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
 from vla_eval.errors import RecordingError
-from vla_eval.evaluate import as_exception, available_cores
-from vla_eval.provenance import collect_environment
-from vla_eval.results.run_file import RunDescription
-from vla_eval.worker_messages import send_message
-from vla_eval.worker_start import simulator_modules
-from vla_eval.workers import WorkerPool
+from vla_eval.evaluation.evaluate import as_exception, available_cores
+from vla_eval.evaluation.worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
+from vla_eval.storage.provenance import collect_environment
+from vla_eval.storage.run_file import RunDescription
+from vla_eval.workers.framing import send_message
+from vla_eval.workers.pool import WorkerPool
+from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording_worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident

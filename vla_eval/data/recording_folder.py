@@ -20,13 +20,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from vla_eval.config.decoding import decode
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RECORDING_FILE
-from vla_eval.decoding import decode
 from vla_eval.errors import DatasetError, RecipeError, RunFolderError
-from vla_eval.results.durable import FolderLock, LineFile, storage_full, sync_folder
-from vla_eval.results.episodes_file import cut_tail
-from vla_eval.results.run_file import (
+from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
+from vla_eval.storage.episodes_file import cut_tail
+from vla_eval.storage.run_file import (
     DEVICE,
     JsonValue,
     RunDescription,
@@ -35,7 +35,7 @@ from vla_eval.results.run_file import (
     environment_changed,
     find_changes,
 )
-from vla_eval.results.store import DISK_TROUBLE
+from vla_eval.storage.run_folder import DISK_TROUBLE
 
 logger = logging.getLogger(__name__)
 

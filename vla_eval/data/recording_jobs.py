@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import SLOT, Attempt
 from vla_eval.data.manifest import DatasetFacts, FailedSeed
-from vla_eval.data.recipe import DatasetRecipe
-from vla_eval.plan import Group
+from vla_eval.evaluation.plan import Group
 
 
 class SetupKey(NamedTuple):

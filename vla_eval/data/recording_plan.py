@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.prompts import load_prompts, sentences_of
+from vla_eval.config.recipes import PolicyRecipe, Recipe, load_recipe
 from vla_eval.data.demonstrations import ONE_BY_ONE
-from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.recording_jobs import TaskPlan
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.plan import Group, GroupKey
+from vla_eval.evaluation.plan import Group, GroupKey
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes
-from vla_eval.prompts import load_prompts, sentences_of
-from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe
-from vla_eval.registry import check_adapter
+from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments

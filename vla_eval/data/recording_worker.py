@@ -1,6 +1,6 @@
 """The inside of a worker that records: tries seeds, renders and encodes shards, puts datasets together.
 
-It is told what to do over a pipe, as `vla_eval.episode_worker` is, and keeps the environment between
+It is told what to do over a pipe, as `vla_eval.evaluation.worker` is, and keeps the environment between
 jobs of one kind. Only whole shards and whole datasets appear on the disk.
 """
 
@@ -10,6 +10,8 @@ import logging
 import shutil
 from collections.abc import Callable, Sequence
 
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import FloatArray, Policy, SimEnv
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.demonstrations import (
@@ -21,7 +23,6 @@ from vla_eval.data.demonstrations import (
     images_digests,
     replay_attempt,
 )
-from vla_eval.data.features import CAMERA_KEYS, frame_values
 from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
@@ -32,7 +33,6 @@ from vla_eval.data.manifest import (
     write_entry,
     write_lines,
 )
-from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.recording_jobs import (
     AttemptJob,
     DatasetWritten,
@@ -52,8 +52,8 @@ from vla_eval.data.shard_writer import (
     remove_drafts,
 )
 from vla_eval.envs.factory import describe_device, make_env
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.episode_worker import (
+from vla_eval.errors import VlaEvalError
+from vla_eval.evaluation.worker import (
     DeviceFound,
     EnvFacts,
     Failed,
@@ -61,9 +61,9 @@ from vla_eval.episode_worker import (
     describe_error,
     make_policy,
 )
-from vla_eval.errors import VlaEvalError
-from vla_eval.results.durable import storage_full
-from vla_eval.results.store import DISK_TROUBLE
+from vla_eval.features import CAMERA_KEYS, frame_values
+from vla_eval.storage.durable import storage_full
+from vla_eval.storage.run_folder import DISK_TROUBLE
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.decoding import decode
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.recipes import TimeoutConfig
 from vla_eval.data.episode_check import STATE_TOLERANCE
-from vla_eval.data.features import CAMERA_KEYS
 from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import (
     RECORDING_FILE,
@@ -24,19 +27,16 @@ from vla_eval.data.manifest import (
     read_facts,
     read_manifest,
 )
-from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.data.replay_report import keep_report, manifest_sha256
-from vla_eval.decoding import decode
-from vla_eval.envs.settings import EnvSettings
-from vla_eval.episode_worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
-from vla_eval.evaluate import as_exception, available_cores
-from vla_eval.provenance import collect_environment
-from vla_eval.recipes import TimeoutConfig
+from vla_eval.evaluation.evaluate import as_exception, available_cores
+from vla_eval.evaluation.worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
+from vla_eval.features import CAMERA_KEYS
+from vla_eval.storage.provenance import collect_environment
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.worker_messages import send_message
-from vla_eval.worker_start import simulator_modules
-from vla_eval.workers import Answered, WorkerPool
+from vla_eval.workers.framing import send_message
+from vla_eval.workers.pool import Answered, WorkerPool
+from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.replay_worker"
 MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver")

@@ -7,8 +7,8 @@ it are known to succeed or are being tried, so that none is left out and few are
 from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
 
+from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.recipe import DatasetRecipe
 from vla_eval.errors import RecordingError
 
 

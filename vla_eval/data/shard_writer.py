@@ -21,12 +21,12 @@ from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
-from vla_eval.data.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, from_json, write_lines
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import DatasetError
-from vla_eval.results.durable import sync_folder
+from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
+from vla_eval.storage.durable import sync_folder
 
 ROBOT_TYPE = "panda_wristcam"
 SHARD_EPISODES = MIKASA_FOLDER / "manifest.jsonl"

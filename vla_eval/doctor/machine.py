@@ -7,7 +7,7 @@ from ctypes.util import find_library
 from pathlib import Path
 
 from vla_eval.doctor.findings import SET_UP, Finding, Probe, ProbeFailure
-from vla_eval.provenance import mesa_version, nvidia_driver_version
+from vla_eval.storage.provenance import mesa_version, nvidia_driver_version
 
 MINIMAL_MESA = "24.3"  # older ones lack features that SAPIEN asks for: ErrorFeatureNotPresent
 ICD_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")

@@ -7,7 +7,7 @@ from packaging.requirements import Requirement
 from packaging.version import InvalidVersion, Version
 
 from vla_eval.doctor.findings import SET_UP, Finding, Probe, ProbeFailure
-from vla_eval.provenance import PACKAGE_FOLDER, package_version
+from vla_eval.storage.provenance import PACKAGE_FOLDER, package_version
 
 DISTRIBUTION = "mikasa-vla-eval"
 MINIMAL_PYTHON, NEWEST_PYTHON = (3, 12), (3, 13)  # as in pyproject.toml

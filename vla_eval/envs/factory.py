@@ -7,8 +7,8 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import cast
 
+from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import SimEnv
-from vla_eval.envs.settings import EnvSettings, RenderSettings
 from vla_eval.errors import MissingDependencyError, unknown_name
 
 __all__ = ["EnvSettings", "RenderSettings", "describe_device", "make_env"]

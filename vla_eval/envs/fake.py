@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
-from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus

@@ -14,8 +14,8 @@ import numpy as np
 import sapien
 import torch
 
+from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
-from vla_eval.envs.settings import HUMAN_CAMERA, EnvSettings
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus

@@ -16,8 +16,12 @@ from lerobot.envs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from numpy.typing import NDArray
 
+from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.prompts import instruction_for
 from vla_eval.core import SimEnv, StepResult
-from vla_eval.data.features import (
+from vla_eval.envs.factory import make_env
+from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
+from vla_eval.features import (
     ACTION_KEY,
     ACTION_NAMES,
     CAMERA_KEYS,
@@ -28,10 +32,6 @@ from vla_eval.data.features import (
     StateKind,
     proprioception,
 )
-from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings, RenderSettings
-from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
-from vla_eval.prompts import instruction_for
 from vla_eval.tasks.catalog import task_spec
 
 SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments

@@ -14,8 +14,8 @@ from vla_eval import __version__
 from vla_eval.errors import ReportError
 from vla_eval.page import choice_sections, machine_sections, rates
 from vla_eval.page.material import Material, gather
-from vla_eval.results.store import StoredRun
 from vla_eval.results.table_formats import render
+from vla_eval.storage.run_folder import StoredRun
 
 PAGE_FILE = "index.html"
 TEMPLATE = "page.html.j2"

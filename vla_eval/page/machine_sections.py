@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from vla_eval.page.material import Material, errors_of
 from vla_eval.page.tables import UNKNOWN, PageTable, page_table
-from vla_eval.results.recording_files import thumbnail_file, video_file
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.run_file import leaves
-from vla_eval.results.store import StoredRun
-from vla_eval.results.timings import measure_latency
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.recording_files import thumbnail_file, video_file
+from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_folder import StoredRun
+from vla_eval.storage.timings import measure_latency
 from vla_eval.tasks.item_names import item_names
 
 MAX_SHOWN_VIDEOS = 12

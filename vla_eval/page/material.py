@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.results.comparison import compare_with_baseline, count_pairs
 from vla_eval.results.estimates import PairCounts
 from vla_eval.results.grouping import Grouping, RowGroup, RowKey, group_runs
-from vla_eval.results.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.results.report import build_table
-from vla_eval.results.store import StoredRun
 from vla_eval.results.table import Row, Table
-from vla_eval.results.timings import read_timings
+from vla_eval.storage.run_folder import StoredRun
+from vla_eval.storage.timings import read_timings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

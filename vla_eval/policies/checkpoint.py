@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.decoding import decode
+from vla_eval.config.decoding import decode
+from vla_eval.config.shipped import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.policies.checkpoint_json import get_text
 from vla_eval.policies.checkpoint_json import read_json as read_json  # where most look for it
-from vla_eval.shipped import search_folders
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from vla_eval.policies.chunking import ChunkingSpec
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.specs import EnvSpec
 
 

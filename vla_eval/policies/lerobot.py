@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
-from vla_eval.data.features import StateKind
 from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
+from vla_eval.features import StateKind
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot_inputs import (
@@ -43,8 +43,8 @@ from vla_eval.policies.lerobot_inputs import (
 )
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
+from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
-from vla_eval.tasks.streams import Stream, generator
 
 N_SEED_BITS = 63
 

@@ -1,6 +1,6 @@
 """Which camera and which proprioception go where, checked against what the policy saw in training.
 
-The names are those of the recorder (`vla_eval.data.features`): the same function computes a training
+The names are those of the recorder (`vla_eval.features`): the same function computes a training
 frame's state and a test frame's. Everything that does not fit is an error before the first episode.
 """
 
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from vla_eval.core import Observation
-from vla_eval.data.features import CAMERA_KEYS, STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.errors import SpecMismatchError, did_you_mean
+from vla_eval.features import CAMERA_KEYS, STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.policies.checkpoint import TrainingFacts
 from vla_eval.specs import EnvSpec
 

@@ -12,10 +12,10 @@ from vla_eval.core import EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.policies.context import PolicyContext
+from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.streams import Stream, generator
 
 
 def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArray[np.float32]:

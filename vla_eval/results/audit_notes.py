@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from vla_eval.audited import Protocol, Verdict, protocol_of, shipped_verdicts
-from vla_eval.results.store import StoredRun
+from vla_eval.results.shipped_audit import Protocol, Verdict, protocol_of, shipped_verdicts
+from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
 RULES: Mapping[Protocol, str] = {"paper": "the paper's rule", "strict": "the strict rule"}

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import p_above
 from vla_eval.results.grouping import RowGroup
-from vla_eval.results.records import EpisodeRecord
 
 Cause = Literal["right", "not_finished", "forgot", "position_habit", "never_chose", "could_not_move"]
 CAUSES: tuple[Cause, ...] = (

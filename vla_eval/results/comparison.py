@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import (
     Interval,
     PairCounts,
@@ -14,7 +15,6 @@ from vla_eval.results.estimates import (
     wilson_interval,
 )
 from vla_eval.results.grouping import RowGroup, RowKey, Run
-from vla_eval.results.records import EpisodeRecord
 from vla_eval.results.table import ChanceSource, IntervalKind
 from vla_eval.tasks.catalog import find_task
 

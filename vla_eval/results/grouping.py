@@ -11,9 +11,9 @@ from itertools import chain
 from pathlib import PurePath
 from typing import NamedTuple
 
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.run_file import leaves
-from vla_eval.results.store import StoredRun
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_folder import StoredRun
 
 VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", "simulator", "sim_backend")
 """Fields of a configuration that move success rates and are no part of an episode's key."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
 from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
-from vla_eval.results.run_file import leaves
-from vla_eval.results.store import StoredRun
 from vla_eval.results.table import Row
+from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
 MAX_NAMED = 6

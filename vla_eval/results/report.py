@@ -19,9 +19,9 @@ from vla_eval.results.comparison import (
 )
 from vla_eval.results.estimates import chance_corrected
 from vla_eval.results.grouping import RowGroup, RowKey, group_runs
-from vla_eval.results.store import StoredRun
 from vla_eval.results.table import Row, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
+from vla_eval.storage.run_folder import StoredRun
 
 __all__ = ["DEFAULT_BASELINE", "FORMATS", "Format", "Row", "Table", "build_table", "render"]
 

@@ -13,7 +13,7 @@ from vla_eval.results.cue import CueFrames, cue_frames
 from vla_eval.results.estimates import PairCounts, PairedTest, holm, mcnemar_exact
 from vla_eval.results.grouping import RowGroup, RowKey, group_runs, variant_labels
 from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
-from vla_eval.results.store import StoredRun
+from vla_eval.storage.run_folder import StoredRun
 
 By = Literal["n_action_steps", "policy"]
 BY: tuple[By, ...] = ("n_action_steps", "policy")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vla_eval.bounds import MAX_STEPS
-from vla_eval.decoding import check_value
+from vla_eval.config.decoding import check_value
 from vla_eval.errors import RecipeError, TaskArgumentError
 from vla_eval.tasks.spec import TaskSpec
 

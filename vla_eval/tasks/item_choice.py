@@ -10,10 +10,10 @@ import sapien
 import torch
 
 from vla_eval.errors import TaskArgumentError
+from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.items import Item, build_item
 from vla_eval.tasks.layout import Plane, jittered, slot_centres_m
-from vla_eval.tasks.streams import Stream
 
 UPRIGHT_WXYZ = (1.0, 0.0, 0.0, 0.0)
 

@@ -23,11 +23,11 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.errors import TaskArgumentError, unknown_name
+from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import Phase
 from vla_eval.tasks.arms import ARMS, CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.bodies import Body, yaw_rad
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
-from vla_eval.tasks.streams import Stream, generator
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 """Index of a phase in tensors -> its name."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
-from vla_eval.prompts import instruction_for
+from vla_eval.config.prompts import instruction_for
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.tasks.spec import TaskSpec
 

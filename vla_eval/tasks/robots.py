@@ -17,8 +17,8 @@ from mani_skill import PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 
-from vla_eval.cache import cache_dir
 from vla_eval.core import FloatArray
+from vla_eval.storage.cache import cache_dir
 
 GRID_M = 0.0015  # finer than a pixel of the base camera at the arm, about 8 mm
 _PANDA_DIR = Path(PACKAGE_ASSET_DIR) / "robots" / "panda"

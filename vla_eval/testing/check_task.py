@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings, Simulator
+from vla_eval.config.prompts import instruction_for
 from vla_eval.core import EpisodeStart, SimEnv
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.settings import EnvSettings, Simulator
 from vla_eval.policies import scripted
-from vla_eval.policies.chunking import ChunkingSpec
 from vla_eval.policies.context import PolicyContext
-from vla_eval.prompts import instruction_for
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_env import check_env

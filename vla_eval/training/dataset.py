@@ -8,12 +8,12 @@ from typing import Any  # lerobot is untyped
 
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.dataset_folder import open_recorded
-from vla_eval.data.features import CAMERA_KEYS
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import FileDigest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError
+from vla_eval.features import CAMERA_KEYS
 
 RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # what our recordings' actions are for
 

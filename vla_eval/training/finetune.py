@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.config.recipes import to_data
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
-from vla_eval.provenance import collect_environment
-from vla_eval.recipes import to_data
-from vla_eval.results.durable import FolderLock
+from vla_eval.storage.durable import FolderLock
+from vla_eval.storage.provenance import collect_environment
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut
@@ -18,7 +19,6 @@ from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
-from vla_eval.training.recipe import FinetuneConfig
 from vla_eval.training.run_folder import METRICS_FILE, open_folder, read_metrics
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 

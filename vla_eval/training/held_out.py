@@ -11,17 +11,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_eval.config.dataset import EVALUATION_SEEDS
+from vla_eval.config.finetuning import FinetuneRecipe, HeldOutEvaluation
+from vla_eval.config.recipes import EvalConfig, to_data
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
-from vla_eval.data.recipe import EVALUATION_SEEDS
 from vla_eval.errors import RecipeError
-from vla_eval.evaluate import evaluate
+from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.policies.checkpoint import MODEL_FOLDER
-from vla_eval.recipes import EvalConfig, to_data
 from vla_eval.results.estimates import wilson_interval
-from vla_eval.results.store import read_run
+from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.dataset import TrainingDataset
-from vla_eval.training.recipe import FinetuneRecipe, HeldOutEvaluation
 from vla_eval.training.run_folder import whole_checkpoints
 
 EVALUATIONS_FOLDER = "evaluations"

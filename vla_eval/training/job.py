@@ -11,18 +11,18 @@ from typing import Any  # lerobot is untyped
 from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from vla_eval.data.features import CAMERA_KEYS
+from vla_eval.config.decoding import decode
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation, merge_fields
+from vla_eval.config.recipes import PolicyRecipe, Recipe, load_recipe, to_data
 from vla_eval.data.opening import video_decoder
-from vla_eval.decoding import decode
 from vla_eval.errors import RecipeError
+from vla_eval.features import CAMERA_KEYS
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
 from vla_eval.policies.lerobot import choose_device
-from vla_eval.recipes import PolicyRecipe, Recipe, load_recipe, to_data
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.held_out import check_held_out
 from vla_eval.training.lora import check_lora_is_told, peft_config
 from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
-from vla_eval.training.recipe import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation, merge_fields
 from vla_eval.training.run_folder import TRAIN_FOLDER
 
 

@@ -13,7 +13,7 @@ import torch
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import (
     RecipeError,
@@ -22,11 +22,11 @@ from vla_eval.errors import (
     check_names,
     did_you_mean,
 )
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.config_check import check_config
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.training.dataset import TrainingDataset
-from vla_eval.training.recipe import FinetuneRecipe
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.errors import TrainingError
-from vla_eval.results.durable import replace_file
-from vla_eval.results.run_file import JsonValue, find_changes
+from vla_eval.storage.durable import replace_file
+from vla_eval.storage.run_file import JsonValue, find_changes
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"

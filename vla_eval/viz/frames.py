@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from vla_eval.config.environment import HUMAN_CAMERA
 from vla_eval.core import ImageArray
-from vla_eval.envs.settings import HUMAN_CAMERA
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.task_state import Phase
 from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.tape import EpisodeTape, TapedStep

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.errors import ViewingError, unknown_name
-from vla_eval.results.recording_files import rrd_file
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.results.store import StoredRun
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.recording_files import rrd_file
+from vla_eval.storage.run_folder import StoredRun
 
 MOST_OPENED = 5  # recordings that the viewer is given at once, unless it is told which
 

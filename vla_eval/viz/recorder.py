@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vla_eval.config.capture import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.core import Stage
-from vla_eval.plan import EpisodeJob
-from vla_eval.results.recording_files import rrd_file, thumbnail_file, video_file
-from vla_eval.results.records import EpisodeRecord
-from vla_eval.viz.settings import RecordingConfig, is_wanted, may_be_wanted
+from vla_eval.evaluation.plan import EpisodeJob
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.recording_files import rrd_file, thumbnail_file, video_file
 from vla_eval.viz.tape import Tapes
 
 VIDEO_WRITER = "vla_eval.viz.video:write_video"

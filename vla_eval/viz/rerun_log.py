@@ -19,8 +19,8 @@ import numpy as np
 import rerun as rr
 
 from vla_eval.core import FloatArray
-from vla_eval.results.recording_files import recording_stem
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.recording_files import recording_stem
 from vla_eval.task_state import Phase
 from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.arm_figure import ROBOT_BASE_M, arm_points_m

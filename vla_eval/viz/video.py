@@ -8,7 +8,7 @@ import av
 from PIL import Image
 
 from vla_eval.errors import ViewingError
-from vla_eval.results.records import EpisodeRecord
+from vla_eval.records import EpisodeRecord
 from vla_eval.viz.frames import compose
 from vla_eval.viz.tape import EpisodeTape
 

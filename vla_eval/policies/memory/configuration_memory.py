@@ -6,8 +6,8 @@ from typing import Any, ClassVar  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from vla_eval.data.features import CAMERA_KEYS
 from vla_eval.errors import check_names
+from vla_eval.features import CAMERA_KEYS
 from vla_eval.policies.memory.sizes import SPOTS, STATE
 
 TYPE = "mikasa_memory"

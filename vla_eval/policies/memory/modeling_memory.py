@@ -7,7 +7,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.policies.memory.goal_layer import by_camera
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from vla_eval.data.features import STATE_NAMES
+from vla_eval.features import STATE_NAMES
 
 STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
 POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1

@@ -6,8 +6,8 @@ from typing import Any, Literal  # lerobot is untyped
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from vla_eval.data.features import ACTION_KEY
 from vla_eval.errors import check_names
+from vla_eval.features import ACTION_KEY
 from vla_eval.policies.octo.diffusion_head import HeadSizes
 from vla_eval.policies.octo.language import T5Sizes
 from vla_eval.policies.octo.transformer import PATCH_PX, TransformerSizes

@@ -6,8 +6,8 @@ from typing import Any, Literal  # lerobot is untyped
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.errors import CheckpointError
+from vla_eval.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.policies.conversion import check_free, folder_when_whole, stated_gripper
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import make_empty_policy

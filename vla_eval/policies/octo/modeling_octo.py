@@ -12,8 +12,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.errors import SpecMismatchError
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.policies.octo.configuration_octo import TRAINED, TYPE, MikasaOctoConfig
 from vla_eval.policies.octo.diffusion_head import Targets, draw
 from vla_eval.policies.octo.flax_names import is_kernel

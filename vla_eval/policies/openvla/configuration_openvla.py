@@ -8,8 +8,8 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vla_eval.data.features import ACTION_KEY, STATE_KEY
 from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.features import ACTION_KEY, STATE_KEY
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, network_sizes
 from vla_eval.policies.steps.gripper import Gripper

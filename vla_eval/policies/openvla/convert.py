@@ -16,8 +16,8 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
 from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
 from vla_eval.policies.checkpoint_json import get_mapping, wrong_type
 from vla_eval.policies.conversion import (

@@ -6,8 +6,8 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.errors import SpecMismatchError
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
 from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
 from vla_eval.policies.openvla.lora import FULL_MODULES

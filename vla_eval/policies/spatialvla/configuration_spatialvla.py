@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vla_eval.data.features import ACTION_KEY, CAMERA_KEYS
 from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS
 from vla_eval.policies.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,

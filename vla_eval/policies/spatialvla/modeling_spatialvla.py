@@ -6,8 +6,8 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.errors import SpecMismatchError
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.policies.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
 from vla_eval.policies.spatialvla.generation import generated_actions, token_loss

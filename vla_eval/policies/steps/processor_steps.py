@@ -15,9 +15,9 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
-from vla_eval.data.features import ACTION_KEY
-from vla_eval.decoding import decode
+from vla_eval.config.decoding import decode
 from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.features import ACTION_KEY
 from vla_eval.policies.steps.gripper import Gripper
 from vla_eval.policies.steps.normalization import Normalization, Normalizer
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS

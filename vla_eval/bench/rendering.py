@@ -1,0 +1,144 @@
+"""How much faster an episode runs when frames that nobody looks at are not rendered.
+
+Every figure comes from one run: the same episode, the same actions, rendered eagerly and lazily in turn
+in one process, so that the ratio does not depend on how fast the machine is today.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, SimEnv
+from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.errors import ConformanceError
+from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.seeding import Stream, generator
+from vla_eval.specs import PolicySpec
+
+CAMERAS = ("base_camera", "hand_camera")
+
+
+class _Looker:
+    """A policy that looks at both cameras and acts at random: all cost is the environment's."""
+
+    def __init__(self, chunk_size: int, cameras: tuple[str, ...]) -> None:
+        self.spec = PolicySpec(name="looker", reads="last", cameras=cameras, states=(), chunk_size=chunk_size)
+        self._rng = np.random.default_rng(0)
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        self._rng = generator(episodes[0].seed, Stream.POLICY)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        drawn = self._rng.uniform(-1, 1, (self.spec.chunk_size, 7))
+        return ActionChunk(actions=drawn.astype(np.float32))
+
+
+class Cost(NamedTuple):
+    """Seconds of an episode, wall clock and processor, and the digest of what happened in it."""
+
+    wall_seconds: float
+    cpu_seconds: float
+    digest: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BenchRow:
+    """Eager against lazy rendering at one chunk length; milliseconds are per control step."""
+
+    n_action_steps: int
+    n_steps: int
+    eager_ms: float
+    lazy_ms: float
+    eager_cpu_ms: float
+    lazy_cpu_ms: float
+
+    @property
+    def speed_up(self) -> float:
+        """Eager wall-clock time over lazy."""
+        return self.eager_ms / self.lazy_ms
+
+    @property
+    def cpu_speed_up(self) -> float:
+        """Eager processor time over lazy."""
+        return self.eager_cpu_ms / self.lazy_cpu_ms
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BenchReport:
+    """What one run measured."""
+
+    task: str
+    device: str
+    wrist_mesh: str
+    physics_ms: float
+    rows: tuple[BenchRow, ...]
+
+
+def run_bench(
+    task: str, *, chunk_lengths: Sequence[int], repeats: int, wrist_mesh: RenderSettings
+) -> BenchReport:
+    """Measure; the lowest of `repeats` times counts, so that a disturbed repeat does not.
+
+    Raises:
+        ConformanceError: the lazy episode was not the eager one.
+    """
+    env = make_env(EnvSettings(task=task, cameras=CAMERAS, render=wrist_mesh))
+    blind = make_env(EnvSettings(task=task))
+    try:
+        _episode(env, 1, CAMERAS, eager=True)  # starts the renderer and compiles its shaders
+        _episode(blind, 1, (), eager=False)
+        rows = tuple(_row(env, k, repeats) for k in chunk_lengths)
+        physics = min(_episode(blind, 1, (), eager=False).wall_seconds for _ in range(repeats))
+        device = dict(describe_device(env) or {})
+        return BenchReport(
+            task=task,
+            device=device.get("render_device", "unknown"),
+            wrist_mesh=wrist_mesh.wrist_mesh,
+            physics_ms=1000 * physics / env.spec.horizon_steps,
+            rows=rows,
+        )
+    finally:
+        env.close()
+        blind.close()
+
+
+def _row(env: SimEnv, n_action_steps: int, repeats: int) -> BenchRow:
+    eager, lazy = [], []
+    for _ in range(repeats):
+        eager.append(_episode(env, n_action_steps, CAMERAS, eager=True))
+        lazy.append(_episode(env, n_action_steps, CAMERAS, eager=False))
+    if len({cost.digest for cost in (*eager, *lazy)}) != 1:
+        raise ConformanceError(
+            f"{env.spec.task}, n_action_steps={n_action_steps}: lazy and eager rendering gave different "
+            "episodes, expected bit-equal ones. Please report this with the output of `mikasa-vla doctor`."
+        )
+    per_step = 1000 / env.spec.horizon_steps
+    return BenchRow(
+        n_action_steps=n_action_steps,
+        n_steps=env.spec.horizon_steps,
+        eager_ms=per_step * min(cost.wall_seconds for cost in eager),
+        lazy_ms=per_step * min(cost.wall_seconds for cost in lazy),
+        eager_cpu_ms=per_step * min(cost.cpu_seconds for cost in eager),
+        lazy_cpu_ms=per_step * min(cost.cpu_seconds for cost in lazy),
+    )
+
+
+def _episode(env: SimEnv, n_action_steps: int, cameras: tuple[str, ...], *, eager: bool) -> Cost:
+    chunking = ChunkingSpec(n_action_steps=n_action_steps)
+    start = EpisodeStart(
+        slot=0,
+        task=env.spec.task,
+        seed=1,
+        run=0,
+        instruction="look and move",
+        horizon_steps=env.spec.horizon_steps,
+    )
+    settings = RolloutSettings(chunking=chunking, eager_rendering=eager)
+    wall, cpu = time.perf_counter(), time.process_time()
+    (record,) = rollout(env, _Looker(n_action_steps, cameras), [start], settings)
+    return Cost(time.perf_counter() - wall, time.process_time() - cpu, record.trajectory_sha256)

@@ -1,0 +1,103 @@
+"""`datasets/*.yaml`: which demonstrations, how recorded, how many. Knows nothing of lerobot or simulators."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
+from vla_eval.config.environment import RenderSettings, Simulator
+from vla_eval.config.recipes import TimeoutConfig, check_run_name, to_data
+from vla_eval.errors import RecipeError
+from vla_eval.features import EncoderSettings, StateKind
+
+MAX_ACTION_NOISE = 10.0  # actions lie between -1 and 1: more is all noise
+EVALUATION_SEEDS = range(1, 101)
+"""The default evaluation's seeds. No demonstration may show them: the policy would be tested on them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetRecipe:
+    """Demonstrations of one or more tasks. `docs/datasets.md` has the table of all fields.
+
+    Raises:
+        RecipeError: a value out of its range, something named twice, or seeds that evaluation uses.
+    """
+
+    name: str
+    tasks: tuple[str, ...]
+    description: str = ""
+    episodes: int = 250
+    seed_start: int = 1000
+    expert: str = "oracle"
+    prompt_set: str = "paper"
+    state: StateKind = "eef"
+    keep: Literal["successes", "all"] = "successes"
+    cut: Literal["after_success", "horizon"] = "after_success"
+    steps_after_success: int = 5
+    action_noise: float = 0.0
+    stored_action: Literal["executed", "intended"] = "executed"
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    render: RenderSettings = field(default_factory=RenderSettings)
+    simulator: Simulator = "maniskill"
+    encoder: EncoderSettings = field(default_factory=EncoderSettings)
+    episodes_per_shard: int = 10
+    max_failed_seeds: int = 250
+    workers: int | Literal["auto"] = "auto"
+    timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        check_run_name(self.name)
+        if not self.tasks or len(set(self.tasks)) != len(self.tasks):
+            raise RecipeError(f"tasks is {list(self.tasks)}, expected at least one, none of them twice.")
+        check_bounds(
+            self,
+            {
+                "episodes": (1, MAX_EPISODES),
+                "episodes_per_shard": (1, MAX_EPISODES),
+                "steps_after_success": (0, MAX_STEPS),
+                "action_noise": (0, MAX_ACTION_NOISE),
+                "max_failed_seeds": (0, MAX_EPISODES),
+                "workers": (1, MAX_PROCESSES),
+            },
+        )
+        check_seeds(self.seed_start, self.episodes + self.max_failed_seeds)
+        self._refuse_evaluation_seeds()
+
+    @property
+    def last_seed(self) -> int:
+        """The highest seed that may be tried before the recording gives up."""
+        return self.seed_start + self.episodes + self.max_failed_seeds - 1
+
+    def _refuse_evaluation_seeds(self) -> None:
+        first, last = EVALUATION_SEEDS[0], EVALUATION_SEEDS[-1]
+        if self.seed_start <= last and self.last_seed >= first:
+            raise RecipeError(
+                f"seed_start is {self.seed_start}: with {self.episodes} episodes and up to "
+                f"{self.max_failed_seeds} failed seeds, demonstrations would use seeds {self.seed_start} to "
+                f"{self.last_seed}, which overlap the evaluation's seeds {first} to {last}. A policy must "
+                f"not be tested on what it was shown: use a seed_start above {last}, such as 1000."
+            )
+
+
+OPTION_FIELDS = ("name", "description", "workers", "timeouts")
+"""Fields of `DatasetRecipe` that content does not depend on: they may differ when a recording goes on."""
+
+
+def content_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a recipe that the dataset's content depends on."""
+    data: dict[str, Any] = to_data(recipe)
+    return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
+
+
+def options_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a recipe that the dataset's content does not depend on."""
+    data: dict[str, Any] = to_data(recipe)
+    return {name: data[name] for name in OPTION_FIELDS}
+
+
+def fingerprint(recipe: DatasetRecipe) -> str:
+    """Return the sha256 of the part of a recipe that the dataset's content depends on."""
+    text = json.dumps(content_of(recipe), sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,202 @@
+"""How a policy is fine-tuned: the `finetune` section of `policies/*.yaml`, and one fine-tuning.
+
+Standard library only: `mikasa-vla list` reads recipes without waiting for torch.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from vla_eval.bounds import (
+    MAX_BATCH,
+    MAX_EPISODES,
+    MAX_PROCESSES,
+    MAX_SLOTS,
+    MAX_STEPS,
+    MAX_TRAINING_STEPS,
+    check_bounds,
+    check_seeds,
+)
+from vla_eval.config.environment import Simulator
+from vla_eval.errors import RecipeError
+
+MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoraRecipe:
+    """Train low-rank adapters instead of all weights.
+
+    Attributes:
+        rank: of the adapters.
+        alpha: scaling is alpha / rank; None: alpha = rank (peft would take 8, whatever the rank).
+        target_modules: regular expression of the modules that get one; None: lerobot's choice, which for
+            π0 and π0.5 is the action expert's attention and the projections, not the language model.
+            `all-linear` is refused: it would take heads and embeddings, too.
+        full_modules: last names of modules that are trained in full beside the adapters.
+    """
+
+    rank: int = 16
+    alpha: int | None = None
+    target_modules: str | None = None
+    full_modules: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the ranges, and refuse what names no modules."""
+        check_bounds(self, {"rank": (1, MAX_RANK), "alpha": (1, MAX_RANK)}, prefix="finetune.lora.")
+        if self.target_modules == "all-linear":
+            raise RecipeError(
+                "finetune.lora.target_modules is 'all-linear', which takes heads and embeddings of a policy, "
+                "too. Write a regular expression of the modules' names."
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneRecipe:
+    """How to fine-tune one type of policy.
+
+    Attributes:
+        type: lerobot's name of the policy: `act`, `diffusion`, `smolvla`, `pi0`, `pi05`, `pi0_fast`, or
+            that of a plugin.
+        policy: fields of lerobot's configuration of that type, among them optimizer and schedule.
+        base_checkpoint: folder with the weights to start from; None: from scratch.
+        tokenizer: folder of the tokenizer; None: the one that the policy names, from the local cache.
+        rename_cameras: field of the dataset -> field of the base checkpoint.
+        lora: train adapters only.
+        steps: gradient steps.
+        batch_size: samples per step and process.
+        micro_batch_size: how many of them go through the network at once; None: all. Gradients are added up
+            (gradient accumulation), so that the step is the same with less of the device's memory.
+        save_every_steps, log_every_steps: when checkpoints and metrics are written.
+        num_workers: processes that load samples, at most; no more than there are cores.
+        decode_ahead: decode each frame once into the user's cache, instead of once per sample.
+        image_transforms: augmentation, fields of lerobot's `ImageTransformsConfig` (`max_num_transforms`,
+            `random_order`, `tfs`); {}: its own six; None: pictures as they are.
+        imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
+        wandb_project, trackio_project: log there, too.
+    """
+
+    type: str
+    policy: dict[str, Any] = field(default_factory=dict)  # Any: lerobot checks its own fields
+    base_checkpoint: str | None = None
+    tokenizer: str | None = None
+    rename_cameras: dict[str, str] = field(default_factory=dict)
+    lora: LoraRecipe | None = None
+    steps: int = 50_000
+    batch_size: int = 32
+    micro_batch_size: int | None = None
+    save_every_steps: int = 5_000
+    log_every_steps: int = 100
+    num_workers: int = 4
+    decode_ahead: bool = True
+    image_transforms: dict[str, Any] | None = None  # Any: lerobot checks its own fields
+    imagenet_statistics: bool = False
+    wandb_project: str | None = None
+    trackio_project: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        check_bounds(
+            self,
+            {
+                "steps": (1, MAX_TRAINING_STEPS),
+                "batch_size": (1, MAX_BATCH),
+                "save_every_steps": (1, MAX_TRAINING_STEPS),
+                "log_every_steps": (1, MAX_TRAINING_STEPS),
+                "num_workers": (0, MAX_PROCESSES),
+            },
+            prefix="finetune.",
+        )
+        if self.micro_batch_size is not None and not 1 <= self.micro_batch_size <= self.batch_size:
+            raise RecipeError(
+                f"finetune.micro_batch_size is {self.micro_batch_size}, expected a number from 1 to "
+                f"batch_size ({self.batch_size}), or null."
+            )
+        if self.lora is not None and self.base_checkpoint is None:
+            raise RecipeError(
+                "finetune.lora: adapters are trained on top of a base; name its folder with "
+                "finetune.base_checkpoint."
+            )
+        if self.rename_cameras and self.base_checkpoint is None:
+            raise RecipeError(
+                "finetune.rename_cameras is for a base_checkpoint whose cameras have other names; from "
+                "scratch, the dataset's names are used."
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutEvaluation:
+    """Evaluate checkpoints while the training goes on. Moves no weight.
+
+    Attributes:
+        every_steps: a multiple of `save_every_steps`; the last checkpoint is evaluated in any case.
+        episodes, seed_start: on which seeds; none of those that tables or demonstrations are made from.
+        task: task id; None: the dataset's.
+        n_action_steps: actions executed per inference; None: the policy's own number.
+        env: arguments of the task.
+        simulator, slots_per_worker, workers: see `EvalConfig`.
+    """
+
+    every_steps: int
+    episodes: int = 20
+    seed_start: int = 900_000  # far above what recordings reach
+    task: str | None = None
+    n_action_steps: int | None = None
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    simulator: Simulator = "maniskill"
+    slots_per_worker: int = 1
+    workers: int | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_bounds(
+            self,
+            {
+                "every_steps": (1, MAX_TRAINING_STEPS),
+                "episodes": (1, MAX_EPISODES),
+                "n_action_steps": (1, MAX_STEPS),
+                "slots_per_worker": (1, MAX_SLOTS),
+                "workers": (1, MAX_PROCESSES),
+            },
+            prefix="evaluation.",
+        )
+        check_seeds(self.seed_start, self.episodes, name="evaluation.seed_start")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneConfig:
+    """One fine-tuning, as `mikasa-vla finetune CONFIG` reads it.
+
+    Attributes:
+        policy: name of a recipe in `policies/` that has a `finetune` section.
+        dataset: folder of a dataset.
+        out: the run folder; None: `runs/POLICY-DATASET-SEED`.
+        run_seed: of initial weights, order of samples and noise.
+        finetune: fields of the recipe's `finetune` section, set to other values.
+        device: `auto`, `cpu`, `cuda`.
+        evaluation: evaluate checkpoints on held-out seeds meanwhile; None: do not.
+        allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
+    """
+
+    policy: str
+    dataset: str
+    out: str | None = None
+    run_seed: int = 0
+    finetune: dict[str, Any] = field(default_factory=dict)  # Any: decoded as a FinetuneRecipe
+    device: str = "auto"
+    evaluation: HeldOutEvaluation | None = None
+    allow_unreplayed: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the range of the seed."""
+        check_seeds(self.run_seed, name="run_seed")
+
+
+def merge_fields(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+    """Put changes on top, field by field; an empty mapping empties."""
+    merged = dict(base)
+    for name, value in changes.items():
+        inner = merged.get(name)
+        merges = isinstance(inner, dict) and isinstance(value, dict) and value
+        merged[name] = merge_fields(inner, value) if merges and inner else value
+    return merged

@@ -1,0 +1,40 @@
+"""The language instruction of a task, from `prompts/*.yaml`. Knows nothing of simulators or policies."""
+
+from vla_eval.config.recipes import PromptRecipe, Recipe, load_recipe
+from vla_eval.errors import MissingInstructionError, did_you_mean
+from vla_eval.tasks.spec import TaskSpec
+
+DEFAULT_PROMPT_SET = "paper"
+
+
+def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
+    """Return a set of instructions by name or path; errors as `load_recipe`."""
+    return load_recipe("prompts", prompt_set, PromptRecipe)
+
+
+def instructions_for(spec: TaskSpec, prompt_set: str = DEFAULT_PROMPT_SET) -> tuple[str, ...]:
+    """Return the sentence of a task and then its paraphrases; errors as `load_prompts` and `sentences_of`."""
+    return sentences_of(load_prompts(prompt_set), spec)
+
+
+def sentences_of(prompts: Recipe[PromptRecipe], spec: TaskSpec) -> tuple[str, ...]:
+    """Return what a set says for a task: the sentence, then its paraphrases.
+
+    Raises:
+        MissingInstructionError: the set has no sentence for this task, or an empty one.
+    """
+    sentences = prompts.value.instructions.get(spec.instruction_key, ())
+    if not sentences or not all(sentence.strip() for sentence in sentences):
+        known = sorted(prompts.value.instructions)
+        raise MissingInstructionError(
+            f"{prompts.path.name}: {spec.id} needs an instruction under the key '{spec.instruction_key}', "
+            f"which is missing or empty.{did_you_mean(spec.instruction_key, known)} "
+            f"It has: {', '.join(known) or 'none'}. Add the sentence to a copy of the file in ./prompts/ and "
+            f"name that file in prompt_set."
+        )
+    return sentences
+
+
+def instruction_for(spec: TaskSpec, prompt_set: str = DEFAULT_PROMPT_SET) -> str:
+    """Return the sentence of a task, word for word as the set has it; errors as `instructions_for`."""
+    return instructions_for(spec, prompt_set)[0]

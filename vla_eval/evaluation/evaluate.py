@@ -1,0 +1,254 @@
+"""Evaluate: plan the episodes, run those that have no result yet, store each as it comes.
+
+Only this process writes results. An episode that cannot be run becomes an error record and the next
+one is run; a mistake that every episode would repeat ends the run. Stopped at any moment, by any
+means, the same call goes on where it stopped.
+"""
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from vla_eval import errors
+from vla_eval.config.recipes import EvalConfig
+from vla_eval.errors import TooManyErrorsError, VlaEvalError
+from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
+from vla_eval.evaluation.plan import (
+    EpisodeJob,
+    GroupKey,
+    Plan,
+    fingerprint,
+    make_plan,
+    options_of,
+    results_config,
+)
+from vla_eval.evaluation.worker import DeviceFound, Failed, Finished, worker_main
+from vla_eval.policies.registry import own_modules
+from vla_eval.records import EpisodeError, EpisodeRecord
+from vla_eval.storage.provenance import collect_environment
+from vla_eval.storage.run_folder import RunDescription, RunFolder
+from vla_eval.viz.recorder import Recorder
+from vla_eval.workers.pool import Answered, WorkerMain, WorkerPool
+from vla_eval.workers.start import simulator_modules
+
+RUNS_FOLDER = Path("runs")
+FINGERPRINT_DIGITS = 8
+
+
+class EvaluationObserver(Protocol):
+    """Watches a run: progress on a terminal, for example."""
+
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Called once, before the first episode."""
+
+    def on_record(self, record: EpisodeRecord) -> None:
+        """Called with each record once it is durable."""
+
+    def on_tick(self) -> bool:
+        """Called several times a second; returns whether the run shall stop now."""
+
+
+class _Silence:
+    """Watches nothing and never stops the run."""
+
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Do nothing."""
+
+    def on_record(self, record: EpisodeRecord) -> None:
+        """Do nothing."""
+
+    def on_tick(self) -> bool:
+        """Go on."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationSummary:
+    """What one call of `evaluate` has come to.
+
+    Attributes:
+        out: the run folder.
+        n_episodes: how many episodes the run has in all.
+        n_open: how many of them have no result: not run, or ended in an error.
+        n_errors: how many ended in an error in this call.
+        was_stopped: the observer asked to stop.
+    """
+
+    out: Path
+    n_episodes: int
+    n_open: int
+    n_errors: int
+    was_stopped: bool
+
+
+def default_run_folder(config: EvalConfig) -> Path:
+    """Return the folder that a configuration's results go to: the same for the same configuration."""
+    return RUNS_FOLDER / f"{config.name}-{fingerprint(config)[:FINGERPRINT_DIGITS]}"
+
+
+def evaluate(
+    config: EvalConfig,
+    *,
+    out: Path | None = None,
+    command: str = "",
+    allow_environment_change: bool = False,
+    observer: EvaluationObserver | None = None,
+) -> EvaluationSummary:
+    """Run all episodes of a configuration that have no result yet.
+
+    Args:
+        config: what to evaluate.
+        out: the run folder; by default `default_run_folder(config)`.
+        command: what the user typed, for the record.
+        allow_environment_change: continue although package versions or the machine have changed.
+        observer: is told of progress.
+
+    Raises:
+        VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
+            episodes in a row ended in an error; errors of the store. What was recorded stays.
+    """
+    observer, path = observer or _Silence(), out or default_run_folder(config)
+    plan = make_plan(config)
+    with RunFolder.open(
+        path, _describe(config, plan, command), allow_environment_change=allow_environment_change
+    ) as folder:
+        finished = folder.finished_keys()
+        queue = JobQueue(plan.jobs, finished=finished)
+        n_open = queue.n_episodes
+        n_workers = worker_count(config, plan, n_jobs=len(queue))
+        observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
+        bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
+        was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers, _modules(config, plan))
+    return EvaluationSummary(
+        out=path,
+        n_episodes=len(plan.jobs),
+        n_open=n_open - bookkeeper.n_results,
+        n_errors=bookkeeper.n_errors,
+        was_stopped=was_stopped,
+    )
+
+
+def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int) -> int:
+    """Return how many workers to start."""
+    if config.workers != "auto":
+        return max(1, min(config.workers, n_jobs))
+    n_cores = available_cores()
+    return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
+    return RunDescription(
+        name=config.name,
+        config={
+            **results_config(config),
+            "policy_names": list(plan.policy_names),
+            "task_versions": dict(plan.task_versions),
+        },
+        recipes=dict(plan.recipe_hashes),
+        environment=collect_environment(),
+        options=options_of(config),
+        command=command,
+        normalization=dict(plan.normalization),
+    )
+
+
+def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
+    """Return what takes workers long to import; other packages' code is left out: it may not bear a fork."""
+    adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
+    return (*simulator_modules(config.simulator), *own_modules(adapters))
+
+
+def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Sequence[str]) -> bool:
+    """Run the queue's episodes; return whether the observer stopped it."""
+    logs = bookkeeper.path / "logs"
+    logs.mkdir(exist_ok=True)
+    config = bookkeeper.config
+    new_pool = WorkerPool[EpisodeBatch, Finished]
+    main: WorkerMain = worker_main
+    if config.recording.is_on:
+        recorder = Recorder(
+            config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
+        )
+        main = functools.partial(worker_main, recorder=recorder)
+    with new_pool(
+        main,
+        answers=(Finished,),
+        size=n_workers,
+        timeouts=config.timeouts,
+        logs=logs,
+        preload=preload,
+    ) as pool:
+        for event in pool.run(queue):
+            if isinstance(event, Answered):
+                bookkeeper.take(event)
+            elif isinstance(event, DeviceFound):
+                bookkeeper.folder.note_device(event.device)
+            elif bookkeeper.observer.on_tick():
+                return True
+    return False
+
+
+@dataclass(slots=True, kw_only=True)
+class _Bookkeeper:
+    """Stores what comes from the workers, and decides when to give up."""
+
+    folder: RunFolder
+    path: Path
+    config: EvalConfig
+    observer: EvaluationObserver
+    queue: JobQueue
+    n_results: int = 0
+    n_errors: int = 0
+    n_consecutive_errors: int = 0
+    proven: set[GroupKey] = field(default_factory=set)  # groups with an episode that ran to its end
+
+    def take(self, answered: Answered[EpisodeBatch, Finished]) -> None:
+        """Store the results, or the error in their place."""
+        batch, answer = answered.job, answered.answer
+        if isinstance(answer, Failed):
+            # What has worked before and now does not is no mistake of the user's: a GPU was lost, say.
+            if answer.refused and batch.group.key not in self.proven:
+                raise as_exception(answer.error)
+            if len(batch.jobs) > 1:
+                self.queue.put_back_alone(batch)
+            else:
+                self._take_error(batch.jobs[0], answer.error)
+            return
+        self.proven.add(batch.group.key)
+        self.n_consecutive_errors = 0
+        for record, timing in zip(answer.records, answer.timings, strict=True):
+            self.folder.append(record, timing)
+            self.n_results += 1
+            self.observer.on_record(record)
+
+    def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:
+        record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)
+        self.folder.append(record)
+        self.n_errors += 1
+        self.n_consecutive_errors += 1
+        self.observer.on_record(record)
+        if self.n_consecutive_errors >= self.config.max_consecutive_errors:
+            raise TooManyErrorsError(
+                f"{self.n_consecutive_errors} episodes in a row ended in an error (max_consecutive_errors). "
+                f"The last: {job.key.policy} on {job.key.task}, seed {job.key.seed}: {error.kind} during "
+                f"{error.stage}: {error.message} All results are kept in {self.path}; the same command "
+                f"retries the errors."
+            )
+
+
+def as_exception(error: EpisodeError) -> VlaEvalError:
+    """Return the worker's exception again; a class of another package becomes its nearest one of ours."""
+    cls = getattr(errors, error.kind, VlaEvalError)
+    return (
+        cls(error.message)
+        if isinstance(cls, type) and issubclass(cls, VlaEvalError)
+        else VlaEvalError(error.message)
+    )

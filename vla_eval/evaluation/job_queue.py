@@ -1,0 +1,91 @@
+"""Which episodes a worker is given next. Knows nothing of processes or results."""
+
+from collections import deque
+from collections.abc import Collection, Hashable, Iterable
+from dataclasses import dataclass
+
+from vla_eval.evaluation.plan import EpisodeJob, Group, GroupKey
+from vla_eval.records import EpisodeKey
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeBatch:
+    """Episodes of one group that a worker runs side by side, each in a slot of its own; never empty."""
+
+    jobs: tuple[EpisodeJob, ...]
+
+    @property
+    def group(self) -> Group:
+        """What the episodes share."""
+        return self.jobs[0].group
+
+    @property
+    def setup_key(self) -> GroupKey:
+        """Batches with the same one can be run with the same environment and policy."""
+        return self.group.key
+
+
+class JobQueue:
+    """Hands out episodes so that mistakes show early and few processes have to be started.
+
+    The first batch of each group that has no result yet comes before all others: what is wrong with
+    the last policy of the list shows in the first minutes, not at the end of the night. After that a
+    worker stays with the group that its process has loaded: another one costs a process. The order moves
+    no result, nor does it matter which episodes are in a batch: an episode's slot is the plan's.
+    """
+
+    def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
+        """Queue the jobs that are not finished."""
+        begun = {GroupKey(*key[:3]) for key in finished}
+        self._heads: deque[EpisodeBatch] = deque()
+        self._rest: dict[GroupKey, deque[EpisodeBatch]] = {}
+        for batch in _batches(job for job in jobs if job.key not in finished):
+            if batch.group.key not in begun:
+                begun.add(batch.group.key)
+                self._heads.append(batch)
+            else:
+                self._rest.setdefault(batch.group.key, deque()).append(batch)
+
+    def __len__(self) -> int:
+        """How many batches have not been handed out."""
+        return len(self._heads) + sum(len(batches) for batches in self._rest.values())
+
+    @property
+    def n_episodes(self) -> int:
+        """How many episodes have not been handed out."""
+        return sum(len(batch.jobs) for batches in (self._heads, *self._rest.values()) for batch in batches)
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> EpisodeBatch | None:
+        """Return the next batch for a worker, or None if there is no more.
+
+        Args:
+            loaded: the group whose environment and policy the worker has at hand.
+            taken: groups that other workers have at hand; avoided while there are others.
+        """
+        if self._heads:  # of several of one group, as `put_back_alone` leaves them, the worker keeps on
+            index = next((i for i, batch in enumerate(self._heads) if batch.setup_key == loaded), 0)
+            head = self._heads[index]
+            del self._heads[index]
+            return head
+        waiting = [key for key, batches in self._rest.items() if batches]
+        if not waiting:
+            return None
+        free = [key for key in waiting if key not in taken]
+        chosen = next((key for key in waiting if key == loaded), (free or waiting)[0])
+        return self._rest[chosen].popleft()
+
+    def put_back_alone(self, batch: EpisodeBatch) -> None:
+        """Queue the episodes of a batch that failed again, one by one, to find the one to blame."""
+        self._heads.extendleft(EpisodeBatch(jobs=(job,)) for job in reversed(batch.jobs))
+
+
+def _batches(jobs: Iterable[EpisodeJob]) -> Iterable[EpisodeBatch]:
+    """Yield the jobs in their order; a batch ends where the group does, or where a slot is wanted twice."""
+    batch: list[EpisodeJob] = []
+    for job in jobs:
+        if batch and (job.group.key != batch[0].group.key or job.slot in {other.slot for other in batch}):
+            yield EpisodeBatch(jobs=tuple(batch))
+            batch = []
+        batch.append(job)
+    if batch:
+        yield EpisodeBatch(jobs=tuple(batch))

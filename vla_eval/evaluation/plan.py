@@ -1,0 +1,233 @@
+"""From a configuration to the list of episodes: task x policy x n_action_steps x run x seed.
+
+Everything that can be wrong with a configuration and can be seen without starting a simulator is
+found here, before the first episode. Knows nothing of processes or files of results.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from vla_eval.bounds import MAX_EPISODES
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.policy import load_policy_recipe
+from vla_eval.config.prompts import load_prompts, sentences_of
+from vla_eval.config.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
+from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
+from vla_eval.policies.registry import check_adapter
+from vla_eval.records import EpisodeKey
+from vla_eval.rollout import RolloutSettings
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.families import check_arguments
+from vla_eval.tasks.spec import TaskSpec
+
+
+class GroupKey(NamedTuple):
+    """What the episodes share that one environment object and one policy object can run."""
+
+    task: str
+    policy: str
+    n_action_steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Group:
+    """Episodes that differ only in run and seed.
+
+    Attributes:
+        key: its identity in the plan.
+        adapter: registry name of the policy's code.
+        args: the adapter's keyword arguments.
+        env: the environment, before it is known which cameras the policy needs.
+        rollout: how the episodes are run.
+        instruction: the language instruction.
+    """
+
+    key: GroupKey
+    adapter: str
+    args: Mapping[str, Any]  # Any: whatever the adapter takes
+    env: EnvSettings
+    rollout: RolloutSettings
+    instruction: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeJob:
+    """One episode to run.
+
+    Attributes:
+        group: what it shares with others.
+        run, seed: what tells it apart from them.
+        slot: where in a worker it runs. Fixed by the plan, since a network that infers for several
+            episodes in one pass gives a row the same bits only in the same place.
+    """
+
+    group: Group
+    run: int
+    seed: int
+    slot: int = 0
+
+    @property
+    def key(self) -> EpisodeKey:
+        """The identity of the episode within its run folder."""
+        return EpisodeKey(*self.group.key, self.run, self.seed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """All that a run needs to know.
+
+    Attributes:
+        jobs: every episode, in a fixed order.
+        recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
+            policies, and the datasets that these were trained on.
+        normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
+        task_versions: task id -> version of the task's rules.
+        policy_names: what records call the policies, in the order of the configuration.
+        left_out: (task, policy) pairs that make no sense together, and why, for a message.
+        max_workers: the most workers that `workers: auto` may start; None: no limit.
+    """
+
+    jobs: tuple[EpisodeJob, ...]
+    recipe_hashes: Mapping[str, str]
+    normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    task_versions: Mapping[str, int]
+    policy_names: tuple[str, ...]
+    left_out: tuple[str, ...]
+    max_workers: int | None
+
+
+def make_plan(config: EvalConfig) -> Plan:
+    """Plan the episodes of a configuration.
+
+    Raises:
+        UnknownNameError: a task, policy, adapter or prompt set does not exist.
+        RecipeError: a recipe is wrong, two policies have the same name, or there are too many episodes.
+        MissingInstructionError: a task has no instruction in the prompt set.
+        TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
+            tasks with candidates, and one of the tasks has none.
+        CheckpointError: the weights that a recipe names are not there, or not whole.
+    """
+    _refuse_instruction(config)
+    tasks = [task_spec(task) for task in config.tasks]
+    policies = [load_policy_recipe(name) for name in config.policies]
+    _refuse_doubles("tasks", [task.id for task in tasks])
+    _refuse_doubles("policies", [policy.name for policy in policies])
+    prompts = load_prompts(config.prompt_set)
+    groups: list[Group] = []
+    left_out: list[str] = []
+    for task in tasks:
+        check_arguments(task, config.env, TASKS.values())
+        instruction = sentences_of(prompts, task)[0]
+        for policy in policies:
+            check_adapter(policy.value.adapter)
+            if policy.value.needs_candidates and task.candidates is None:
+                left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
+                continue
+            groups.extend(_groups(config, task, policy, instruction))
+    if not groups:
+        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
+    _refuse_too_many(config, n_groups=len(groups))
+    limits = [policy.value.max_workers for policy in policies if policy.value.max_workers is not None]
+    return Plan(
+        jobs=tuple(
+            EpisodeJob(
+                group=group, run=run, seed=config.seed_start + index, slot=index % config.slots_per_worker
+            )
+            for group in groups
+            for run in range(config.runs)
+            for index in range(config.episodes)
+        ),
+        recipe_hashes={
+            f"prompts/{prompts.name}": prompts.sha256,
+            **{f"policies/{policy.name}": policy.sha256 for policy in policies},
+            **{
+                name: digest
+                for policy in policies
+                for name, digest in checkpoint_hashes(
+                    policy.value.adapter, policy.value.args, policy=policy.name
+                ).items()
+            },
+        },
+        normalization={
+            policy.name: notes
+            for policy in policies
+            if (notes := normalization_notes(policy.value.adapter, policy.value.args))
+        },
+        task_versions={task.id: task.version for task in tasks},
+        policy_names=tuple(policy.name for policy in policies),
+        left_out=tuple(left_out),
+        max_workers=min(limits, default=None),
+    )
+
+
+def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a configuration that results depend on; compared when a run is continued."""
+    data: dict[str, Any] = to_data(config)
+    if config.slots_per_worker == 1:  # runs of versions that knew nothing else can be continued
+        del data["slots_per_worker"]
+    return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
+
+
+def options_of(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
+    """Return the part of a configuration that moves no result; recorded only."""
+    data: dict[str, Any] = to_data(config)
+    return {name: data[name] for name in OPTION_FIELDS}
+
+
+def fingerprint(config: EvalConfig) -> str:
+    """Return the sha256 of the part of a configuration that results depend on."""
+    text = json.dumps(results_config(config), sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _refuse_instruction(config: EvalConfig) -> None:
+    if "instruction" in config.env:
+        raise RecipeError(
+            "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
+            "./prompts/ and name that file in prompt_set."
+        )
+
+
+def _refuse_too_many(config: EvalConfig, *, n_groups: int) -> None:
+    n_episodes = n_groups * config.runs * config.episodes
+    if n_episodes > MAX_EPISODES:
+        raise RecipeError(
+            f"{config.name}: {n_groups} groups (task, policy, n_action_steps), {config.runs} runs and "
+            f"{config.episodes} episodes make {n_episodes} episodes, expected at most {MAX_EPISODES} in one "
+            f"run folder. Use fewer, or several configurations."
+        )
+
+
+def _refuse_doubles(kind: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise RecipeError(f"{kind}: '{name}' is named twice; records tell them apart by name alone.")
+
+
+def _groups(
+    config: EvalConfig, task: TaskSpec, policy: Recipe[PolicyRecipe], instruction: str
+) -> Iterable[Group]:
+    for n_action_steps in config.n_action_steps or (policy.value.default_n_action_steps,):
+        yield Group(
+            key=GroupKey(task.id, policy.name, n_action_steps),
+            adapter=policy.value.adapter,
+            args=policy.value.args,
+            env=EnvSettings(
+                task=task.id,
+                kwargs=config.env,
+                simulator=config.simulator,
+                sim_backend=config.sim_backend,
+                render=config.render,
+                n_slots=config.slots_per_worker,
+            ),
+            rollout=RolloutSettings(
+                chunking=config.chunking.spec(n_action_steps),
+                eager_rendering=config.eager_rendering,
+                stop_at_success=config.stop_at_success,
+            ),
+            instruction=instruction,
+        )

@@ -1,0 +1,63 @@
+"""Which folder is a run folder, which may become one, and which one may have been meant."""
+
+import os
+from pathlib import Path
+
+from vla_eval.errors import RunFolderError, did_you_mean
+from vla_eval.storage.run_file import RUN_FILE
+
+EPISODES_FILE = "episodes.jsonl"
+TIMINGS_FILE = "timings.jsonl"
+LOCK_FILE = "run.lock"
+# What a process that was killed before it wrote run.json may have left behind.
+UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
+
+
+def make_folder(path: Path) -> None:
+    """Make the folder if it is not there.
+
+    Args:
+        path: the folder that a run is to go into.
+
+    Raises:
+        RunFolderError: it is there and somebody else's, or is no folder.
+        OSError: it cannot be made.
+    """
+    if path.exists() and not path.is_dir():
+        raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
+    path.mkdir(parents=True, exist_ok=True)
+    names = set(os.listdir(path))
+    if RUN_FILE in names or names <= UNSTARTED:
+        return
+    if EPISODES_FILE in names:
+        raise RunFolderError(
+            f"{path}: holds {EPISODES_FILE} but no {RUN_FILE}, so nobody knows what its episodes are. "
+            f"Restore {RUN_FILE} or use another --out."
+        )
+    others = sorted(names - UNSTARTED)
+    shown = ", ".join(others[:3]) + (", …" if len(others) > 3 else "")
+    raise RunFolderError(
+        f"{path}: holds other files ({shown}) and no {RUN_FILE}: it is not a run folder, and nothing is "
+        f"written into it. Use another --out."
+    )
+
+
+def not_a_run_folder(path: Path) -> RunFolderError:
+    """Build the error for a folder that is no run folder, with the ones that may have been meant."""
+    inside = _run_folders(path)
+    if inside:
+        shown = " ".join(str(path / name) for name in inside[:5])
+        return RunFolderError(f"{path}: is not a run folder, but holds some. Name them: {shown}")
+    what = f"has no {RUN_FILE}" if path.exists() else "does not exist"
+    siblings = _run_folders(path.parent)
+    known = f" Run folders in {path.parent}: {', '.join(siblings[:10])}." if siblings else ""
+    return RunFolderError(
+        f"{path}: is not a run folder: it {what}.{did_you_mean(path.name, siblings)}{known} "
+        f"`mikasa-vla eval` makes one."
+    )
+
+
+def _run_folders(folder: Path) -> list[str]:
+    if not folder.is_dir():
+        return []
+    return sorted(entry.name for entry in folder.iterdir() if (entry / RUN_FILE).is_file())

@@ -1,0 +1,30 @@
+"""What the recordings of an episode are called. Files of an episode that has none are simply not there."""
+
+from pathlib import Path
+
+from vla_eval.records import EpisodeRecord
+
+VIDEOS, RRDS = "videos", "rrd"  # subfolders of a run folder
+
+
+def recording_stem(record: EpisodeRecord) -> str:
+    """Return `RememberColor3-v0_oracle_K1_run0_seed7_success`."""
+    return (
+        f"{record.task}_{record.policy}_K{record.n_action_steps}_run{record.run}_seed{record.seed}"
+        f"_{record.outcome}"
+    )
+
+
+def video_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the video of an episode is, or would be."""
+    return folder / VIDEOS / f"{recording_stem(record)}.mp4"
+
+
+def thumbnail_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the picture of an episode's last recorded step is, or would be."""
+    return folder / VIDEOS / f"{recording_stem(record)}.jpg"
+
+
+def rrd_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the rerun recording of an episode is, or would be."""
+    return folder / RRDS / f"{recording_stem(record)}.rrd"

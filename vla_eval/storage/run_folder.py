@@ -1,0 +1,257 @@
+"""The run folder: episodes are durable when they are reported as finished, and none is counted twice.
+
+    run.json        what the run was started with, and each time it was continued (see `run_file`)
+    episodes.jsonl  one `EpisodeRecord` per line, appended, never rewritten
+    timings.jsonl   wall-clock seconds, one `EpisodeTiming` per line; no result depends on it
+    run.lock        held by the process that writes
+
+Knows nothing of tasks, policies or statistics.
+"""
+
+import errno
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vla_eval.errors import RunFolderError
+from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.results.unstarted import FolderStart
+from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
+from vla_eval.storage.episodes_file import cut_tail, parse_records, repair_records, shown_key
+from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, make_folder, not_a_run_folder
+from vla_eval.storage.run_file import (
+    DEVICE,
+    RUN_FILE,
+    Change,
+    JsonValue,
+    RunDescription,
+    RunFile,
+    Session,
+    environment_changed,
+    find_changes,
+)
+
+__all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "read_run"]
+
+logger = logging.getLogger(__name__)
+
+_OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", EPISODES_FILE, TIMINGS_FILE, LOCK_FILE)
+DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredRun:
+    """What a run folder holds.
+
+    Attributes:
+        path: the folder.
+        description: what the run was started with.
+        records: one per key: the success or failure if there is one, else the last error.
+        sessions: each time that the run was started or continued.
+    """
+
+    path: Path
+    description: RunDescription
+    records: tuple[EpisodeRecord, ...]
+    sessions: tuple[Session, ...] = ()
+
+
+class RunFolder:
+    """A run folder that this process writes into; make it with `RunFolder.open`.
+
+    It is a context manager. Only one process at a time can have it open; that ends with the process.
+    """
+
+    def __init__(self, path: Path, description: RunDescription, *, allow_environment_change: bool) -> None:
+        """Use `open`: this is called with the folder locked."""
+        self.path = path
+        self._allow_environment_change = allow_environment_change
+        self._lock: FolderLock | None = None
+        self._start: FolderStart | None = None
+        self._run_file = self._load(description)
+        records = repair_records(path / EPISODES_FILE)
+        self._finished = {key for key, record in records.items() if record.outcome != "error"}
+        self._has_lines = bool(records)
+        cut_tail(path / TIMINGS_FILE)
+        # run.json comes first: episodes without it would be nobody's.
+        self._run_file.save(path)
+        self._episodes: LineFile | None = LineFile(path / EPISODES_FILE, durable=True)
+        self._timings = LineFile(path / TIMINGS_FILE, durable=False)
+        sync_folder(path)
+
+    @classmethod
+    def open(cls, path: Path, description: RunDescription, *, allow_environment_change: bool = False) -> Self:
+        """Start a run in a new or empty folder, or continue the one that is there.
+
+        Args:
+            path: the folder; it is made if it is not there.
+            description: what the run is started with; it must be what it was before.
+            allow_environment_change: continue although commit, versions or device have changed.
+
+        Raises:
+            RunChangedError: configuration, recipes or environment are not what they were.
+            RunFolderError: another process has it open, its files are damaged, or it is somebody else's.
+            StorageFullError: the disk is full.
+        """
+        try:
+            start = FolderStart(path, own=_OWN_FILES)
+            make_folder(path)
+            lock = FolderLock(path / LOCK_FILE)
+            try:
+                folder = cls(path, description, allow_environment_change=allow_environment_change)
+            except BaseException:
+                start.undo()
+                lock.release()
+                raise
+        except OSError as exc:
+            if exc.errno in DISK_TROUBLE:
+                raise storage_full(path, exc) from exc
+            raise RunFolderError(
+                f"{path}: cannot be used as a run folder ({exc.strerror or exc}). Use another --out."
+            ) from exc
+        folder._lock = lock
+        folder._start = start
+        return folder
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the folder; a new one is removed if an error came before its first episode."""
+        if isinstance(exc, Exception) and self._start is not None and not self._has_lines:
+            self._start.undo()
+        self.close()
+
+    def finished_keys(self) -> frozenset[EpisodeKey]:
+        """Return the keys of all episodes with a result. Errors have none, so they are run again."""
+        return frozenset(self._finished)
+
+    def append(self, record: EpisodeRecord, timing: EpisodeTiming | None = None) -> None:
+        """Store one episode; it is durable when this returns.
+
+        Args:
+            record: what came of it.
+            timing: how long it took; not made durable, and lost rather than an error if it cannot be kept.
+
+        Raises:
+            RunFolderError: the episode has a result already, or the folder is closed.
+            StorageFullError: it could not be stored; the folder is as it was before.
+        """
+        if self._episodes is None:
+            raise RunFolderError(f"{self.path}: the run folder is closed. Open it again before appending.")
+        if record.outcome != "error" and record.key in self._finished:
+            raise RunFolderError(
+                f"{self.path}: {shown_key(record.key)} has a result already; a second one would be counted "
+                f"twice. Skip the keys in finished_keys()."
+            )
+        self._has_lines = True  # also if the line could not be written as a whole
+        self._episodes.append(record.to_json())
+        if record.outcome != "error":
+            self._finished.add(record.key)
+        if timing is not None:
+            try:
+                self._timings.append(json.dumps({**asdict(timing), "key": timing.key._asdict()}))
+            except RunFolderError as exc:
+                logger.warning("%s: a timing was not kept (%s)", self.path, exc)
+
+    def note_device(self, device: Mapping[str, JsonValue]) -> None:
+        """Record facts about the device; what is known already must not have changed.
+
+        Args:
+            device: name -> value; names that were given before may be left out.
+
+        Raises:
+            RunChangedError: a value differs from the recorded one, and changes are not allowed.
+            StorageFullError: it could not be recorded.
+        """
+        updated = self._with_device(self._run_file, device)
+        if updated != self._run_file:
+            updated.save(self.path)
+            self._run_file = updated
+
+    def close(self) -> None:
+        """Close the files and let other processes in; a second call does nothing."""
+        if self._episodes is not None:
+            self._episodes.close()
+            self._timings.close()
+            self._episodes = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _load(self, description: RunDescription) -> RunFile:
+        """Return what run.json must hold from now on."""
+        session = Session(
+            started_at=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=description.command,
+            options=description.options,
+        )
+        try:
+            known = RunFile.load(self.path)
+        except FileNotFoundError:
+            return RunFile(description=description, sessions=(session,))
+        known.check_unchanged(description, self.path)
+        changes = find_changes(
+            _without_device(known.description.environment),
+            _without_device(description.environment),
+            prefix="environment",
+        )
+        self._check_allowed(changes)
+        updated = known.with_session(replace(session, environment_changes=changes))
+        device = description.environment.get(DEVICE)
+        return self._with_device(updated, device) if isinstance(device, Mapping) else updated
+
+    def _with_device(self, run_file: RunFile, device: Mapping[str, JsonValue]) -> RunFile:
+        recorded = run_file.description.environment.get(DEVICE)
+        recorded = recorded if isinstance(recorded, Mapping) else {}
+        # A session may know less of the device than the one before, as long as it does not contradict it.
+        again = {name: device[name] for name in device if name in recorded}
+        before = {name: recorded[name] for name in again}
+        changes = find_changes(before, again, prefix=f"environment.{DEVICE}")
+        self._check_allowed(changes)
+        if not changes and again.keys() == device.keys():
+            return run_file
+        return run_file.with_device({**device, **recorded}, changes)
+
+    def _check_allowed(self, changes: tuple[Change, ...]) -> None:
+        if changes and not self._allow_environment_change:
+            raise environment_changed(changes, self.path)
+        for change in changes:
+            logger.warning("%s: the environment has changed: %s", self.path, change)
+
+
+def read_run(path: Path) -> StoredRun:
+    """Read a run folder without touching it; a run may be going on in it.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        RunFolderError: it is no run folder, or a file in it is damaged.
+    """
+    try:
+        run_file = RunFile.load(path)
+        data = (path / EPISODES_FILE).read_bytes() if (path / EPISODES_FILE).exists() else b""
+    except (FileNotFoundError, NotADirectoryError) as exc:
+        raise not_a_run_folder(path) from exc
+    except OSError as exc:
+        raise RunFolderError(f"{path}: cannot be read ({exc.strerror or exc}).") from exc
+    # What follows the last newline is being written at this moment, or was when its writer was killed.
+    records = parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE)
+    return StoredRun(
+        path=path,
+        description=run_file.description,
+        records=tuple(records.values()),
+        sessions=run_file.sessions,
+    )
+
+
+def _without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    return {name: value for name, value in environment.items() if name != DEVICE}

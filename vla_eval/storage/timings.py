@@ -1,0 +1,66 @@
+"""Read `timings.jsonl`: wall-clock seconds per episode. No result depends on it.
+
+A file that is not there, or a line that is damaged, is a timing that is not known; never a zero.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.storage.folders import TIMINGS_FILE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Latency:
+    """Seconds per inference, over episodes; and per episode.
+
+    Attributes:
+        n_episodes: episodes with a timing.
+        median_seconds, slowest_seconds: of the episodes' mean seconds per inference.
+        episode_seconds: median of the whole episodes.
+    """
+
+    n_episodes: int
+    median_seconds: float
+    slowest_seconds: float
+    episode_seconds: float
+
+
+def read_timings(folder: Path) -> dict[EpisodeKey, EpisodeTiming]:
+    """Return the timing of each episode of a run folder, the last one where it was run again."""
+    path = folder / TIMINGS_FILE
+    found: dict[EpisodeKey, EpisodeTiming] = {}
+    if not path.is_file():
+        return found
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            data = json.loads(line)
+            key = EpisodeKey(**data.pop("key"))
+            found[key] = EpisodeTiming(key=key, **data)
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue  # torn by a kill: the episode has a result and no timing
+    return found
+
+
+def measure_latency(
+    records: Iterable[EpisodeRecord], timings: Mapping[EpisodeKey, EpisodeTiming]
+) -> Latency | None:
+    """Return how long the inferences of some episodes took; None if no timing is known.
+
+    Args:
+        records: episodes with a result.
+        timings: by key, of the run folder that the records are from.
+    """
+    known = [(record, timings[record.key]) for record in records if record.key in timings]
+    each = [timing.inference_seconds / record.n_inferences for record, timing in known if record.n_inferences]
+    if not each:
+        return None
+    return Latency(
+        n_episodes=len(each),
+        median_seconds=median(each),
+        slowest_seconds=max(each),
+        episode_seconds=median(timing.total_seconds for _, timing in known),
+    )

@@ -1,0 +1,87 @@
+"""A made-up dataset in the form of ours: for tests, and to measure loaders without recordings.
+
+Pictures drift, as a camera's do, so that the codec has ordinary work; all numbers are random. Nothing
+here was ever simulated, and no manifest says so: it is not a complete dataset.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from vla_eval.core import ImageArray
+from vla_eval.data.opening import video_decoder
+from vla_eval.features import (
+    CAMERA_KEYS,
+    DONE_KEY,
+    FPS,
+    IMAGE_SHAPE,
+    REWARD_KEY,
+    SUCCESS_KEY,
+    EncoderSettings,
+    StateKind,
+    dataset_features,
+)
+
+INSTRUCTIONS = ("look, wait, choose", "follow the ball")
+
+
+def write_synthetic_dataset(
+    root: Path, *, n_episodes: int, n_frames: int, state: StateKind = "eef", seed: int = 0
+) -> Path:
+    """Write a `LeRobotDataset` of made-up episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
+
+    Args:
+        root: the folder to make.
+        n_episodes: how many; two instructions take turns.
+        n_frames: length of the shortest.
+        state: which proprioception `observation.state` is.
+        seed: of all that is drawn.
+    """
+    features = dataset_features(state)
+    dataset = LeRobotDataset.create(
+        f"local/{root.name}",
+        fps=FPS,
+        features=features,
+        root=root,
+        streaming_encoding=True,
+        encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames where its queue is full
+        rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
+        video_backend=video_decoder(),
+    )
+    for episode in range(n_episodes):
+        rng = np.random.default_rng([seed, episode])
+        length = n_frames + episode % 3
+        textures = {camera: _texture(rng) for camera in CAMERA_KEYS.values()}
+        for step in range(length):
+            dataset.add_frame(
+                {
+                    **{camera: np.roll(texture, 2 * step, axis=1) for camera, texture in textures.items()},
+                    **_numbers(rng, features),
+                    REWARD_KEY: rng.random(1, dtype=np.float32),
+                    SUCCESS_KEY: np.array([step == length - 1]),
+                    DONE_KEY: np.array([step == length - 1]),
+                    "task": INSTRUCTIONS[episode % len(INSTRUCTIONS)],
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def _texture(rng: np.random.Generator) -> ImageArray:
+    """Return a picture of 8 × 8 px tiles with a little noise."""
+    height, width, channels = IMAGE_SHAPE
+    tiles = rng.integers(40, 216, (height // 8, width // 8, channels)).repeat(8, 0).repeat(8, 1)
+    return (tiles + rng.integers(-8, 9, IMAGE_SHAPE)).astype(np.uint8)
+
+
+def _numbers(rng: np.random.Generator, features: dict[str, Any]) -> dict[str, Any]:  # Any: arrays
+    return {
+        key: rng.uniform(-1, 1, feature["shape"]).astype(np.float32)
+        for key, feature in features.items()
+        if feature["dtype"] == "float32" and key != REWARD_KEY
+    }

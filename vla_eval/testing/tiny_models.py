@@ -1,0 +1,164 @@
+"""The π0 family, SmolVLA and ACT with few random weights, for tests: the whole way without network or GPU.
+
+lerobot 0.6.1 builds these models in full size only, so some names of its modules are replaced while a
+model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
+"""
+
+import contextlib
+import importlib
+from collections.abc import Iterator, Mapping
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Literal  # lerobot and transformers are untyped
+from unittest.mock import patch
+
+from vla_eval.evaluation.worker import SharedStage, worker_main
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+
+Family = Literal["pi0", "pi05", "pi0_fast"]
+VOCABULARY = 512
+CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
+SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
+SMOLVLM_TOKENS = {
+    "image_token": "<image>",
+    "fake_image_token": "<fake_token_around_image>",
+    "global_image_token": "<global-img>",
+    "end_of_utterance_token": "<end_of_utterance>",
+}
+TINY_POLICY: dict[str, Any] = {
+    "chunk_size": 4,
+    "n_action_steps": 4,
+    "num_inference_steps": 2,
+    "image_resolution": [56, 56],
+    "dtype": "float32",
+}
+"""Fields of the policy's configuration that go with the tiny model."""
+
+
+@contextlib.contextmanager
+def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
+    """Make lerobot build the tiny model wherever it would build the full one, within the context."""
+    modeling: Any = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
+    sizes = {"depth": 2, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}  # 8 heads are hard-coded
+    vlm = modeling.GemmaConfig(width=64, mlp_dim=128, **sizes)
+    expert = modeling.GemmaConfig(width=32, mlp_dim=64, **sizes)
+    full_vlm = modeling.PaliGemmaForConditionalGenerationWithPiGemma
+    full_expert: Any = getattr(modeling, "PiGemmaForCausalLM", None)  # π0-FAST has no expert
+
+    def make_vlm(config: Any) -> Any:
+        config._vocab_size = config.text_config.vocab_size = VOCABULARY
+        config.image_token_index = VOCABULARY - 1
+        config.projection_dim = config.vision_config.projection_dim = vlm.width
+        vision = config.vision_config
+        vision.hidden_size, vision.intermediate_size, vision.patch_size = 32, 64, 14
+        vision.num_hidden_layers, vision.num_attention_heads = 2, 2
+        vision.image_size = TINY_POLICY["image_resolution"][0]  # π0-FAST leaves it as it is
+        return full_vlm(config=config)
+
+    def make_expert(config: Any) -> Any:
+        config.vocab_size = VOCABULARY
+        return full_expert(config=config)
+
+    with (
+        patch.object(modeling, "get_gemma_config", {"gemma_2b": vlm, "gemma_300m": expert}.__getitem__),
+        patch.object(modeling, "PaliGemmaForConditionalGenerationWithPiGemma", make_vlm),
+        patch.object(modeling, "PiGemmaForCausalLM", make_expert, create=full_expert is None),
+    ):
+        yield
+
+
+@contextlib.contextmanager
+def tiny_resnet() -> Iterator[None]:
+    """Make lerobot's ACT take one convolution instead of ResNet-18 (11 M parameters) within the context."""
+    torchvision: Any = importlib.import_module("torchvision")
+    nn: Any = importlib.import_module("torch").nn
+
+    def make_resnet(**_: Any) -> Any:
+        layers = {"layer4": nn.Conv2d(3, 8, kernel_size=32, stride=32), "fc": nn.Linear(8, 1)}
+        return nn.ModuleDict(layers)  # an attribute of each name, which is all that is read
+
+    with patch.object(torchvision.models, "resnet18", make_resnet):
+        yield
+
+
+def write_tiny_tokenizer(folder: Path) -> Path:
+    """Train a tokenizer on three sentences, save it, and return its folder."""
+    _tokenizer({}).save_pretrained(str(folder))
+    return folder
+
+
+def write_tiny_fast_tokenizer(folder: Path) -> Path:
+    """Make an action tokenizer in which each byte is a token, save it, and return its folder."""
+    from vla_eval.policies.fast_tokens import FastActionTokenizer
+
+    folder.mkdir()
+    FastActionTokenizer(_tokenizer({}), scale=10.0, min_token=-60).save_pretrained(folder)
+    return folder
+
+
+def write_tiny_smolvlm(folder: Path) -> Path:
+    """Save configuration and processor of a tiny SmolVLM, which SmolVLA needs none of lerobot patched for."""
+    from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
+    from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+
+    tokenizer = _tokenizer(SMOLVLM_TOKENS)
+    special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
+    heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
+    text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4}
+    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    config: Any = SmolVLMConfig
+    config(
+        vision_config={**vision, "image_size": 64, "patch_size": 16},
+        text_config={**text, **heads, **special, "vocab_size": len(tokenizer)},
+        scale_factor=2,
+        image_token_id=tokenizer.convert_tokens_to_ids(SMOLVLM_TOKENS["image_token"]),
+        pad_token_id=tokenizer.pad_token_id,
+    ).save_pretrained(str(folder))
+    processor: Any = SmolVLMProcessor
+    processor(
+        image_processor=SmolVLMImageProcessor(),
+        tokenizer=tokenizer,
+        video_processor=SmolVLMVideoProcessor(),
+        image_seq_len=4,
+    ).save_pretrained(str(folder))
+    return folder
+
+
+def _tokenizer(named: Mapping[str, str]) -> Any:
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast
+
+    tokenizer: Any = Tokenizer(models.BPE(unk_token="<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=VOCABULARY - 1,  # the last one is the image's
+        special_tokens=[*SPECIAL_TOKENS, *named.values()],
+        initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )
+    tokenizer.train_from_iterator(CORPUS, trainer)
+    make_fast: Any = PreTrainedTokenizerFast
+    extra = {"extra_special_tokens": dict(named)} if named else {}
+    return make_fast(
+        tokenizer_object=tokenizer,
+        pad_token="<pad>",
+        eos_token="<eos>",
+        bos_token="<bos>",
+        unk_token="<unk>",
+        padding_side="right",
+        **extra,
+    )
+
+
+def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any) -> LeRobotPolicy:
+    """Make a policy from a tiny checkpoint; an adapter for recipes in tests."""
+    with tiny_paligemma(family):
+        return make_lerobot(context, **args)
+
+
+def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
+    """Be a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
+    with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
+        worker_main(connection, shared, log)

@@ -1,0 +1,112 @@
+"""A table of learned policies with tiny random models, on a stand-in for the simulator, in minutes.
+
+What the rows reach says nothing of the models they are named after; that a row is there says that recording,
+fine-tuning, loading and evaluating fit together.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.finetuning import merge_fields
+from vla_eval.config.policy import LEROBOT_ADAPTER
+from vla_eval.config.recipes import PolicyRecipe, load_recipe, to_data
+from vla_eval.errors import RecipeError
+from vla_eval.evaluation.grid import ModelTable, TableRow
+from vla_eval.storage.durable import replace_file
+from vla_eval.testing.tiny_models import TINY_POLICY, write_tiny_tokenizer
+
+TINY_RECIPES = {
+    "mikasa_octo": "octo_tiny",
+    "mikasa_openvla": "openvla_oft_tiny",
+    "mikasa_spatialvla": "spatialvla_tiny",
+}
+"""Type of a policy -> recipe of its tiny form."""
+TINY_UNET: dict[str, Any] = {"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}
+SMALL = ("act", "diffusion", "mikasa_memory")
+"""Types whose own recipes are small enough; of a diffusion the U-Net is not."""
+TINY_PI0_ADAPTER = "vla_eval.testing.tiny_models:make_tiny_pi0"
+N_EPISODES = 2
+N_STEPS = 2
+SHORT = {
+    "steps": N_STEPS,
+    "batch_size": 2,
+    "save_every_steps": N_STEPS,
+    "log_every_steps": 1,
+    "num_workers": 0,
+}
+
+
+def tiny_table(table: ModelTable, out: Path) -> tuple[ModelTable, dict[str, str]]:
+    """Return the table with a tiny model in each row, and the adapters of rows that are not lerobot's own.
+
+    Args:
+        table: the real one; rows, tasks and controls stay.
+        out: folder of the table; gets the recipes of the tiny models.
+
+    Raises:
+        RecipeError: a row is of a type that has no tiny form.
+    """
+    rows, adapters = [], {}
+    for row in table.rows:
+        recipe, adapter = _tiny_recipe(row, out / "tiny")
+        path = out / "tiny" / f"{row.name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, yaml.safe_dump(recipe, sort_keys=False, allow_unicode=True))
+        rows.append(replace(row, policy=str(path), finetune=None))
+        adapters[row.name] = adapter
+    tiny = replace(
+        table,
+        name=f"{table.name}_tiny",
+        rows=tuple(rows),
+        datasets=str(out / "data"),
+        steps=N_STEPS,
+        run_seeds=table.run_seeds[:2],
+        episodes=N_EPISODES,
+        simulator="fake",
+        allow_unreplayed=True,
+    )
+    return tiny, adapters
+
+
+def tiny_dataset(table: ModelTable) -> DatasetRecipe:
+    """Return the recipe of demonstrations for a tiny table."""
+    return DatasetRecipe(
+        name="tiny", tasks=table.tasks, episodes=N_EPISODES, simulator="fake", workers=1, episodes_per_shard=2
+    )
+
+
+def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
+    real = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
+    kind = None if real is None else real.type
+    longest = max(row.n_action_steps)
+    chunk = {"chunk_size": longest, "n_action_steps": longest}
+    if kind == "pi0":
+        policy = {**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": N_STEPS, **chunk}
+        tokenizer = str(write_tiny_tokenizer(folder / "tokenizer"))
+        section: dict[str, Any] = {"type": "pi0", "tokenizer": tokenizer, "policy": policy, **SHORT}
+        return _recipe(row, section), TINY_PI0_ADAPTER
+    if kind not in TINY_RECIPES and kind not in SMALL:
+        known = ", ".join(("pi0", *SMALL, *TINY_RECIPES))
+        raise RecipeError(f"row {row.name}: there is no tiny form of the type {kind}. Known: {known}.")
+    if kind in SMALL:
+        section = merge_fields(to_data(real), row.finetune or {})
+    else:
+        section = to_data(load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune)
+    section |= SHORT
+    # A diffusion's chunk is what its horizon leaves of it: the recipe's own.
+    section["policy"] = {**section["policy"], **(TINY_UNET if kind == "diffusion" else chunk)}
+    return _recipe(row, section), LEROBOT_ADAPTER
+
+
+def _recipe(row: TableRow, section: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "version": 1,
+        "description": f"Tiny random weights in the place of {row.policy}.",
+        "adapter": LEROBOT_ADAPTER,
+        "default_n_action_steps": row.n_action_steps[0],
+        "finetune": section,
+    }

@@ -1,0 +1,243 @@
+"""Worker processes with a watchdog: whatever a worker does, an answer comes for every job.
+
+A worker that is busy with one thing for too long is asked where it hangs and then killed; one that
+dies is replaced; both give an `EpisodeError` with the cause. A process does the jobs of one setup key
+only: whatever a policy changes in its process, from the default dtype to numpy's functions, ends with
+the process. Knows nothing of environments, policies or files of results, nor of what a job is: the
+inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording_worker`.
+"""
+
+import signal
+import time
+from collections.abc import Collection, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self, cast
+
+from vla_eval.config.recipes import TimeoutConfig
+from vla_eval.core import Stage
+from vla_eval.evaluation.worker import DeviceFound, Failed
+from vla_eval.records import EpisodeError
+from vla_eval.workers.framing import BrokenMessageError
+from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
+from vla_eval.workers.start import worker_context
+
+__all__ = ["Answered", "Job", "JobSource", "WorkerMain", "WorkerPool"]
+
+TICK_SECONDS = 0.2
+DUMP_SECONDS = 0.5  # for a hanging worker to write where it hangs
+
+
+class Job(Protocol):
+    """What a worker can be told to do; it is sent to it by pickle."""
+
+    @property
+    def setup_key(self) -> Hashable:
+        """Jobs with the same one need the same preparation, which a process keeps; others get their own."""
+
+
+class JobSource[J: Job](Protocol):
+    """Where jobs come from; `JobQueue` is one."""
+
+    def __len__(self) -> int:
+        """How many jobs can be handed out now."""
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
+        """Return the next job for a worker that has `loaded` at hand, while others have `taken`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered[J: Job, A]:
+    """What came of one job."""
+
+    job: J
+    answer: A | Failed
+
+
+@dataclass(slots=True, kw_only=True)
+class _Worker[J: Job]:
+    """One process and what it was given to do."""
+
+    process: WorkerProcess
+    loaded: Hashable
+    job: J | None
+
+
+class WorkerPool[J: Job, A]:
+    """Some worker processes; a context manager that leaves none behind.
+
+    Args:
+        main: what a process runs: it answers each job `J` by an `A` or a `Failed`.
+        answers: the classes of `A`; anything else that a worker sends is an error.
+        size: how many processes at most.
+        timeouts: how long a worker may be busy with one thing.
+        logs: folder for what the workers write to standard output and error.
+        preload: modules that the workers need and that take long to import; see `worker_context`.
+    """
+
+    def __init__(
+        self,
+        main: WorkerMain,
+        *,
+        answers: tuple[type, ...],
+        size: int,
+        timeouts: TimeoutConfig,
+        logs: Path,
+        preload: Sequence[str] = (),
+    ) -> None:
+        """Start nothing yet: processes start when there is work for them."""
+        self._main = main
+        self._answers = (*answers, Failed)
+        self._size = size
+        self._limits: dict[Stage, float] = {
+            "setup": timeouts.setup_seconds,
+            "reset": timeouts.reset_seconds,
+            "step": timeouts.step_seconds,
+            "inference": timeouts.inference_seconds,
+        }
+        self._logs = logs
+        self._context = worker_context(preload=preload)
+        self._workers: dict[int, _Worker[J]] = {}
+
+    def __enter__(self) -> Self:
+        """Return the pool."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """End all processes: gently after success, at once after an exception."""
+        idle = [worker for worker in self._workers.values() if worker.job is None and kind is None]
+        for worker in idle:
+            worker.process.ask_to_close()
+        deadline = time.monotonic() + CLOSE_SECONDS
+        for worker in idle:
+            worker.process.wait(max(0.0, deadline - time.monotonic()))
+        for worker in self._workers.values():
+            worker.process.ask_to_end()
+        for worker in self._workers.values():
+            worker.process.end()
+        self._workers.clear()
+
+    def run(self, queue: JobSource[J]) -> Iterator[Answered[J, A] | DeviceFound | None]:
+        """Run all jobs of the queue; yields answers as they come, and None on every tick."""
+        while True:
+            self._hand_out(queue)
+            busy = {index: worker for index, worker in self._workers.items() if worker.job is not None}
+            if not busy:
+                return
+            wait([worker.process.connection for worker in busy.values()], timeout=TICK_SECONDS)
+            for index, worker in busy.items():
+                yield from self._look_at(index, worker)
+            yield None
+
+    def _hand_out(self, queue: JobSource[J]) -> None:
+        for index in range(self._size):
+            worker = self._workers.get(index)
+            if (worker is not None and worker.job is not None) or not len(queue):
+                continue
+            if worker is not None and worker.process.says_something():  # which an idle one does at its end
+                self._end(index)
+                worker = None
+            taken = {other.loaded for other in self._workers.values() if other is not worker}
+            job = queue.take(worker.loaded if worker else None, taken=taken)
+            assert job is not None  # the queue was not empty
+            if worker is None or worker.loaded != job.setup_key:
+                process = WorkerProcess(
+                    self._main,
+                    self._context,
+                    index=index,
+                    log=self._logs / f"worker-{index}.log",
+                    predecessor=worker.process if worker else None,
+                )
+                worker = self._workers[index] = _Worker(process=process, loaded=job.setup_key, job=None)
+            worker.job = job
+            worker.process.give(job)
+
+    def _look_at(self, index: int, worker: _Worker[J]) -> Iterator[Answered[J, A] | DeviceFound]:
+        """Take what a busy worker has said; then see whether it is alive, and in time."""
+        job = worker.job
+        assert job is not None  # only busy ones are looked at
+        error: EpisodeError | None
+        try:
+            for message in worker.process.read():
+                if isinstance(message, DeviceFound):
+                    yield message
+                    continue
+                if worker.job is None or not isinstance(message, self._answers):
+                    raise BrokenMessageError(
+                        f"expected an answer, found one of type {type(message).__name__}"
+                    )
+                worker.job = None
+                if isinstance(message, Failed):
+                    self._end(index)
+                yield Answered(job=job, answer=cast("A | Failed", message))
+                if isinstance(message, Failed):
+                    return
+            if worker.job is None:
+                return
+            error = self._overtime(index, worker.process)
+        except BrokenMessageError as exc:
+            self._end(index)
+            if worker.job is None:  # it has answered; what it says beyond that is nobody's
+                return
+            error = _crashed(worker.process, f"wrote into the parent's pipe or memory: {exc}")
+        except (EOFError, OSError):
+            exitcode = worker.process.wait(END_SECONDS)  # the pipe closes a moment before the process is gone
+            error = _crashed(worker.process, _cause_of_death(exitcode))
+            self._end(index)
+        if error is not None:
+            worker.job = None
+            yield Answered(job=job, answer=Failed(error=error, refused=False))
+
+    def _overtime(self, index: int, process: WorkerProcess) -> EpisodeError | None:
+        """Return an error if the worker could not be started, or if it is busy for too long; then kill it."""
+        if process.start_error is not None:
+            self._end(index)
+            return _crashed(process, f"could not be started: {process.start_error!r}")
+        busy = process.busy()
+        limit_seconds = self._limits[busy.stage]
+        if time.monotonic() - busy.since <= limit_seconds:
+            return None
+        process.ask_where()  # it writes the stack of every thread to its log
+        time.sleep(DUMP_SECONDS)
+        doing = "starting its process" if process.is_starting else f"busy with {busy.stage}"
+        self._end(index)
+        return EpisodeError(
+            kind=f"{busy.stage.capitalize()}Timeout",
+            stage=busy.stage,
+            message=f"The worker was {doing} for more than {limit_seconds:g} s and was "
+            f"stopped. Where it hung is in details. If this machine needs so long, raise the limit: "
+            f"--set timeouts.{busy.stage}_seconds={2 * limit_seconds:g}",
+            details=process.tail(),
+        )
+
+    def _end(self, index: int) -> None:
+        """Kill the process and whatever it has started."""
+        self._workers.pop(index).process.end()
+
+
+def _crashed(process: WorkerProcess, what: str) -> EpisodeError:
+    try:
+        stage: Stage = process.busy().stage
+    except BrokenMessageError:
+        stage = "setup"
+    return EpisodeError(
+        kind="WorkerCrashed",
+        stage=stage,
+        message=f"The worker process {what} during {stage}. The end of its output is in details, all of it "
+        f"in logs/{process.log.name}.",
+        details=process.tail(),
+    )
+
+
+def _cause_of_death(exitcode: int | None) -> str:
+    if exitcode is None:
+        return "closed its pipe without ending"
+    if exitcode >= 0:
+        return f"exited with code {exitcode}"
+    name = signal.Signals(-exitcode).name if -exitcode in set(signal.Signals) else f"signal {-exitcode}"
+    hint = " (often the kernel, for want of memory: use fewer --workers)" if name == "SIGKILL" else ""
+    return f"was killed by {name}{hint}"

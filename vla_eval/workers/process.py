@@ -1,0 +1,218 @@
+"""One worker process as its parent sees it: given jobs, listened to, ended. Decides nothing.
+
+Whatever may take long, or never end, is done in a thread: starting a process by a server that may have been
+stopped, handing a job to a process that does not read, waiting for the process before.
+"""
+
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext, ForkServerProcess, SpawnContext, SpawnProcess
+from pathlib import Path
+
+from vla_eval.core import Stage
+from vla_eval.evaluation.worker import MAX_DETAILS, STAGES, SharedStage, write_stage
+from vla_eval.workers.framing import BrokenMessageError, Inbox
+from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
+from vla_eval.workers.start import begin, end_server, worker_environment
+
+CLOSE_SECONDS = 5.0  # for closing a simulator; then it is killed
+END_SECONDS = REAP_SECONDS + 1  # the guard gives up earlier
+START_ATTEMPTS = 2  # the process that workers are forked from may have been killed: then there is a new one
+
+WorkerMain = Callable[[Connection, SharedStage, Path], None]
+"""Entry point of a worker process: pipe, shared memory for its stage, its log."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Busy:
+    """What a worker is busy with, and since when by `time.monotonic`: one clock for all of the machine."""
+
+    stage: Stage
+    since: float
+
+
+class WorkerProcess:
+    """One process; it starts with its first job.
+
+    Args:
+        main: what it runs.
+        context: what makes it.
+        index: which of the pool's workers it is, for messages.
+        log: where its standard output and error go.
+        predecessor: a process that is to end before this one starts: two policies are never loaded at once.
+
+    Attributes:
+        connection: our end of the pipe.
+        start_error: why it could not be started or handed a job.
+        is_starting: the system has been asked for the process and has not answered yet.
+    """
+
+    def __init__(
+        self,
+        main: WorkerMain,
+        context: ForkServerContext | SpawnContext,
+        *,
+        index: int,
+        log: Path,
+        predecessor: "WorkerProcess | None" = None,
+    ) -> None:
+        self.index = index
+        self.log = log
+        self.connection, self._their_connection = context.Pipe()
+        self.start_error: BaseException | None = None
+        self._inbox = Inbox(self.connection)
+        self._their_lifeline, self._lifeline = context.Pipe(duplex=False)
+        self._shared: SharedStage = context.RawArray("d", 2)
+        self._main = main
+        self._context = context
+        self._predecessor = predecessor
+        self._process: ForkServerProcess | SpawnProcess | None = None
+        self.is_starting = self._is_abandoned = False
+        self._thread: threading.Thread | None = None
+        self._log_offset = 0  # where the log of the present job begins
+        self._given_at = 0.0
+
+    def give(self, job: object) -> None:
+        """Have the process do a job, starting it if need be; returns at once."""
+        self._log_offset = self.log.stat().st_size if self.log.exists() else 0
+        self._given_at = time.monotonic()
+        write_stage(self._shared, "setup", self._given_at)
+        self._thread = threading.Thread(target=self._hand_over, args=(job,), daemon=True)
+        self._thread.start()
+
+    def read(self) -> list[object]:
+        """Return what it has sent; see `Inbox.read`."""
+        return self._inbox.read()
+
+    def says_something(self) -> bool:
+        """Whether there is something to read: of an idle worker, that it has ended or gone wrong."""
+        return self.connection.poll()
+
+    def busy(self) -> Busy:
+        """Return what it is busy with.
+
+        Raises:
+            BrokenMessageError: its memory holds something else, as after a stray write.
+        """
+        # The stage first, as `write_stage` writes it last.
+        stage, since = self._shared[1], self._shared[0]
+        if stage not in range(len(STAGES)) or not self._given_at <= since <= time.monotonic():
+            raise BrokenMessageError(
+                f"expected a stage and its time in shared memory, found {stage}, {since}"
+            )
+        return Busy(stage=STAGES[int(stage)], since=since)
+
+    def ask_where(self) -> None:
+        """Have it write the stack of every thread to its log."""
+        self._send(ASK_WHERE)
+
+    def wait(self, seconds: float) -> int | None:
+        """Wait for its end; return its exit code if there is one."""
+        deadline = time.monotonic() + seconds
+        if self._thread is not None:
+            self._thread.join(seconds)
+        if self._process is None:
+            return None
+        self._process.join(max(0.0, deadline - time.monotonic()))
+        return self._process.exitcode
+
+    def ask_to_close(self) -> None:
+        """Have an idle worker close its simulator and end."""
+        with contextlib.suppress(OSError):  # it has ended
+            self.connection.send(None)
+
+    def ask_to_end(self) -> None:
+        """Have the guard kill the process and whatever it has started."""
+        self._is_abandoned = True
+        self._send(END)
+
+    def end(self) -> None:
+        """Kill the process and whatever it has started, and wait until that is done."""
+        self.ask_to_end()
+        exitcode = self.wait(END_SECONDS)
+        if self.is_starting:
+            end_server()
+            exitcode = self.wait(END_SECONDS)
+        if self._process is not None and exitcode is None:
+            self._process.kill()
+            if self.wait(1.0) is None:
+                logger.warning(
+                    "Worker %d (process %s) does not end; going on without it.", self.index, self._process.pid
+                )
+        self.connection.close()
+        self._lifeline.close()
+
+    def tail(self) -> str | None:
+        """Return the end of what it has written since it was given its job."""
+        try:
+            with self.log.open("rb") as log:
+                log.seek(max(self._log_offset, self.log.stat().st_size - MAX_DETAILS))
+                return log.read(MAX_DETAILS).decode(errors="replace") or None
+        except FileNotFoundError:  # it ended before it opened its log
+            return None
+
+    def _send(self, request: bytes) -> None:
+        with contextlib.suppress(OSError):  # it has ended
+            os.write(self._lifeline.fileno(), request)
+
+    def _hand_over(self, job: object) -> None:
+        try:
+            if self._process is None:
+                self._start()
+            self.connection.send(job)
+        except (BrokenPipeError, ConnectionResetError) as exc:
+            logger.debug(
+                "worker %d: %s", self.index, exc
+            )  # it has ended: the parent reads that from the pipe
+        except BaseException as exc:  # the parent reports it
+            self.start_error = exc
+
+    def _start(self) -> None:
+        if self._predecessor is not None:
+            self._predecessor.ask_to_close()
+            self._predecessor.wait(CLOSE_SECONDS)
+            self._predecessor.end()
+            self._predecessor = None
+        try:
+            for attempt in range(START_ATTEMPTS):
+                try:
+                    self._start_once()
+                    break
+                except (EOFError, ConnectionError):
+                    if self._is_abandoned or attempt + 1 == START_ATTEMPTS:
+                        raise
+                    end_server()  # it is dying; another one is started once it is gone
+        finally:
+            self._their_connection.close()  # else its end would not be seen as an end of file
+            self._their_lifeline.close()
+
+    def _start_once(self) -> None:
+        with worker_environment() as environment:
+            if self._is_abandoned:
+                return
+            process = self._context.Process(
+                target=begin,
+                args=(
+                    environment,
+                    self._their_lifeline,
+                    self._main,
+                    self._their_connection,
+                    self._shared,
+                    self.log,
+                ),
+                name=f"mikasa-vla worker {self.index}",
+            )
+            self.is_starting = True
+            try:
+                process.start()
+            finally:
+                self.is_starting = False
+            self._process = process

@@ -1,0 +1,22 @@
+"""Imported by the process that workers are forked from; see `vla_eval.workers.start`."""
+
+import contextlib
+import importlib
+import os
+
+import vla_eval.evaluation.worker  # noqa: F401  # every worker needs it
+
+IMPORTS_VARIABLE = "MIKASA_VLA_WORKER_IMPORTS"
+"""Environment variable: names of further modules to import, separated by colons."""
+
+
+def import_for_workers() -> None:
+    """Import what workers will need; what cannot be imported, they report as the error of an episode."""
+    for name in filter(None, os.environ.get(IMPORTS_VARIABLE, "").split(":")):
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+
+
+if IMPORTS_VARIABLE in os.environ:  # else somebody imports this module for its names
+    os.setsid()  # signals to the command's group are for the command, which then ends its workers
+    import_for_workers()

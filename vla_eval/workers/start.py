@@ -1,0 +1,89 @@
+"""How worker processes begin: forked from one server that has imported what takes long.
+
+Importing torch, ManiSkill and lerobot takes seconds and hundreds of megabytes, for every worker and again
+after every error; a fork has them at once, and shares the memory. Where there is an NVIDIA driver each
+worker starts from nothing: a CUDA context does not survive a fork, and an import may open one.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext, SpawnContext
+
+from vla_eval.config.environment import Simulator
+from vla_eval.storage.provenance import nvidia_driver_version
+from vla_eval.workers.guard import fork_guarded
+from vla_eval.workers.server import IMPORTS_VARIABLE
+
+SERVER_MODULE = "vla_eval.workers.server"
+
+# One thread per worker: several workers share the cores, and sums do not depend on the number of threads.
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+
+_preloaded: dict[str, None] = {}
+_environment_lock = threading.Lock()  # several workers may be starting at once
+
+
+def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
+    """Return what makes worker processes.
+
+    Args:
+        preload: modules that the server imports before the first fork. The server starts with the first
+            worker of this process; what is named later, workers import.
+    """
+    if nvidia_driver_version() is not None:
+        return multiprocessing.get_context("spawn")
+    _preloaded.update(dict.fromkeys(preload))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([SERVER_MODULE])
+    return context
+
+
+def simulator_modules(simulator: Simulator) -> tuple[str, ...]:
+    """Return what workers that run a simulator need and what takes long to import."""
+    return ("vla_eval.envs.maniskill",) if simulator == "maniskill" else ()
+
+
+def begin(
+    environment: Mapping[str, str], lifeline: Connection, main: Callable[..., None], *args: object
+) -> None:
+    """Run `main` in a guarded worker as if the process had been started with this environment.
+
+    The server keeps the environment of its own start, which may be of an earlier pool.
+    """
+    fork_guarded(lifeline)
+    os.environ.clear()
+    os.environ.update(environment)
+    main(*args)
+
+
+def end_server() -> None:
+    """Kill the process that workers are forked from: it does not answer. The next worker starts another one.
+
+    Workers are not touched; the kernel keeps the dead process until `multiprocessing` sees that it is gone.
+    """
+    pid: int | None = getattr(forkserver._forkserver, "_forkserver_pid", None)  # there is no public name
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            os.kill(pid, signal.SIGKILL)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+@contextlib.contextmanager
+def worker_environment() -> Iterator[Mapping[str, str]]:
+    """Set the environment variables that a new process reads when it starts, unless the user has set them."""
+    with _environment_lock:
+        added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
+        os.environ.update(added)
+        try:
+            environment = dict(os.environ)
+            os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
+            yield environment
+        finally:
+            for name in (*added, IMPORTS_VARIABLE):
+                os.environ.pop(name, None)
