@@ -26,10 +26,11 @@ test: setup  ## run the tests that need neither GPU, network nor much time
 test-all: setup  ## run every test this machine can run
 	$(PYTEST) -m "not network and not parity"
 
-lint: setup  ## ruff and mypy --strict
+lint: setup  ## ruff, mypy --strict and import-linter
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+	$(BIN)/lint-imports --no-cache
 
 docs: setup  ## build the documentation into site/; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -48,3 +48,9 @@ def check_seeds(first: int, count: int = 1, *, name: str = "seed_start") -> None
             f"{name} is {first}: the last of {count} seeds would be {first + count - 1}, expected at most "
             f"{MAX_SEED}, the largest seed that numpy and ManiSkill take."
         )
+
+
+def require(condition: bool, name: str, found: object, expected: str) -> None:
+    """Raise `RecipeError` unless the condition holds: `name is found, expected expected`."""
+    if not condition:
+        raise RecipeError(f"{name} is {found!s:.200}, expected {expected}.")

@@ -4,6 +4,9 @@ One generator per (episode seed, purpose): what one purpose draws cannot shift w
 and neither batch size, device, order of episodes nor global random state plays a part.
 """
 
+import hashlib
+import random
+import sys
 from enum import IntEnum, unique
 
 import numpy as np
@@ -35,3 +38,17 @@ def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:
         A PCG64 generator; the same arguments always give the same draws.
     """
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(stream, *extra))))
+
+
+def seed_global_generators(*purpose: str | int) -> None:
+    """Seed `random`, numpy's and, if it is imported, torch's generators by what they are about to be for.
+
+    For policies that draw from generators that all code of a process shares; the harness never does. Without
+    this, their draws would depend on the episodes that the process happened to run before.
+    """
+    digest = hashlib.sha256(repr(purpose).encode()).digest()
+    random.seed(digest)  # noqa: TID251  # for the draws of others
+    np.random.seed(np.frombuffer(digest, dtype="<u4"))  # noqa: TID251
+    torch = sys.modules.get("torch")  # not imported for this: that takes seconds
+    if torch is not None:
+        torch.manual_seed(int.from_bytes(digest[:8], "little") >> 1)

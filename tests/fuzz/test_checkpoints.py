@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from lerobot.policies.act.configuration_act import ACTConfig
 from safetensors.numpy import save_file
 
-from vla_eval.config.policy import load_policy_recipe
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies import lerobot_loading
 from vla_eval.policies.adapter_config import read_adapter_config
@@ -19,6 +18,7 @@ from vla_eval.policies.checkpoint import checkpoint_sha256
 from vla_eval.policies.checkpoint_notes import normalization_notes
 from vla_eval.policies.lerobot_loading import LoadOptions, read_config
 from vla_eval.policies.processor_door import resolve_step
+from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.saved_processor import check_paths, read_saved_processor
 
 CONFIG, PREPROCESSOR, ADAPTER = "config.json", "policy_preprocessor.json", "adapter_config.json"

@@ -14,8 +14,9 @@ from tests.fuzz.recipe_cases import FRAGMENTS, ODD_SCALARS, outcome, plain, yaml
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import apply_overrides, to_data
 from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.config.recipes import EvalConfig, apply_overrides, to_data
 
 BASES: dict[type[Any], dict[str, Any]] = {
     EvalConfig: {"name": "x", "tasks": ["RememberColor3-v0"], "policies": ["random"]},

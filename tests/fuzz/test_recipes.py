@@ -12,16 +12,11 @@ from tests.fuzz.recipe_cases import changed_recipe, damaged_text, outcome, shipp
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode, load_yaml
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import Folder, Recipe, load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.config.recipes import (
-    EvalConfig,
-    Folder,
-    PolicyRecipe,
-    PromptRecipe,
-    Recipe,
-    load_recipe,
-    to_data,
-)
+from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.prompts import PromptRecipe
 from vla_eval.data.recording_plan import plan_recording
 from vla_eval.evaluation.grid import ModelTable, finetunings, is_model_table
 from vla_eval.evaluation.plan import fingerprint, make_plan

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.records import EpisodeRecord

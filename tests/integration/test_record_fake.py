@@ -37,9 +37,10 @@ from vla_eval.data.recording_worker import RecordingRunner
 from vla_eval.data.replay_report import require_passed
 from vla_eval.data.shard_writer import ShardWriter
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
-from vla_eval.evaluation.worker import Failed, Heartbeat
 from vla_eval.storage.durable import FolderLock
 from vla_eval.training.dataset import training_dataset
+from vla_eval.workers.inside import Heartbeat
+from vla_eval.workers.messages import Failed
 
 TASK = "RememberColor3-v0"
 FIELDS: dict[str, Any] = {

@@ -15,7 +15,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.capture import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.config.decoding import decode
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, VlaEvalError

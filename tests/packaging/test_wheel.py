@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = ("configs", "policies", "prompts", "datasets")
 
 LIST_RECIPES = """
-import json, vla_eval, vla_eval.config.recipes as recipes
+import json, vla_eval, vla_eval.config.files as recipes
 names = {folder: sorted(recipes.list_recipes(folder)) for folder in %r}
 texts = [path.read_text(encoding="utf-8") for f in names for path in recipes.list_recipes(f).values()]
 print(json.dumps({"file": vla_eval.__file__, "names": names, "all_read": all(texts)}))

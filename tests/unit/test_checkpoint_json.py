@@ -9,7 +9,6 @@ import pytest
 from lerobot.policies.act.configuration_act import ACTConfig
 
 from vla_eval.cli.main import main
-from vla_eval.config.policy import load_policy_recipe
 from vla_eval.errors import CheckpointError
 from vla_eval.policies import checkpoint_json
 from vla_eval.policies.adapter_config import lora_fields
@@ -17,6 +16,7 @@ from vla_eval.policies.checkpoint import adapter_bases, checkpoint_sha256
 from vla_eval.policies.checkpoint_json import parse_json, read_json
 from vla_eval.policies.checkpoint_notes import normalization_notes
 from vla_eval.policies.config_check import check_config
+from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.saved_processor import read_saved_processor
 
 DAMAGED: dict[str, tuple[bytes, str]] = {

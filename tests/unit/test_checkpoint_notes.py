@@ -10,7 +10,7 @@ from safetensors.numpy import save_file
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.data.recording_plan import plan_recording
 from vla_eval.errors import CheckpointError, TaskArgumentError
 from vla_eval.evaluation.plan import Plan, make_plan

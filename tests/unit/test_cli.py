@@ -10,7 +10,7 @@ import pytest
 
 from vla_eval.cli.main import VERBS, main
 from vla_eval.cli.show import task_arguments
-from vla_eval.config.recipes import list_recipes
+from vla_eval.config.files import list_recipes
 from vla_eval.tasks.catalog import TASKS, task_spec
 
 HEAVY = ("torch", "sapien", "mani_skill", "gymnasium", "lerobot", "cv2", "rerun", "transformers")

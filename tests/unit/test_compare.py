@@ -9,7 +9,8 @@ from scipy import stats
 from tests.unit.stored_runs import stored
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.cli.main import main
-from vla_eval.config.recipes import EvalConfig, load_recipe
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.records import EpisodeRecord

@@ -7,8 +7,9 @@ import pytest
 from vla_eval.cli.main import build_parser, main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
-from vla_eval.config.recipes import EvalConfig, apply_overrides
 from vla_eval.errors import RecipeError
 
 EVAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import list_recipes, load_recipe
+from vla_eval.config.files import list_recipes, load_recipe
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.exact_statistics import count_levels, image_statistics, vector_statistics
 from vla_eval.data.seed_queue import SeedQueue

@@ -18,7 +18,9 @@ from vla_eval.cli.main import VERBS, build_parser, main
 from vla_eval.cli.show import task_arguments
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import EvalConfig, PolicyRecipe, find_recipe, load_recipe
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import find_recipe, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.evaluation.grid import is_model_table, load_model_table
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments

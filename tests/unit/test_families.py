@@ -9,7 +9,7 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.decoding import decode
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import TaskArgumentError, UnknownNameError

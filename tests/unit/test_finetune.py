@@ -19,13 +19,13 @@ from tests.unit.tiny_trainings import SHORT, TASK, act, context, pi0
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.config.policy import load_policy_recipe
 from vla_eval.core import EpisodeStart
 from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
 from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts
 from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.tiny_models import Family, make_tiny_pi0, tiny_paligemma, write_tiny_smolvlm
 from vla_eval.training.finetune import finetune

@@ -10,8 +10,9 @@ import torch
 from tests.unit import tiny_trainings
 from tests.unit.tiny_trainings import act, context, pi0
 from vla_eval.cli.main import main
+from vla_eval.config.files import list_recipes, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.config.recipes import PolicyRecipe, list_recipes, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, write_entry
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError

@@ -14,8 +14,8 @@ from safetensors.torch import load_file
 
 from tests.unit import tiny_trainings
 from vla_eval.cli.main import main
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation
-from vla_eval.config.recipes import EvalConfig
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.policies.checkpoint import find_checkpoint

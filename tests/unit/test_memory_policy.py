@@ -9,8 +9,9 @@ import torch
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
+from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
-from vla_eval.config.recipes import PolicyRecipe, load_recipe, to_data
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, UnknownNameError

@@ -12,8 +12,9 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import build_parser, main
 from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.config.environment import EnvSettings
+from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.config.recipes import PolicyRecipe, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import FolderInUseError, VlaEvalError

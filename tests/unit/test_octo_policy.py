@@ -19,7 +19,8 @@ from tests.unit.tiny_octo import GOLDEN, TINY
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.recipes import PolicyRecipe, load_recipe
+from vla_eval.config.files import load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, MissingInstructionError

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from tests.unit import openvla_golden as golden
+from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.config.recipes import PolicyRecipe, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import (
     MissingInstructionError,
     RecipeError,

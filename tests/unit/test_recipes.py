@@ -8,15 +8,9 @@ import pytest
 
 from vla_eval.config import shipped
 from vla_eval.config.decoding import decode, load_yaml
-from vla_eval.config.recipes import (
-    EvalConfig,
-    PolicyRecipe,
-    apply_overrides,
-    find_recipe,
-    list_recipes,
-    load_recipe,
-    to_data,
-)
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import apply_overrides, find_recipe, list_recipes, load_recipe, to_data
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError, VlaEvalError
 from vla_eval.evaluation.grid import is_model_table, load_model_table
 from vla_eval.evaluation.job_queue import JobQueue

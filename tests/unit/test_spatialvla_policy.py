@@ -11,8 +11,9 @@ from PIL import Image
 from scipy.stats import norm
 
 from tests.unit import spatialvla_golden as golden
+from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.config.recipes import PolicyRecipe, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import (
     MissingInstructionError,

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Which tasks can be won without memory: the controls that need none, played on every task. Runs nothing itself."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import p_above, p_more

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""How fast this machine renders and loads, as ratios measured in one run."""

@@ -7,7 +7,8 @@ from typing import Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import EvalConfig, apply_overrides
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import apply_overrides
 
 DESCRIPTION = """Play every task with the controls that need no memory, and with the oracle, and say by which
 road each can be won: without acting, by touching one candidate after another, by staying at the cue,

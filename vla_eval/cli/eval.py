@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
 from vla_eval.config.decoding import decode, set_field
-from vla_eval.config.policy import policy_name
-from vla_eval.config.recipes import EvalConfig, apply_overrides, load_recipe
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
+from vla_eval.policies.recipe import policy_name
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun

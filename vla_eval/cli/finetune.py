@@ -7,8 +7,8 @@ from typing import Any
 
 from vla_eval.cli.arguments import typed_command
 from vla_eval.config.decoding import decode, set_field
+from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
-from vla_eval.config.recipes import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import is_model_table
 

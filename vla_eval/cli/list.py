@@ -5,8 +5,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import Folder, list_recipes, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import instruction_for, load_prompts
-from vla_eval.config.recipes import EvalConfig, Folder, PolicyRecipe, list_recipes, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters

@@ -9,7 +9,7 @@ from types import FrameType
 from typing import Any
 
 from vla_eval.cli.episode_bar import EpisodeBar
-from vla_eval.config.recipes import EvalConfig
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vla_eval.cli.arguments import typed_command, workers_argument
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
-from vla_eval.config.recipes import apply_overrides, load_recipe
+from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 from vla_eval.config.environment import RenderSettings, Simulator
-from vla_eval.config.recipes import TimeoutConfig, check_run_name, to_data
+from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.config.files import check_run_name, to_data
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings, StateKind
 

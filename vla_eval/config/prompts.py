@@ -1,10 +1,41 @@
 """The language instruction of a task, from `prompts/*.yaml`. Knows nothing of simulators or policies."""
 
-from vla_eval.config.recipes import PromptRecipe, Recipe, load_recipe
+from dataclasses import dataclass
+from typing import Protocol
+
+from vla_eval.config.files import Recipe, load_recipe
 from vla_eval.errors import MissingInstructionError, did_you_mean
-from vla_eval.tasks.spec import TaskSpec
 
 DEFAULT_PROMPT_SET = "paper"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PromptRecipe:
+    """`prompts/*.yaml`: the instructions of the tasks, under one name.
+
+    Attributes:
+        version: raised when a sentence changes.
+        description: one sentence.
+        source: where the sentences come from.
+        instructions: instruction key of a task -> its sentence, then paraphrases of it.
+    """
+
+    version: int
+    description: str
+    source: str
+    instructions: dict[str, tuple[str, ...]]
+
+
+class Instructed(Protocol):
+    """What has an instruction: a task, by its id and its key in the prompt sets."""
+
+    @property
+    def id(self) -> str:
+        """The task id."""
+
+    @property
+    def instruction_key(self) -> str:
+        """Under which key a prompt set has its sentences."""
 
 
 def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
@@ -12,12 +43,12 @@ def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
     return load_recipe("prompts", prompt_set, PromptRecipe)
 
 
-def instructions_for(spec: TaskSpec, prompt_set: str = DEFAULT_PROMPT_SET) -> tuple[str, ...]:
+def instructions_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> tuple[str, ...]:
     """Return the sentence of a task and then its paraphrases; errors as `load_prompts` and `sentences_of`."""
     return sentences_of(load_prompts(prompt_set), spec)
 
 
-def sentences_of(prompts: Recipe[PromptRecipe], spec: TaskSpec) -> tuple[str, ...]:
+def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, ...]:
     """Return what a set says for a task: the sentence, then its paraphrases.
 
     Raises:
@@ -35,6 +66,6 @@ def sentences_of(prompts: Recipe[PromptRecipe], spec: TaskSpec) -> tuple[str, ..
     return sentences
 
 
-def instruction_for(spec: TaskSpec, prompt_set: str = DEFAULT_PROMPT_SET) -> str:
+def instruction_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> str:
     """Return the sentence of a task, word for word as the set has it; errors as `instructions_for`."""
     return instructions_for(spec, prompt_set)[0]

@@ -32,13 +32,13 @@ from vla_eval.data.recording_jobs import (
 from vla_eval.data.recording_plan import RecordingPlan, plan_recording
 from vla_eval.data.seed_queue import SeedQueue, Selection
 from vla_eval.errors import RecordingError
-from vla_eval.evaluation.evaluate import as_exception, available_cores
-from vla_eval.evaluation.worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
 from vla_eval.workers.framing import send_message
+from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.pool import WorkerPool
-from vla_eval.workers.start import simulator_modules
+from vla_eval.workers.start import available_cores, simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording_worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
+from vla_eval.config.files import Recipe, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import load_prompts, sentences_of
-from vla_eval.config.recipes import PolicyRecipe, Recipe, load_recipe
 from vla_eval.data.demonstrations import ONE_BY_ONE
 from vla_eval.data.recording_jobs import TaskPlan
 from vla_eval.evaluation.plan import Group, GroupKey

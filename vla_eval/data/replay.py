@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, Protocol
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.recipes import TimeoutConfig
+from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.episode_check import STATE_TOLERANCE
 from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import (
@@ -29,14 +29,14 @@ from vla_eval.data.manifest import (
 )
 from vla_eval.data.replay_report import keep_report, manifest_sha256
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
-from vla_eval.evaluation.evaluate import as_exception, available_cores
-from vla_eval.evaluation.worker import DeviceFound, Failed, Heartbeat, SharedStage, detach, serve
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.framing import send_message
+from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.pool import Answered, WorkerPool
-from vla_eval.workers.start import simulator_modules
+from vla_eval.workers.start import available_cores, simulator_modules
 
 WORKER_MODULE = "vla_eval.data.replay_worker"
 MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver")

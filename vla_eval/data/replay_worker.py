@@ -15,8 +15,9 @@ from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay import EpisodeReplayed, ReplayJob
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import VlaEvalError
-from vla_eval.evaluation.worker import DeviceFound, Failed, Heartbeat, describe_error
 from vla_eval.features import CAMERA_KEYS
+from vla_eval.workers.inside import Heartbeat
+from vla_eval.workers.messages import DeviceFound, Failed, describe_error
 
 logger = logging.getLogger(__name__)
 

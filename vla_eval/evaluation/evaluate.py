@@ -6,15 +6,13 @@ means, the same call goes on where it stopped.
 """
 
 import functools
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from vla_eval import errors
-from vla_eval.config.recipes import EvalConfig
-from vla_eval.errors import TooManyErrorsError, VlaEvalError
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.plan import (
     EpisodeJob,
@@ -25,17 +23,19 @@ from vla_eval.evaluation.plan import (
     options_of,
     results_config,
 )
-from vla_eval.evaluation.worker import DeviceFound, Failed, Finished, worker_main
+from vla_eval.evaluation.worker import Finished, worker_main
 from vla_eval.policies.registry import own_modules
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder
 from vla_eval.viz.recorder import Recorder
+from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.pool import Answered, WorkerMain, WorkerPool
-from vla_eval.workers.start import simulator_modules
+from vla_eval.workers.start import available_cores, simulator_modules
 
 RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
+WORKER_MODULE = "vla_eval.evaluation.worker"
 
 
 class EvaluationObserver(Protocol):
@@ -139,11 +139,6 @@ def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int) -> int:
     return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
     return RunDescription(
         name=config.name,
@@ -163,7 +158,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
 def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
     """Return what takes workers long to import; other packages' code is left out: it may not bear a fork."""
     adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
-    return (*simulator_modules(config.simulator), *own_modules(adapters))
+    return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
 
 
 def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Sequence[str]) -> bool:
@@ -242,13 +237,3 @@ class _Bookkeeper:
                 f"{error.stage}: {error.message} All results are kept in {self.path}; the same command "
                 f"retries the errors."
             )
-
-
-def as_exception(error: EpisodeError) -> VlaEvalError:
-    """Return the worker's exception again; a class of another package becomes its nearest one of ours."""
-    cls = getattr(errors, error.kind, VlaEvalError)
-    return (
-        cls(error.message)
-        if isinstance(cls, type) and issubclass(cls, VlaEvalError)
-        else VlaEvalError(error.message)
-    )

@@ -21,10 +21,12 @@ from vla_eval.bounds import (
     check_seeds,
 )
 from vla_eval.config.environment import RenderSettings, Simulator
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import check_run_name, load_recipe, recipe_fields
 from vla_eval.config.finetuning import FinetuneConfig, merge_fields
-from vla_eval.config.policy import LEROBOT_ADAPTER
-from vla_eval.config.recipes import EvalConfig, PolicyRecipe, check_run_name, load_recipe, recipe_fields
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, check_names
+from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.storage.durable import replace_file
 from vla_eval.tasks.catalog import task_spec
 

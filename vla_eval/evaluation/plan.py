@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 
 from vla_eval.bounds import MAX_EPISODES
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.policy import load_policy_recipe
+from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
+from vla_eval.config.files import Recipe, to_data
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import load_prompts, sentences_of
-from vla_eval.config.recipes import OPTION_FIELDS, EvalConfig, PolicyRecipe, Recipe, to_data
 from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
+from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import check_adapter
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings

@@ -5,46 +5,34 @@ its log and, if asked, recordings of its episodes. After an error it is replaced
 native library or a GPU context may be left in a state that no rebuilding within the process mends.
 """
 
-import ctypes
 import dataclasses
-import faulthandler
 import functools
 import inspect
 import logging
-import os
-import signal
-import sys
-import time
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import EpisodeStart, Policy, SimEnv, Stage
+from vla_eval.core import EpisodeStart, Policy, SimEnv
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
 from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.evaluation.plan import EpisodeJob, Group
-from vla_eval.global_generators import seed_global_generators
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import policy_factory
-from vla_eval.records import EpisodeError, EpisodeRecord, EpisodeTiming
+from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
+from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.viz.recorder import Recorder
 from vla_eval.workers.framing import send_message
-
-STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
-MAX_DETAILS = 20_000  # characters of a traceback or a message; the log has it all
-MAX_KIND = 200  # characters of an exception's class
+from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.messages import DeviceFound, Failed, describe_error
 
 logger = logging.getLogger(__name__)
-
-SharedStage = ctypes.Array[ctypes.c_double]
-"""(time.monotonic() when the stage began, index of the stage), in memory shared with the parent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,96 +43,11 @@ class Finished:
     timings: tuple[EpisodeTiming, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Failed:
-    """An episode, or one of a batch, could not be run.
-
-    Attributes:
-        error: what happened.
-        refused: environment and policy cannot be made or do not fit, for a reason that this package
-            knows: it will be the same for every episode of the group.
-    """
-
-    error: EpisodeError
-    refused: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceFound:
-    """What the environment says of the device it runs on."""
-
-    device: Mapping[str, str]
-
-
 class EnvFacts(NamedTuple):
     """What a policy is told of an environment before it is made."""
 
     spec: EnvSpec
     n_candidates: int
-
-
-class Heartbeat:
-    """Says in shared memory what the worker is busy with, and adds up the time per stage."""
-
-    def __init__(self, shared: SharedStage) -> None:
-        """Take the memory to write to."""
-        self._shared = shared
-        self._stage: Stage | None = None
-        self._since = 0.0
-        self.seconds: dict[Stage, float] = dict.fromkeys(STAGES, 0.0)
-
-    def __call__(self, stage: Stage) -> None:
-        """Begin a stage."""
-        now = time.monotonic()
-        self._add_up(now)
-        self._stage, self._since = stage, now
-        write_stage(self._shared, stage, now)
-
-    @property
-    def stage(self) -> Stage:
-        """The stage that was begun last."""
-        return self._stage or "setup"
-
-    def _add_up(self, now: float) -> None:
-        if self._stage is not None:
-            self.seconds[self._stage] += now - self._since
-
-    def begin_batch(self) -> None:
-        """Forget the times of the last batch."""
-        self._stage = None
-        self.seconds = dict.fromkeys(STAGES, 0.0)
-
-    def timings(self, jobs: Sequence[EpisodeJob]) -> tuple[EpisodeTiming, ...]:
-        """Return the times of the batch that has just ended, an equal share for each episode."""
-        self._add_up(time.monotonic())
-        self._stage = None
-        share = {stage: seconds / len(jobs) for stage, seconds in self.seconds.items()}
-        return tuple(
-            EpisodeTiming(
-                key=job.key,
-                total_seconds=sum(share.values()),
-                reset_seconds=share["reset"],
-                step_seconds=share["step"],
-                inference_seconds=share["inference"],
-            )
-            for job in jobs
-        )
-
-
-def write_stage(shared: SharedStage, stage: Stage, now: float) -> None:
-    """Begin a stage; the time first, so that no reader sees a new stage with an old time."""
-    shared[0] = now
-    shared[1] = STAGES.index(stage)
-
-
-class Runner(Protocol):
-    """What answers the jobs of a worker."""
-
-    def answer(self, job: Any) -> object:  # Any: what the parent sends
-        """Do the job; whatever goes wrong becomes a `Failed`."""
-
-    def close(self) -> None:
-        """Release the simulator."""
 
 
 class EpisodeRunner:
@@ -207,7 +110,7 @@ class EpisodeRunner:
             self._recorder.write(
                 batch.jobs, tapes, named, control_hz=env.spec.control_hz, heartbeat=self._heartbeat
             )
-        return Finished(records=named, timings=self._heartbeat.timings(batch.jobs))
+        return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
@@ -284,22 +187,6 @@ def make_policy(group: Group, facts: EnvFacts) -> Policy:
     return factory(context, **group.args)
 
 
-def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
-    """Return what is recorded of an exception."""
-    try:
-        message = str(exc)
-    except Exception as in_turn:  # a policy's exception may have a mistake of its own
-        message = f"its message cannot be read ({type(in_turn).__name__})"
-    if len(message) > MAX_DETAILS:
-        message = f"{message[:MAX_DETAILS]} … ({len(message) - MAX_DETAILS:,} characters left out)"
-    return EpisodeError(
-        kind=type(exc).__name__[:MAX_KIND],
-        stage=stage,
-        message=message or f"{type(exc).__name__[:MAX_KIND]} without a message",
-        details="".join(traceback.format_exception(exc))[-MAX_DETAILS:],
-    )
-
-
 def worker_main(
     connection: Connection,
     shared: SharedStage,
@@ -310,26 +197,3 @@ def worker_main(
     detach(log)
     tell = functools.partial(send_message, connection)
     serve(connection, EpisodeRunner(Heartbeat(shared), tell, recorder))
-
-
-def serve(connection: Connection, runner: Runner) -> None:
-    """Answer one job after the other until the parent sends None or closes the pipe."""
-    try:
-        while (job := connection.recv()) is not None:
-            send_message(connection, runner.answer(job))
-    except (EOFError, BrokenPipeError, ConnectionResetError) as exc:
-        logger.warning("the parent is gone: %r", exc)
-    runner.close()
-
-
-def detach(log: Path) -> None:
-    """Send all output to the log, and leave the terminal's signals to the parent."""
-    os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    os.dup2(descriptor, sys.__stdout__.fileno() if sys.__stdout__ else 1)
-    os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
-    os.close(descriptor)
-    faulthandler.enable(file=2, all_threads=True)
-    faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it hangs
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")

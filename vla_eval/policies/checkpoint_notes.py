@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any  # JSON of another program
 
-from vla_eval.config.policy import LEROBOT_ADAPTER
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
@@ -17,6 +16,7 @@ from vla_eval.policies.checkpoint import (
     read_facts,
 )
 from vla_eval.policies.checkpoint_json import get_mapping, get_text
+from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.policies.saved_processor import SavedStep, read_saved_processor
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 

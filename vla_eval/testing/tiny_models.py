@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any, Literal  # lerobot and transformers are untyped
 from unittest.mock import patch
 
-from vla_eval.evaluation.worker import SharedStage, worker_main
+from vla_eval.evaluation.worker import worker_main
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.workers.inside import SharedStage
 
 Family = Literal["pi0", "pi05", "pi0_fast"]
 VOCABULARY = 512

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.config.recipes import to_data
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
 from vla_eval.storage.durable import FolderLock
 from vla_eval.storage.provenance import collect_environment

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.dataset import EVALUATION_SEEDS
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutEvaluation
-from vla_eval.config.recipes import EvalConfig, to_data
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import evaluate

@@ -12,8 +12,9 @@ from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from vla_eval.config.decoding import decode
+from vla_eval.config.files import Recipe, load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation, merge_fields
-from vla_eval.config.recipes import PolicyRecipe, Recipe, load_recipe, to_data
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS

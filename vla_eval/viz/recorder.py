@@ -4,17 +4,32 @@ import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from vla_eval.config.capture import RecordingConfig, is_wanted, may_be_wanted
 from vla_eval.core import Stage
-from vla_eval.evaluation.plan import EpisodeJob
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.recording_files import rrd_file, thumbnail_file, video_file
 from vla_eval.viz.tape import Tapes
 
 VIDEO_WRITER = "vla_eval.viz.video:write_video"
 RRD_WRITER = "vla_eval.viz.rerun_log:write_rrd"
+
+
+class Recordable(Protocol):
+    """An episode, as far as it decides whether it is recorded."""
+
+    @property
+    def slot(self) -> int:
+        """The slot it runs in."""
+
+    @property
+    def run(self) -> int:
+        """Its run."""
+
+    @property
+    def seed(self) -> int:
+        """Its seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +52,7 @@ class Recorder:
             if which != "none":
                 _import(writer)
 
-    def tapes(self, jobs: Sequence[EpisodeJob]) -> Tapes | None:
+    def tapes(self, jobs: Sequence[Recordable]) -> Tapes | None:
         """Return the observer of a batch; None if none of its episodes can be wanted."""
         slots = {
             job.slot
@@ -51,7 +66,7 @@ class Recorder:
 
     def write(
         self,
-        jobs: Sequence[EpisodeJob],
+        jobs: Sequence[Recordable],
         tapes: Tapes,
         records: Sequence[EpisodeRecord],
         *,
@@ -87,7 +102,7 @@ class Recorder:
                 heartbeat("step")
                 _import(RRD_WRITER)(tape, record, rrd_file(self.folder, record), control_hz=control_hz)
 
-    def _wants(self, which: Any, job: EpisodeJob, record: EpisodeRecord) -> bool:
+    def _wants(self, which: Any, job: Recordable, record: EpisodeRecord) -> bool:
         index = job.seed - self.seed_start
         return is_wanted(which, run=job.run, index=index, is_success=record.outcome == "success")
 

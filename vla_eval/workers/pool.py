@@ -16,11 +16,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self, cast
 
-from vla_eval.config.recipes import TimeoutConfig
+from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.core import Stage
-from vla_eval.evaluation.worker import DeviceFound, Failed
 from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
+from vla_eval.workers.messages import DeviceFound, Failed
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
 from vla_eval.workers.start import worker_context
 

@@ -16,9 +16,10 @@ from multiprocessing.context import ForkServerContext, ForkServerProcess, SpawnC
 from pathlib import Path
 
 from vla_eval.core import Stage
-from vla_eval.evaluation.worker import MAX_DETAILS, STAGES, SharedStage, write_stage
 from vla_eval.workers.framing import BrokenMessageError, Inbox
 from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
+from vla_eval.workers.inside import STAGES, SharedStage, write_stage
+from vla_eval.workers.messages import MAX_DETAILS
 from vla_eval.workers.start import begin, end_server, worker_environment
 
 CLOSE_SECONDS = 5.0  # for closing a simulator; then it is killed

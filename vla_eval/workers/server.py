@@ -4,8 +4,6 @@ import contextlib
 import importlib
 import os
 
-import vla_eval.evaluation.worker  # noqa: F401  # every worker needs it
-
 IMPORTS_VARIABLE = "MIKASA_VLA_WORKER_IMPORTS"
 """Environment variable: names of further modules to import, separated by colons."""
 

@@ -87,3 +87,8 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
         finally:
             for name in (*added, IMPORTS_VARIABLE):
                 os.environ.pop(name, None)
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

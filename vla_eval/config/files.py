@@ -2,31 +2,21 @@
 
 A recipe is a file in one of four folders: `configs/`, `policies/`, `prompts/`, `datasets/`. It is
 found by a given path, then in the working directory's folder, then among the ones that come with the
-package. Knows nothing of tasks, policies or simulators: whether a named task exists is not its affair.
+package. Knows nothing of what the recipes mean.
 """
 
 import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from vla_eval.bounds import (
-    MAX_EPISODES,
-    MAX_PROCESSES,
-    MAX_SECONDS,
-    MAX_SLOTS,
-    MAX_STEPS,
-    check_bounds,
-    check_seeds,
+    require,
 )
-from vla_eval.chunking import ChunkingSpec
-from vla_eval.config.capture import RecordingConfig
 from vla_eval.config.decoding import decode, set_field
-from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
-from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.shipped import search_folders
 from vla_eval.config.yaml_data import MAX_CHARACTERS, load_yaml
 from vla_eval.errors import MAX_SHOWN, RecipeError, unknown_name
@@ -51,148 +41,10 @@ class Recipe[T]:
     value: T
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PolicyRecipe:
-    """`policies/*.yaml`: which code and which weights, under one name.
-
-    Attributes:
-        version: raised when a change of the recipe moves a success rate.
-        description: one sentence.
-        adapter: a name from the registry (`mikasa-vla list policies`) or `module:attr`.
-        args: keyword arguments of the adapter.
-        default_n_action_steps: actions executed per inference, where the evaluation names none.
-        max_workers: how many workers `workers: auto` may start, since each loads the policy.
-        needs_candidates: the policy makes no sense for a task without candidates; such a pair is left out.
-        finetune: how weights for it are trained; None for policies that have nothing to train.
-    """
-
-    version: int
-    description: str
-    adapter: str
-    args: dict[str, Any] = field(default_factory=dict)  # Any: whatever the adapter takes
-    default_n_action_steps: int = 1
-    max_workers: int | None = None
-    needs_candidates: bool = False
-    finetune: FinetuneRecipe | None = None
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        check_bounds(self, {"default_n_action_steps": (1, MAX_STEPS), "max_workers": (1, MAX_PROCESSES)})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PromptRecipe:
-    """`prompts/*.yaml`: the instructions of the tasks, under one name.
-
-    Attributes:
-        version: raised when a sentence changes.
-        description: one sentence.
-        source: where the sentences come from.
-        instructions: instruction key of a task -> its sentence, then paraphrases of it.
-    """
-
-    version: int
-    description: str
-    source: str
-    instructions: dict[str, tuple[str, ...]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChunkingConfig:
-    """How chunks of actions are executed; `vla_eval.chunking` explains it."""
-
-    mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
-    delay_steps: int = 0
-    delay_alignment: Literal["skip", "stale"] = "skip"
-    ensemble_decay: float = 0.01
-
-    def spec(self, n_action_steps: int) -> ChunkingSpec:
-        """Return the chunking of one evaluation."""
-        return ChunkingSpec(n_action_steps=n_action_steps, **dataclasses.asdict(self))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimeoutConfig:
-    """Seconds after which a worker that is busy with one thing is killed."""
-
-    setup_seconds: float = 900.0
-    reset_seconds: float = 120.0
-    step_seconds: float = 120.0
-    inference_seconds: float = 300.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        least_and_most = (0.001, MAX_SECONDS)
-        check_bounds(self, {f.name: least_and_most for f in dataclasses.fields(self)}, prefix="timeouts.")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvalConfig:
-    """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys.
-
-    Raises:
-        RecipeError: a value out of its range, or something named twice.
-    """
-
-    name: str
-    tasks: tuple[str, ...]
-    policies: tuple[str, ...]
-    description: str = ""
-    n_action_steps: tuple[int, ...] | None = None
-    episodes: int = 100
-    seed_start: int = 1
-    runs: int = 1
-    prompt_set: str = "paper"
-    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
-    chunking: ChunkingConfig = field(default_factory=ChunkingConfig)
-    render: RenderSettings = field(default_factory=RenderSettings)
-    simulator: Simulator = "maniskill"
-    sim_backend: SimBackend = "cpu"
-    stop_at_success: bool = False
-    eager_rendering: bool = False
-    slots_per_worker: int = 1
-    workers: int | Literal["auto"] = "auto"
-    timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
-    max_consecutive_errors: int = 10
-    recording: RecordingConfig = field(default_factory=RecordingConfig)
-
-    def __post_init__(self) -> None:
-        """Check what a type cannot say."""
-        check_run_name(self.name)
-        check_bounds(
-            self,
-            {
-                "episodes": (1, MAX_EPISODES),
-                "runs": (1, MAX_EPISODES),
-                "slots_per_worker": (1, MAX_SLOTS),
-                "max_consecutive_errors": (1, MAX_EPISODES),
-                "workers": (1, MAX_PROCESSES),
-            },
-        )
-        check_seeds(self.seed_start, self.episodes)
-        for name in ("tasks", "policies", "n_action_steps"):
-            values = getattr(self, name)
-            _require(values is None or len(values) > 0, name, values, "at least one")
-            _require(
-                values is None or len(set(values)) == len(values), name, list(values or ()), "no doubles"
-            )
-        for n_action_steps in self.n_action_steps or (1,):
-            self.chunking.spec(n_action_steps)  # checks the ranges
-
-
-OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "recording")
-"""Fields of `EvalConfig` that move no result: they may differ when a run is continued."""
-
-
-def _require(condition: bool, name: str, found: object, expected: str) -> None:
-    if not condition:
-        raise RecipeError(f"{name} is {found!s:.200}, expected {expected}.")
-
-
 def check_run_name(name: str) -> None:
     """Raise `RecipeError` unless the name can be the name of a folder on any machine."""
     allowed = name and name[0].isalnum() and all(c.isalnum() or c in "._-" for c in name) and name.isascii()
-    _require(bool(allowed), "name", repr(name), "letters, digits, '.', '_' and '-', a letter or digit first")
+    require(bool(allowed), "name", repr(name), "letters, digits, '.', '_' and '-', a letter or digit first")
 
 
 def check_recorded_name(name: str, *, kind: str) -> None:
@@ -202,9 +54,6 @@ def check_recorded_name(name: str, *, kind: str) -> None:
             f"{kind}: the file is called {name!r:.200}, expected a name that begins with a letter, a digit "
             f"or '_' and has no line breaks or other control characters. Rename the file."
         )
-
-
-# ------------------------------------------------------------------------------------------ finding
 
 
 def list_recipes(folder: Folder) -> dict[str, Path]:
@@ -234,9 +83,6 @@ def find_recipe(folder: Folder, name: str) -> Path:
     if stem in known:
         return known[stem]
     raise unknown_name(f"{folder}/*.yaml", name, known)
-
-
-# ------------------------------------------------------------------------------------------ loading
 
 
 def load_recipe[T](

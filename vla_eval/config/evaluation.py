@@ -1,0 +1,104 @@
+"""`configs/*.yaml`: one evaluation."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from vla_eval.bounds import (
+    MAX_EPISODES,
+    MAX_PROCESSES,
+    MAX_SECONDS,
+    MAX_SLOTS,
+    check_bounds,
+    check_seeds,
+    require,
+)
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.config.capture import RecordingConfig
+from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
+from vla_eval.config.files import check_run_name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkingConfig:
+    """How chunks of actions are executed; `vla_eval.chunking` explains it."""
+
+    mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
+    delay_steps: int = 0
+    delay_alignment: Literal["skip", "stale"] = "skip"
+    ensemble_decay: float = 0.01
+
+    def spec(self, n_action_steps: int) -> ChunkingSpec:
+        """Return the chunking of one evaluation."""
+        return ChunkingSpec(n_action_steps=n_action_steps, **dataclasses.asdict(self))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeoutConfig:
+    """Seconds after which a worker that is busy with one thing is killed."""
+
+    setup_seconds: float = 900.0
+    reset_seconds: float = 120.0
+    step_seconds: float = 120.0
+    inference_seconds: float = 300.0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        least_and_most = (0.001, MAX_SECONDS)
+        check_bounds(self, {f.name: least_and_most for f in dataclasses.fields(self)}, prefix="timeouts.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvalConfig:
+    """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys.
+
+    Raises:
+        RecipeError: a value out of its range, or something named twice.
+    """
+
+    name: str
+    tasks: tuple[str, ...]
+    policies: tuple[str, ...]
+    description: str = ""
+    n_action_steps: tuple[int, ...] | None = None
+    episodes: int = 100
+    seed_start: int = 1
+    runs: int = 1
+    prompt_set: str = "paper"
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    chunking: ChunkingConfig = field(default_factory=ChunkingConfig)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    simulator: Simulator = "maniskill"
+    sim_backend: SimBackend = "cpu"
+    stop_at_success: bool = False
+    eager_rendering: bool = False
+    slots_per_worker: int = 1
+    workers: int | Literal["auto"] = "auto"
+    timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
+    max_consecutive_errors: int = 10
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
+
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        check_run_name(self.name)
+        check_bounds(
+            self,
+            {
+                "episodes": (1, MAX_EPISODES),
+                "runs": (1, MAX_EPISODES),
+                "slots_per_worker": (1, MAX_SLOTS),
+                "max_consecutive_errors": (1, MAX_EPISODES),
+                "workers": (1, MAX_PROCESSES),
+            },
+        )
+        check_seeds(self.seed_start, self.episodes)
+        for name in ("tasks", "policies", "n_action_steps"):
+            values = getattr(self, name)
+            require(values is None or len(values) > 0, name, values, "at least one")
+            require(values is None or len(set(values)) == len(values), name, list(values or ()), "no doubles")
+        for n_action_steps in self.n_action_steps or (1,):
+            self.chunking.spec(n_action_steps)  # checks the ranges
+
+
+OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "recording")
+"""Fields of `EvalConfig` that move no result: they may differ when a run is continued."""

@@ -1,0 +1,73 @@
+"""A policy by its name: a recipe in `policies/`, or a folder that holds a LeRobot checkpoint.
+
+Knows nothing of models: a folder is looked at, never loaded.
+"""
+
+import os
+from pathlib import Path
+
+from vla_eval.config.files import Recipe, find_recipe, list_recipes, load_recipe
+from vla_eval.config.policy import PolicyRecipe
+from vla_eval.policies.checkpoint import (
+    CONFIG_FILE,
+    checkpoint_name,
+    checkpoint_sha256,
+    find_checkpoint,
+    read_json,
+    weights_file,
+)
+from vla_eval.policies.checkpoint_json import get_count, get_text
+from vla_eval.policies.config_check import MAX_ACTIONS
+
+LEROBOT_ADAPTER = "lerobot"
+BIG_CHECKPOINT_BYTES = 1 << 30  # of such policies one worker is enough for a GPU, and too much for most CPUs
+
+
+def policy_name(name: str) -> str:
+    """Return the name that records and tables use for what the user wrote.
+
+    Raises:
+        UnknownNameError: there is no such recipe, and no such folder.
+        CheckpointError: it is a folder without a checkpoint.
+    """
+    return checkpoint_name(Path(name)) if is_folder(name) else find_recipe("policies", name).stem
+
+
+def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
+    """Return the recipe of a policy, or one for the checkpoint in a folder.
+
+    Args:
+        name: the name of a recipe, its file, or a folder: a fine-tuning run, a checkpoint in it, or a
+            LeRobot checkpoint. The recipe's digest is then that of the checkpoint's files.
+
+    Raises:
+        UnknownNameError, RecipeError: see `load_recipe`.
+        CheckpointError: it is a folder without a checkpoint.
+    """
+    if not is_folder(name):
+        return load_recipe("policies", name, PolicyRecipe)
+    folder = find_checkpoint(Path(name))
+    config = read_json(folder / CONFIG_FILE)
+    where = str(folder / CONFIG_FILE)
+    n_action_steps = get_count(config, "n_action_steps", maximum=MAX_ACTIONS, where=where)
+    weights = weights_file(folder)
+    is_big = weights is not None and weights.stat().st_size >= BIG_CHECKPOINT_BYTES
+    return Recipe(
+        name=checkpoint_name(folder),
+        path=folder,
+        sha256=checkpoint_sha256(folder),
+        value=PolicyRecipe(
+            version=1,
+            description=f"A LeRobot checkpoint of type {get_text(config, 'type', where=where)}.",
+            adapter=LEROBOT_ADAPTER,
+            args={"checkpoint": str(folder)},
+            default_n_action_steps=n_action_steps or 1,
+            max_workers=1 if is_big else None,
+        ),
+    )
+
+
+def is_folder(name: str) -> bool:
+    """Whether the user means a folder: recipes come first where there is one of that name."""
+    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    return os.path.isdir(name) and name not in list_recipes("policies")

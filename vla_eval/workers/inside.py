@@ -1,0 +1,114 @@
+"""The inside of any worker process: its heartbeat, its log, and the loop that answers jobs.
+
+Knows nothing of what a job is; that is the `Runner`'s.
+"""
+
+import ctypes
+import faulthandler
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol
+
+from vla_eval.core import Stage
+from vla_eval.records import EpisodeKey, EpisodeTiming
+from vla_eval.workers.framing import send_message
+
+logger = logging.getLogger(__name__)
+
+STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
+
+SharedStage = ctypes.Array[ctypes.c_double]
+"""(time.monotonic() when the stage began, index of the stage), in memory shared with the parent."""
+
+
+class Heartbeat:
+    """Says in shared memory what the worker is busy with, and adds up the time per stage."""
+
+    def __init__(self, shared: SharedStage) -> None:
+        """Take the memory to write to."""
+        self._shared = shared
+        self._stage: Stage | None = None
+        self._since = 0.0
+        self.seconds: dict[Stage, float] = dict.fromkeys(STAGES, 0.0)
+
+    def __call__(self, stage: Stage) -> None:
+        """Begin a stage."""
+        now = time.monotonic()
+        self._add_up(now)
+        self._stage, self._since = stage, now
+        write_stage(self._shared, stage, now)
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that was begun last."""
+        return self._stage or "setup"
+
+    def _add_up(self, now: float) -> None:
+        if self._stage is not None:
+            self.seconds[self._stage] += now - self._since
+
+    def begin_batch(self) -> None:
+        """Forget the times of the last batch."""
+        self._stage = None
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+
+    def timings(self, keys: Sequence[EpisodeKey]) -> tuple[EpisodeTiming, ...]:
+        """Return the times of the batch that has just ended, an equal share for each episode."""
+        self._add_up(time.monotonic())
+        self._stage = None
+        share = {stage: seconds / len(keys) for stage, seconds in self.seconds.items()}
+        return tuple(
+            EpisodeTiming(
+                key=key,
+                total_seconds=sum(share.values()),
+                reset_seconds=share["reset"],
+                step_seconds=share["step"],
+                inference_seconds=share["inference"],
+            )
+            for key in keys
+        )
+
+
+def write_stage(shared: SharedStage, stage: Stage, now: float) -> None:
+    """Begin a stage; the time first, so that no reader sees a new stage with an old time."""
+    shared[0] = now
+    shared[1] = STAGES.index(stage)
+
+
+class Runner(Protocol):
+    """What answers the jobs of a worker."""
+
+    def answer(self, job: Any) -> object:  # Any: what the parent sends
+        """Do the job; whatever goes wrong becomes a `Failed`."""
+
+    def close(self) -> None:
+        """Release the simulator."""
+
+
+def serve(connection: Connection, runner: Runner) -> None:
+    """Answer one job after the other until the parent sends None or closes the pipe."""
+    try:
+        while (job := connection.recv()) is not None:
+            send_message(connection, runner.answer(job))
+    except (EOFError, BrokenPipeError, ConnectionResetError) as exc:
+        logger.warning("the parent is gone: %r", exc)
+    runner.close()
+
+
+def detach(log: Path) -> None:
+    """Send all output to the log, and leave the terminal's signals to the parent."""
+    os.setsid()  # Ctrl-C is for the parent, which then ends this process and all that it has started
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    os.dup2(descriptor, sys.__stdout__.fileno() if sys.__stdout__ else 1)
+    os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
+    os.close(descriptor)
+    faulthandler.enable(file=2, all_threads=True)
+    faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it hangs
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")

@@ -1,0 +1,60 @@
+"""What a worker says beside its answers: failed, found a device. Knows nothing of what a job is."""
+
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vla_eval import errors
+from vla_eval.core import Stage
+from vla_eval.errors import VlaEvalError
+from vla_eval.records import EpisodeError
+
+MAX_DETAILS = 20_000  # characters of a traceback or a message; the log has it all
+MAX_KIND = 200  # characters of an exception's class
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failed:
+    """An episode, or one of a batch, could not be run.
+
+    Attributes:
+        error: what happened.
+        refused: environment and policy cannot be made or do not fit, for a reason that this package
+            knows: it will be the same for every episode of the group.
+    """
+
+    error: EpisodeError
+    refused: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceFound:
+    """What the environment says of the device it runs on."""
+
+    device: Mapping[str, str]
+
+
+def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
+    """Return what is recorded of an exception."""
+    try:
+        message = str(exc)
+    except Exception as in_turn:  # a policy's exception may have a mistake of its own
+        message = f"its message cannot be read ({type(in_turn).__name__})"
+    if len(message) > MAX_DETAILS:
+        message = f"{message[:MAX_DETAILS]} … ({len(message) - MAX_DETAILS:,} characters left out)"
+    return EpisodeError(
+        kind=type(exc).__name__[:MAX_KIND],
+        stage=stage,
+        message=message or f"{type(exc).__name__[:MAX_KIND]} without a message",
+        details="".join(traceback.format_exception(exc))[-MAX_DETAILS:],
+    )
+
+
+def as_exception(error: EpisodeError) -> VlaEvalError:
+    """Return the worker's exception again; a class of another package becomes its nearest one of ours."""
+    cls = getattr(errors, error.kind, VlaEvalError)
+    return (
+        cls(error.message)
+        if isinstance(cls, type) and issubclass(cls, VlaEvalError)
+        else VlaEvalError(error.message)
+    )
