@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from vla_eval.errors import CheckpointError
-from vla_eval.policies.conversion import folder_when_whole
+from vla_eval.policies.conversion.parts import folder_when_whole
 
 
 def test_a_folder_that_was_not_finished_has_not_got_its_name_and_the_next_try_begins_anew(

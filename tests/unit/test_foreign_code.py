@@ -22,12 +22,12 @@ from vla_eval.cli.main import main
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import CheckpointError, DatasetError, TrainingError
 from vla_eval.policies.adapter_config import read_adapter_config
-from vla_eval.policies.conversion import check_free
+from vla_eval.policies.conversion.openvla import ConvertOptions, read_original
+from vla_eval.policies.conversion.parts import check_free
 from vla_eval.policies.foreign_code import CALLS_IT, RUNS_CODE, no_foreign_code
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, read_config
 from vla_eval.policies.octo.original import read_parameters
-from vla_eval.policies.openvla.convert import ConvertOptions, read_original
 from vla_eval.policies.openvla.sizes import NetworkSizes
 from vla_eval.training.finetune import finetune
 

@@ -16,7 +16,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.octo.convert import convert
+from vla_eval.policies.conversion.octo import convert
 from vla_eval.policies.octo.flax_names import our_name
 from vla_eval.policies.octo.original import unpack
 from vla_eval.training.finetune import finetune

@@ -27,9 +27,9 @@ from vla_eval.errors import CheckpointError, MissingInstructionError
 from vla_eval.features import ACTION_NAMES
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.conversion.octo import octo_config
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.octo.configuration_octo import TRAINED, MikasaOctoConfig
-from vla_eval.policies.octo.convert import octo_config
 from vla_eval.policies.octo.language import PromptEmbeddings
 from vla_eval.policies.octo.modeling_octo import MikasaOctoPolicy
 from vla_eval.policies.steps.trainable import trainable

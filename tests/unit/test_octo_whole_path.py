@@ -16,7 +16,7 @@ from tests.unit.tiny_octo import GOLDEN
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk, FloatArray, ObservationWindow
 from vla_eval.policies import lerobot
-from vla_eval.policies.octo.convert import convert
+from vla_eval.policies.conversion.octo import convert
 from vla_eval.specs import PolicySpec
 
 CAMERAS = {"primary": "base_camera", "wrist": "hand_camera"}

@@ -12,8 +12,8 @@ import torch
 from tests.unit import openvla_golden as golden
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.conversion.openvla import STATISTICS_FILE, ConvertOptions, convert_openvla
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
-from vla_eval.policies.openvla.convert import STATISTICS_FILE, ConvertOptions, convert_openvla
 from vla_eval.policies.openvla.network import Inputs
 from vla_eval.policies.verify import verify_checkpoint
 

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.unit import openvla_golden as golden
 from vla_eval.core import ActionChunk, Observation, ObservationWindow
 from vla_eval.errors import UnknownNameError
-from vla_eval.policies.openvla.paper_compat import PaperCompatPolicy, jpeg_round_trip, make_openvla
+from vla_eval.policies.openvla_paper import PaperCompatPolicy, jpeg_round_trip, make_openvla
 from vla_eval.specs import PolicySpec
 
 

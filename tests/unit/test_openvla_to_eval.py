@@ -19,7 +19,7 @@ from vla_eval.policies.checkpoint import ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.merging import merge_adapter
-from vla_eval.policies.openvla.paper_compat import make_openvla
+from vla_eval.policies.openvla_paper import make_openvla
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
 

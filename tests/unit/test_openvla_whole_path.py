@@ -14,9 +14,9 @@ from tests.unit import openvla_golden as golden
 from tests.unit.stored_frames import StoredFrames, context, executed
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies import lerobot_inputs
+from vla_eval.policies.conversion.openvla import ConvertOptions, convert_openvla
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
-from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla
-from vla_eval.policies.openvla.paper_compat import make_openvla
+from vla_eval.policies.openvla_paper import make_openvla
 
 # The stored images have the model's size, and the original ran without the crop.
 OPTIONS = ConvertOptions(

@@ -19,10 +19,10 @@ from tests.unit.stored_frames import StoredFrames, context, executed
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.conversion.spatialvla import ConvertOptions, convert_spatialvla
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.spatialvla.action_tokens import from_tokens
-from vla_eval.policies.spatialvla.convert import ConvertOptions, convert_spatialvla
 from vla_eval.policies.spatialvla.depth import PAD_PX
 from vla_eval.policies.spatialvla.described import _NOT_OF_EYE, _NOT_OF_ZOE, check_described
 from vla_eval.policies.spatialvla.ego3d import CENTRE_M

@@ -1,1 +1,1 @@
-"""Which tasks can be won without memory: the controls that need none, played on every task. Runs nothing itself."""
+"""Which tasks can be won without memory: the controls that need none, on every task. Runs nothing itself."""

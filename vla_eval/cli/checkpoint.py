@@ -65,7 +65,7 @@ def _verify(args: argparse.Namespace) -> list[str]:
 
 
 def _convert(args: argparse.Namespace) -> list[str]:
-    from vla_eval.policies.octo.convert import SIZES, convert
+    from vla_eval.policies.conversion.octo import SIZES, convert
 
     out = convert(
         Path(args.path),

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> list[str]:
         from vla_eval.policies.merging import merge_adapter
 
         return [str(merge_adapter(path, out, base_checkpoint=args.base_checkpoint))]
-    from vla_eval.policies.openvla.convert import ConvertOptions, convert_openvla
+    from vla_eval.policies.conversion.openvla import ConvertOptions, convert_openvla
 
     named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
     options = ConvertOptions(

@@ -22,7 +22,7 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
 def run(args: argparse.Namespace) -> list[str]:
     """Do it; return lines for standard output."""
     # Here and not above: `mikasa-vla --help` need not wait for torch.
-    from vla_eval.policies.spatialvla.convert import ConvertOptions, convert_spatialvla
+    from vla_eval.policies.conversion.spatialvla import ConvertOptions, convert_spatialvla
 
     named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
     options = ConvertOptions(unnorm_key=args.unnorm_key, head=args.head, **named)

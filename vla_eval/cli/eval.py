@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from vla_eval.evaluation.grid import is_model_table
 from vla_eval.policies.recipe import policy_name
 
 if TYPE_CHECKING:
-    from vla_eval.storage.run_folder import StoredRun
+    pass
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -109,6 +108,7 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
+    from vla_eval.cli.output import check_baseline, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.evaluation.evaluate import default_run_folder
     from vla_eval.storage.run_folder import read_run
@@ -149,36 +149,6 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_html([found], args)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
-
-
-def print_table(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
-    """Print the table of all runs in the format that was asked for."""
-    from vla_eval.results.report import build_table, render
-
-    table = build_table(runs, baseline=args.baseline)
-    print(render(table, args.format, paper=args.paper))
-    if args.format == "csv":  # has no place for them
-        for note in table.notes:
-            print(f"note: {note}", file=sys.stderr)
-
-
-def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
-    """Write the report page and say where."""
-    from vla_eval.page.build import write_page
-
-    page = write_page(runs, args.html, baseline=args.baseline)
-    sys.stdout.flush()  # the table first, wherever the two go
-    print(f"Report page: {page}", file=sys.stderr)
-
-
-def check_baseline(baseline: str | None, policies: "Sequence[str]") -> None:
-    """Refuse a baseline that is not evaluated: now, and not when the night is over.
-
-    Raises:
-        UnknownNameError: it is none of the policies.
-    """
-    if baseline is not None and baseline not in policies:
-        raise unknown_name("policy", baseline, policies, where="--baseline")
 
 
 def _which(text: str, *, flag: str) -> str | int:

@@ -1,1 +1,1 @@
-"""Privileged experts, one file per task family: the laws by which the arm moves."""
+"""Privileged experts: the controllers of each task family. State in, action out."""

@@ -15,7 +15,7 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
-from vla_eval.policies.conversion import check_free, folder_when_whole
+from vla_eval.policies.conversion.parts import check_free, folder_when_whole
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, read_config
 
 NOT_COPIED = (ADAPTER_CONFIG_FILE, ADAPTER_WEIGHTS_FILE, "README.md", "train_config.json")

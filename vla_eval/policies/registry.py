@@ -37,7 +37,7 @@ POLICIES = {
     "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
     "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
-    "openvla": "vla_eval.policies.openvla.paper_compat:make_openvla",
+    "openvla": "vla_eval.policies.openvla_paper:make_openvla",
 }
 
 

@@ -20,7 +20,6 @@ from typing import Self
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.storage.unstarted import FolderStart
 from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
 from vla_eval.storage.episodes_file import cut_tail, parse_records, repair_records, shown_key
 from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, make_folder, not_a_run_folder
@@ -35,6 +34,7 @@ from vla_eval.storage.run_file import (
     environment_changed,
     find_changes,
 )
+from vla_eval.storage.unstarted import FolderStart
 
 __all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "read_run"]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
-from vla_eval.policies.conversion import check_free, folder_when_whole, stated_gripper
+from vla_eval.policies.conversion.parts import check_free, folder_when_whole, stated_gripper
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import make_empty_policy
 from vla_eval.policies.lerobot_processors import save_tokenizers

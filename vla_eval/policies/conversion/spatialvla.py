@@ -18,7 +18,7 @@ from torch import Tensor
 from vla_eval.errors import CheckpointError, SpecMismatchError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS
 from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
-from vla_eval.policies.conversion import (
+from vla_eval.policies.conversion.parts import (
     Statistics,
     check_free,
     check_mask,

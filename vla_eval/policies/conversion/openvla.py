@@ -20,7 +20,7 @@ from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
 from vla_eval.policies.checkpoint_json import get_mapping, wrong_type
-from vla_eval.policies.conversion import (
+from vla_eval.policies.conversion.parts import (
     Statistics,
     check_free,
     chosen_statistics,
