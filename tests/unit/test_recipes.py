@@ -393,6 +393,10 @@ class TestBounds:
             config(**fields)
         assert f"'{path}'" in str(caught.value)
 
+    def test_keys_that_are_no_text_do_not_disturb_a_message(self) -> None:
+        with pytest.raises(RecipeError, match=r"'env\.5': expected a finite number"):
+            config(env={5: float("nan")})
+
     def test_what_is_nested_without_end_is_refused(self) -> None:
         nested: list[Any] = []
         for _ in range(5000):

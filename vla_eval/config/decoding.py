@@ -100,7 +100,7 @@ def _decoded(hint: Any, value: Any, *, path: str) -> Any:  # Any: type annotatio
             return tuple(_decoded(item_hint, item, path=f"{path}[{i}]") for i, item in enumerate(value))
         if origin is dict and isinstance(value, Mapping):
             item_hint = get_args(option)[1]
-            return {key: _decoded(item_hint, item, path=f"{path}.{key:.60}") for key, item in value.items()}
+            return {key: _decoded(item_hint, item, path=f"{path}.{key!s:.60}") for key, item in value.items()}
         if option is float and type(value) in (int, float):
             return _finite(value, path=path)
         if option is Any:
@@ -122,8 +122,8 @@ def _decoded_fields(cls: type, data: Mapping[str, Any], *, path: str) -> Any:  #
             raise RecipeError(_no_such_field(f"{prefix}{name}", name, [field.name for field in fields]))
     values = {name: _decoded(hints[name], value, path=f"{prefix}{name}") for name, value in data.items()}
     for field in fields:
-        has_default = not field.default is field.default_factory is dataclasses.MISSING
-        if field.name not in values and not has_default:
+        is_required = field.default is field.default_factory is dataclasses.MISSING
+        if is_required and field.name not in values:
             raise RecipeError(f"the field '{prefix}{field.name}' is missing.")
     return cls(**values)
 
@@ -149,7 +149,7 @@ def _check_plain(value: object, *, path: str, depth: int) -> None:
             _check_plain(item, path=f"{path}[{i}]", depth=depth + 1)
     elif isinstance(value, Mapping):
         for key, item in value.items():
-            _check_plain(item, path=f"{path}.{key:.60}", depth=depth + 1)
+            _check_plain(item, path=f"{path}.{key!s:.60}", depth=depth + 1)
     elif value is not None and not isinstance(value, str | int):
         raise RecipeError(_wrong(path, "text, a number, a list or a mapping", value))
 
