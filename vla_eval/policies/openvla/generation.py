@@ -44,7 +44,7 @@ def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts:
         counts: (B, K) float, 0 for actions that are left out; the stop token counts as the last action.
 
     Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
-    prismatic/vla/datasets/datasets.py#L28-L69: `predict_stop_token`, whichever way the tokens are predicted.
+    prismatic/vla/datasets/datasets.py#L32-L74: `predict_stop_token`, whichever way the tokens are predicted.
     """
     one_by_one = network.options.head == "tokens"
     ids = to_tokens(actions.flatten(1), network.sizes.text_vocabulary)

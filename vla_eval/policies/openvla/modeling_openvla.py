@@ -79,7 +79,7 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
 
         Source of the whole levels: in training https://github.com/moojink/dlimp_openvla/blob/
         040105d256bd28866cc6620621a3d5f7b6b91b46/dlimp/augmentations.py#L125, in evaluation https://github.com/
-        moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/experiments/robot/openvla_utils.py#L625.
+        moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/experiments/robot/openvla_utils.py#L623.
         """
         edge = self.network.sizes.image_px
         pictures = []
