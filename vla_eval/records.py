@@ -5,15 +5,40 @@ episode gives the same line. Wall-clock times are kept apart (`EpisodeTiming`).
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
+from vla_eval.record_rules import broken_rule, shown_fields
+from vla_eval.strict_json import (
+    Count,
+    Distance,
+    Positive,
+    Rate,
+    Seconds,
+    Source,
+    as_dataclass,
+    read_json,
+    read_version,
+)
 
 RECORD_VERSION = 1
 """Raise it when a field changes its meaning; readers refuse versions they do not know."""
 
 Outcome = Literal["success", "failure", "error"]
+
+LATER_FIELDS = frozenset({"chance_success", "target_place", "first_choice_place", "tcp_reach_m"})
+"""Fields that records of earlier versions of this program do not have."""
+
+
+REMEDY = (
+    "The file was changed by something else; restore it, remove the line so that the episode is run again, "
+    "or start a new run folder."
+)
+MADE_REMEDY = (
+    "Nothing was stored. Mend the environment or the policy that gave these values; a policy's file with "
+    "such a name has to be renamed."
+)
 
 
 class EpisodeKey(NamedTuple):
@@ -21,9 +46,9 @@ class EpisodeKey(NamedTuple):
 
     task: str
     policy: str
-    n_action_steps: int
-    run: int
-    seed: int
+    n_action_steps: Positive
+    run: Count
+    seed: Count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,28 +98,28 @@ class EpisodeRecord:
 
     task: str
     policy: str
-    n_action_steps: int
-    run: int
-    seed: int
+    n_action_steps: Positive
+    run: Count
+    seed: Count
     outcome: Outcome
     success_once: bool | None = None
     success_at_end: bool | None = None
-    success_step: int | None = None
-    n_steps: int | None = None
-    target: int | None = None
-    n_candidates: int | None = None
-    first_choice: int | None = None
+    success_step: Positive | None = None
+    n_steps: Positive | None = None
+    target: Count | None = None
+    n_candidates: Positive | None = None
+    first_choice: Count | None = None
     first_choice_success: bool | None = None
-    n_wrong_choices: int | None = None
-    chance_success: float | None = None
+    n_wrong_choices: Count | None = None
+    chance_success: Rate | None = None
     episode_return: float | None = None
-    n_inferences: int | None = None
-    n_frames: int | None = None
-    n_clipped_steps: int | None = None
+    n_inferences: Positive | None = None
+    n_frames: Count | None = None
+    n_clipped_steps: Count | None = None
     trajectory_sha256: str | None = None
-    target_place: int | None = None
-    first_choice_place: int | None = None
-    tcp_reach_m: float | None = None
+    target_place: Count | None = None
+    first_choice_place: Count | None = None
+    tcp_reach_m: Distance | None = None
     error: EpisodeError | None = None
 
     @property
@@ -108,7 +133,7 @@ class EpisodeRecord:
         return json.dumps(data, ensure_ascii=False, allow_nan=False)
 
     @classmethod
-    def from_json(cls, line: str, *, where: str) -> Self:
+    def from_json(cls, line: str | bytes, *, where: str) -> Self:
         """Read a record back.
 
         Args:
@@ -116,23 +141,35 @@ class EpisodeRecord:
             where: file and line number, for the message.
 
         Raises:
-            RunFolderError: the line is no record, or one of another version.
+            RunFolderError: the line is no record, one of another version, or one that cannot be true.
         """
-        try:
-            data: dict[str, Any] = json.loads(line)
-            version = data.pop("record_version")
-            if version != RECORD_VERSION:
-                raise RunFolderError(
-                    f"{where}: record version {version}, this program reads version {RECORD_VERSION}. "
-                    f"Report it with the version of mikasa-vla-eval that wrote it (see run.json)."
-                )
-            error = data.pop("error")
-            return cls(**data, error=EpisodeError(**error) if error else None)
-        except (ValueError, KeyError, TypeError, AttributeError) as exc:
-            raise RunFolderError(
-                f"{where}: expected an episode record, found {line[:80]!r} ({exc}). "
-                f"The file was changed by something else; restore it or start a new run folder."
-            ) from exc
+        source = Source(where=where, what="an episode record", remedy=REMEDY, error=RunFolderError)
+        data = read_json(line, source)
+        read_version(data, "record_version", RECORD_VERSION, source)
+        return cls._from_data(data, source)
+
+    def check(self, *, where: str) -> None:
+        """Raise `RunFolderError` if this is no record that could be read back.
+
+        Args:
+            where: what made it, for the message.
+        """
+        source = Source(where=where, what="a sound episode record", remedy=MADE_REMEDY, error=RunFolderError)
+        self._from_data(asdict(self), source)
+
+    @classmethod
+    def _from_data(cls, data: dict[str, Any], source: Source) -> Self:  # Any: JSON
+        for name in REQUIRED_FIELDS:
+            if name not in data:
+                raise source.refuse(f"no field '{name}'", "it is missing")
+        record = as_dataclass(cls, data, source)
+        rule = broken_rule(record)
+        if rule is not None:
+            raise source.refuse(shown_fields(record, rule), f"expected {rule.expected}")
+        return record
+
+
+REQUIRED_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.name not in LATER_FIELDS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +177,7 @@ class EpisodeTiming:
     """Wall-clock seconds of one episode; kept beside the record, never part of it."""
 
     key: EpisodeKey
-    total_seconds: float
-    reset_seconds: float
-    step_seconds: float
-    inference_seconds: float
+    total_seconds: Seconds
+    reset_seconds: Seconds
+    step_seconds: Seconds
+    inference_seconds: Seconds

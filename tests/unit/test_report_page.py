@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from functools import lru_cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -296,7 +297,8 @@ def test_names_between_backticks_are_set_as_code_and_still_escaped() -> None:
 
 
 def test_the_verb_prints_the_path_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RunFolder.open(tmp_path / "run", stored().description) as folder:
+    description = replace(stored().description, config={"tasks": [COLOR, INTERCEPT], "episodes": 4})
+    with RunFolder.open(tmp_path / "run", description) as folder:
         for record in full_run().records:
             folder.append(record)
     assert main(["report", str(tmp_path / "run"), "--html", str(tmp_path / "page")]) == 0

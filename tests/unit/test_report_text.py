@@ -128,7 +128,7 @@ def arguments(*words: str) -> argparse.Namespace:
 def run_folder(tmp_path: Path) -> Path:
     description = stored([]).description
     with RunFolder.open(tmp_path / "demo", description) as folder:
-        for record in (*episodes("p", "+-"), *episodes("random", "--")):
+        for record in (*episodes("p", "+-", first_choice=0), *episodes("random", "--")):
             folder.append(record)
     return tmp_path / "demo"
 
@@ -153,7 +153,7 @@ def test_the_notes_of_a_csv_go_to_standard_error(
 
 def test_the_baseline_random_is_an_error_only_if_it_was_asked_for(tmp_path: Path) -> None:
     with RunFolder.open(tmp_path / "demo", stored([]).description) as folder:
-        folder.append(episode("p", 1, "+"))
+        folder.append(episode("p", 1, "+", first_choice=0))
     assert report_verb.run(arguments(str(tmp_path / "demo"))) == 0
     with pytest.raises(UnknownNameError, match="there is no policy 'random'"):
         report_verb.run(arguments(str(tmp_path / "demo"), "--baseline", "random"))

@@ -28,6 +28,7 @@ from vla_eval.errors import RecordingError
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import EnvSpec, PolicySpec
+from vla_eval.strict_json import Count, Positive
 
 SLOT = 0
 ONE_BY_ONE = ChunkingSpec(n_action_steps=1)
@@ -48,11 +49,11 @@ class Attempt:
         states_sha256: see `states_digest`.
     """
 
-    seed: int
-    success_step: int | None
-    n_steps: int
-    cue_steps: int
-    delay_steps: int
+    seed: Count
+    success_step: Positive | None
+    n_steps: Positive
+    cue_steps: Count
+    delay_steps: Count
     actions: str
     intended_actions: str | None
     states_sha256: str

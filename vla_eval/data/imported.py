@@ -7,12 +7,11 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from vla_eval.config.decoding import decode
-from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest
-from vla_eval.errors import DatasetError, RecipeError
+from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest, check_file_names
+from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
+from vla_eval.strict_json import Count, Positive, Source, as_dataclass, read_file, read_json, read_version
 
 IMPORT_FILE = MIKASA_FOLDER / "import.json"
 FORMAT_VERSION = 1
@@ -31,7 +30,7 @@ class ImportedEpisode:
     """
 
     name: str
-    n_steps: int
+    n_steps: Positive
     instruction: str
     source_seed: int | None
     success: bool | None
@@ -67,7 +66,7 @@ class ImportFacts:
     executable_by_pd_ee_delta_pose: bool
     absent: tuple[str, ...]
     left_out: tuple[str, ...]
-    n_frames: int
+    n_frames: Count
     episodes: tuple[ImportedEpisode, ...]
     source_files: dict[str, FileDigest]
     files: dict[str, FileDigest]
@@ -88,14 +87,19 @@ def read_import(dataset: Path) -> ImportFacts | None:
         DatasetError: the file is damaged, of another version, or the conversion did not finish.
     """
     path = dataset / IMPORT_FILE
-    if not path.exists():
-        return None
+    source = Source(
+        where=str(path),
+        what="what a conversion says of a dataset",
+        remedy="The file was changed by another program; convert the source again.",
+        error=DatasetError,
+    )
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))  # Any: JSON
-        version = data.pop("format_version")
-        facts = decode(ImportFacts, data, where=str(path)) if version == FORMAT_VERSION else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecipeError) as exc:
-        raise DatasetError(f"{path}: damaged ({exc!r:.200}). Convert the source again.") from exc
-    if facts is None or not facts.complete:
-        raise DatasetError(f"{path}: of another version of this program. Convert the source again.")
+        data = read_json(read_file(path, source), source)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    read_version(data, "format_version", FORMAT_VERSION, source)
+    facts = as_dataclass(ImportFacts, data, source)
+    check_file_names(facts.files, where=path)
+    if not facts.complete:
+        raise source.refuse("complete False", "the conversion did not finish")
     return facts

@@ -13,17 +13,26 @@ import base64
 import binascii
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from vla_eval.config.decoding import decode
 from vla_eval.core import FloatArray
-from vla_eval.errors import DatasetError, RecipeError
+from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
+from vla_eval.strict_json import (
+    Count,
+    Positive,
+    Source,
+    as_dataclass,
+    read_file,
+    read_json,
+    read_version,
+    shown,
+)
 
 FORMAT_VERSION = 1
 """Of the files below. Raise it when a field changes its meaning; readers refuse versions they do not know."""
@@ -33,6 +42,9 @@ MANIFEST_FILE = MIKASA_FOLDER / "manifest.jsonl"
 FAILED_FILE = MIKASA_FOLDER / "failed.jsonl"
 RECORDING_FILE = MIKASA_FOLDER / "recording.json"
 REPLAY_FILE = MIKASA_FOLDER / "replay.json"
+
+FETCH_AGAIN = "The file was changed by another program; fetch or record the dataset again."
+MAX_NAME = 255  # bytes; what file systems take
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,18 +65,18 @@ class RecordedEpisode:
         images_sha256: camera -> digest of its raw frames, (n_steps, H, W, 3) uint8, before encoding.
     """
 
-    episode_index: int
+    episode_index: Count
     task: str
-    task_version: int
+    task_version: Positive
     env_kwargs: dict[str, Any]  # Any: whatever the task's arguments are
-    seed: int
+    seed: Count
     instruction: str
     expert: str
-    expert_version: int
-    cue_steps: int
-    delay_steps: int
-    n_steps: int
-    success_step: int | None
+    expert_version: Positive
+    cue_steps: Count
+    delay_steps: Count
+    n_steps: Positive
+    success_step: Positive | None
     actions: str
     intended_actions: str | None
     states_sha256: str
@@ -79,15 +91,15 @@ class RecordedEpisode:
 class FailedSeed:
     """A seed below the last kept one at which the expert did not succeed within the horizon."""
 
-    seed: int
-    n_steps: int
+    seed: Count
+    n_steps: Count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileDigest:
     """Size and sha256 of one file of the dataset."""
 
-    n_bytes: int
+    n_bytes: Count
     sha256: str
 
 
@@ -112,12 +124,12 @@ class DatasetFacts:
     complete: bool
     name: str
     task: str
-    task_version: int
+    task_version: Positive
     instruction: str
     state: str
-    n_episodes: int
-    n_frames: int
-    n_failed_seeds: int
+    n_episodes: Count
+    n_frames: Count
+    n_failed_seeds: Count
     recipe: dict[str, Any]  # Any: plain data
     recipe_sha256: str
     recipe_files: dict[str, str]
@@ -143,8 +155,8 @@ class ReplayReport:
     """
 
     passed: bool
-    n_episodes: int
-    n_total: int
+    n_episodes: Count
+    n_total: Count
     pixels: bool
     states_compared: str
     mismatches: tuple[str, ...]
@@ -182,26 +194,16 @@ def to_json(entry: Entry, *, indent: int | None = None) -> str:
     return json.dumps(data, ensure_ascii=False, allow_nan=False, indent=indent)
 
 
-def from_json[E: Entry](cls: type[E], text: str, *, where: str) -> E:
+def from_json[E: Entry](cls: type[E], text: str | bytes, *, where: str) -> E:
     """Return the entry that `to_json` wrote.
 
     Raises:
         DatasetError: it is something else, or of another version.
     """
-    try:
-        data: dict[str, Any] = json.loads(text)  # Any: JSON
-        version = data.pop("format_version")
-        if version == FORMAT_VERSION:
-            return decode(cls, data, where=where)
-    except (ValueError, KeyError, TypeError, AttributeError, RecipeError) as exc:
-        raise DatasetError(
-            f"{where}: expected a {cls.__name__}, found something else ({exc!r:.200}). The file was changed "
-            f"by another program; fetch or record the dataset again."
-        ) from exc
-    raise DatasetError(
-        f"{where}: format version {version}, this program reads version {FORMAT_VERSION}. Use the version "
-        f"of mikasa-vla-eval that wrote it."
-    )
+    source = Source(where=where, what=f"a {cls.__name__}", remedy=FETCH_AGAIN, error=DatasetError)
+    data = read_json(text, source)
+    read_version(data, "format_version", FORMAT_VERSION, source)
+    return as_dataclass(cls, data, source)
 
 
 def write_lines(path: Path, entries: Sequence[RecordedEpisode | FailedSeed]) -> None:
@@ -223,7 +225,9 @@ def read_manifest(dataset: Path) -> tuple[RecordedEpisode, ...]:
     episodes = _read_lines(dataset / MANIFEST_FILE, RecordedEpisode)
     numbers = [episode.episode_index for episode in episodes]
     if numbers != list(range(len(episodes))):
-        raise DatasetError(f"{dataset / MANIFEST_FILE}: expected episodes 0, 1, 2 …, found {numbers[:10]} ….")
+        raise DatasetError(
+            f"{dataset / MANIFEST_FILE}: expected episodes 0, 1, 2 …, found {numbers[:10]} …. {FETCH_AGAIN}"
+        )
     return episodes
 
 
@@ -238,7 +242,9 @@ def read_facts(dataset: Path) -> DatasetFacts:
     Raises:
         DatasetError: there is no `recording.json`, it is damaged, or the dataset is not complete.
     """
-    facts = from_json(DatasetFacts, _text(dataset / RECORDING_FILE), where=str(dataset / RECORDING_FILE))
+    path = dataset / RECORDING_FILE
+    facts = from_json(DatasetFacts, _content(path), where=str(path))
+    check_file_names(facts.files, where=path)
     if not facts.complete:
         raise DatasetError(f"{dataset}: is not complete. Run the command that records it again: it goes on.")
     return facts
@@ -251,19 +257,38 @@ def read_replay(dataset: Path) -> ReplayReport | None:
         DatasetError: the file is damaged.
     """
     path = dataset / REPLAY_FILE
-    return from_json(ReplayReport, _text(path), where=str(path)) if path.exists() else None
+    return from_json(ReplayReport, _content(path), where=str(path)) if path.exists() else None
+
+
+def check_file_names(files: Mapping[str, FileDigest], *, where: Path) -> None:
+    """Raise `DatasetError` unless every name is a path inside of the dataset.
+
+    Args:
+        files: path below the dataset -> digest.
+        where: the file that names them, for the message.
+    """
+    for name in files:
+        parts = PurePosixPath(name).parts
+        is_inside = bool(parts) and not name.startswith("/") and ".." not in parts
+        if not is_inside or not name.isprintable() or max(len(part.encode()) for part in parts) > MAX_NAME:
+            raise DatasetError(
+                f"{where}: expected names of files inside of the dataset, found {shown(name)}. {FETCH_AGAIN}"
+            )
 
 
 def _read_lines[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
-    lines = _text(path).splitlines()
-    return tuple(from_json(cls, line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1))
+    lines = _content(path).split(b"\n")
+    if lines[-1]:
+        raise DatasetError(f"{path}: expected a line end at its end; the last line is torn. {FETCH_AGAIN}")
+    return tuple(from_json(cls, line, where=f"{path}:{i}") for i, line in enumerate(lines[:-1], start=1))
 
 
-def _text(path: Path) -> str:
+def _content(path: Path) -> bytes:
+    remedy = "Name the folder of one task, OUT/TASK, that `mikasa-vla record` has finished."
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as exc:
+        return read_file(path, Source(where=str(path), what="a file", remedy=remedy, error=DatasetError))
+    except (FileNotFoundError, NotADirectoryError) as exc:
         raise DatasetError(
-            f"{path}: cannot be read ({exc}): this is no dataset that `mikasa-vla record` has finished. "
-            f"Name the folder of one task, OUT/TASK."
+            f"{path}: is not there: this is no dataset that `mikasa-vla record` has finished. Name the "
+            f"folder of one task, OUT/TASK."
         ) from exc

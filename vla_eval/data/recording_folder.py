@@ -20,12 +20,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vla_eval.config.decoding import decode
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RECORDING_FILE
-from vla_eval.errors import DatasetError, RecipeError, RunFolderError
+from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
-from vla_eval.storage.episodes_file import cut_tail
+from vla_eval.storage.episodes_file import cut_tail, read_lines
 from vla_eval.storage.run_file import (
     DEVICE,
     JsonValue,
@@ -36,6 +35,7 @@ from vla_eval.storage.run_file import (
     find_changes,
 )
 from vla_eval.storage.run_folder import DISK_TROUBLE
+from vla_eval.strict_json import Source, as_dataclass, read_json
 
 logger = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ class RecordingFolder:
         """
         path = self._task_folder(task) / ATTEMPTS_FILE
         cut_tail(path)
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        lines = read_lines(path).split(b"\n")[:-1]
         found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
         return {one.seed: one for one in found}
 
@@ -211,14 +211,10 @@ def _refuse_foreign(out: Path) -> None:
         )
 
 
-def _attempt(line: str, *, where: str) -> Attempt:
-    try:
-        return decode(Attempt, json.loads(line), where=where)
-    except (ValueError, RecipeError) as exc:
-        raise DatasetError(
-            f"{where}: expected an attempt, found {line[:80]!r} ({exc}). The file was changed by another "
-            f"program; restore it or record into another --out."
-        ) from exc
+def _attempt(line: bytes, *, where: str) -> Attempt:
+    remedy = "The file was changed by another program; restore it or record into another --out."
+    source = Source(where=where, what="an attempt", remedy=remedy, error=DatasetError)
+    return as_dataclass(Attempt, read_json(line, source), source)
 
 
 def _made(folder: Path) -> Path:

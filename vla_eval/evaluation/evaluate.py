@@ -113,7 +113,10 @@ def evaluate(
     observer, path = observer or _Silence(), out or default_run_folder(config)
     plan = make_plan(config)
     with RunFolder.open(
-        path, _describe(config, plan, command), allow_environment_change=allow_environment_change
+        path,
+        _describe(config, plan, command),
+        allow_environment_change=allow_environment_change,
+        groups={job.group.key for job in plan.jobs},
     ) as folder:
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)

@@ -17,9 +17,9 @@ from vla_eval.policies.checkpoint_json import (
     get_text,
     get_texts,
     read_json,
-    shown,
     wrong_type,
 )
+from vla_eval.strict_json import shown
 
 MAX_RANK = 16_384
 NAMES = ("target_modules", "exclude_modules")

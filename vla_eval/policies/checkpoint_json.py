@@ -1,21 +1,18 @@
 """The one reader of a checkpoint's JSON, which somebody else wrote. Standard library only.
 
-It returns plain data: text that is UTF-8, finite numbers, no key twice, and no nesting that later code
-could not walk through. Whoever reads a field says which type it has, with the functions below.
+It returns plain data, as strict as `strict_json` makes it. Whoever reads a field says which type it has,
+with the functions below.
 """
 
-import json
-import math
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn  # Any: JSON of another program
+from typing import Any  # Any: JSON of another program
 
 from vla_eval.errors import CheckpointError
+from vla_eval.strict_json import loads, shown
 
 MAX_BYTES = 64 << 20  # the largest that were seen hold statistics of dozens of datasets: under 1 MiB
-MAX_DEPTH = 50  # configurations are about 5 deep; Python's own limit is 1,000 calls
-MAX_SHOWN = 60
 FETCH_AGAIN = "Fetch the checkpoint again, from where you trust it."
 WORDS: Mapping[type, str] = {
     bool: "true or false",
@@ -48,15 +45,7 @@ def parse_json(content: bytes, *, where: str) -> dict[str, Any]:
         CheckpointError: it is no JSON, or holds something else.
     """
     try:
-        data = json.loads(
-            content.decode("utf-8"),
-            object_pairs_hook=_without_repetition,
-            parse_constant=_no_number,
-            parse_float=_finite,
-        )
-        _check_nesting(data)
-    except RecursionError as exc:
-        raise _damaged(where, f"nesting of more than {MAX_DEPTH} levels") from exc
+        data = loads(content)
     except ValueError as exc:  # json's and UTF-8's own are such errors
         raise _damaged(where, str(exc)) from exc
     if not isinstance(data, dict):
@@ -124,12 +113,6 @@ def wrong_type(where: str, key: str, expected: str, value: object) -> Checkpoint
     )
 
 
-def shown(value: object) -> str:
-    """Return the beginning of what was found, for messages."""
-    text = repr(value) if not isinstance(value, int) or abs(value) < 10**MAX_SHOWN else "a very large number"
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
-
-
 def _content(path: Path) -> bytes:
     try:
         found = path.stat()
@@ -145,44 +128,6 @@ def _content(path: Path) -> bytes:
             f"{path}: expected JSON of at most {MAX_BYTES >> 20} MiB, found more. {FETCH_AGAIN}"
         )
     return content
-
-
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    data: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in data:
-            raise ValueError(f"the field {shown(name)} twice")
-        data[name] = value
-    return data
-
-
-def _no_number(name: str) -> NoReturn:
-    raise ValueError(f"{name}, which is no number of JSON")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text:.{MAX_SHOWN}}, which no number can hold")
-    return value
-
-
-def _check_nesting(data: object) -> None:
-    """Refuse deep nesting, and text that is no Unicode; without recursion."""
-    level: list[object] = [data]
-    for _ in range(MAX_DEPTH):
-        below: list[object] = []
-        for value in level:
-            if isinstance(value, dict):
-                below += (*value, *value.values())
-            elif isinstance(value, list):
-                below += value
-            elif isinstance(value, str):
-                value.encode("utf-8")  # half a surrogate pair cannot be printed, nor be a path
-        if not below:
-            return
-        level = below
-    raise RecursionError
 
 
 def _damaged(where: str, found: str) -> CheckpointError:

@@ -16,9 +16,9 @@ from vla_eval.policies.checkpoint_json import (
     get_mapping,
     get_text,
     read_json,
-    shown,
     wrong_type,
 )
+from vla_eval.strict_json import shown
 
 STATE_SUFFIX = ".safetensors"
 HUB_SNAPSHOTS, HUB_BLOBS = "snapshots", "blobs"

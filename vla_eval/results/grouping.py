@@ -8,10 +8,10 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import PurePath
 from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
+from vla_eval.storage.planned import bare_name
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 
@@ -244,8 +244,7 @@ def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     names = config.get(field) if names is None else names
     if isinstance(names, str) or not isinstance(names, Sequence):
         return ()
-    # A policy may be given as a file, a task with its namespace; records carry the bare name.
-    return tuple(PurePath(str(name)).name.removesuffix(".yaml").removesuffix(".yml") for name in names)
+    return tuple(bare_name(str(name)) for name in names)
 
 
 def _in_order(groups: Iterable[RowGroup], runs: Sequence[StoredRun]) -> list[RowGroup]:

@@ -5,6 +5,7 @@ import io
 from collections.abc import Sequence
 from typing import Literal
 
+from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
 from vla_eval.results.sweep import Sweep, SweepRow
 
 SweepFormat = Literal["markdown", "csv"]
@@ -20,9 +21,13 @@ def render_sweep(sweep: Sweep, fmt: SweepFormat) -> str:
     titles, rows = sweep_cells(sweep)
     if fmt == "csv":
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([titles, *rows])
+        csv.writer(text, lineterminator="\n").writerows(
+            [titles, *([csv_cell(cell) for cell in row] for row in rows)]
+        )
         return text.getvalue().rstrip("\n")
-    return f"{_markdown(titles, rows)}\n\n" + "\n".join(f"- {note}" for note in sweep_notes(sweep))
+    return f"{_markdown(titles, rows)}\n\n" + "\n".join(
+        f"- {markdown_text(note)}" for note in sweep_notes(sweep)
+    )
 
 
 def sweep_cells(sweep: Sweep) -> tuple[list[str], list[list[str]]]:
@@ -75,7 +80,7 @@ def _rate(value: float | None) -> str:
 
 
 def _markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    table = [[cell.replace("|", "\\|") for cell in row] for row in (titles, *rows)]
+    table = [[markdown_cell(cell) for cell in row] for row in (titles, *rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
 
     def line(cells: Sequence[str]) -> str:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from typing import Literal, NamedTuple, get_args
 
-from vla_eval.errors import ReportError, check_names
+from vla_eval.errors import ReportError, check_names, one_line
 from vla_eval.results import paper_table
+from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
 from vla_eval.results.table import Row, Table
@@ -173,7 +174,7 @@ def _markdown(table: Table, columns: Sequence[Column], figures: Sequence[PaperFi
         )
     ]
     if table.notes:
-        parts.append("\n".join(f"- {note}" for note in table.notes))
+        parts.append("\n".join(f"- {markdown_text(note)}" for note in table.notes))
     if figures:
         parts.append(f"**{PAPER_TITLE}**")
         parts.append(_markdown_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER))
@@ -184,7 +185,7 @@ def _markdown(table: Table, columns: Sequence[Column], figures: Sequence[PaperFi
 
 
 def _markdown_table(titles: list[str], rows: list[list[str]], is_number: list[bool]) -> str:
-    escaped = [[cell.replace("|", "\\|") for cell in row] for row in (titles, *rows)]
+    escaped = [[markdown_cell(cell) for cell in row] for row in (titles, *rows)]
     widths = [max(2, *(len(row[i]) for row in escaped)) for i in range(len(titles))]
 
     def line(cells: list[str]) -> str:
@@ -207,7 +208,8 @@ def _csv(table: Table, figures: Sequence[PaperFigure] | None) -> str:
     writer = csv.DictWriter(text, [*source, *names], restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in table.rows:
-        writer.writerow({"source": "measured", **row.to_dict()})
+        cells = {name: csv_cell(value) for name, value in row.to_dict().items()}
+        writer.writerow({"source": "measured", **cells})
     for figure in figures or ():
         writer.writerow({"source": "paper", "policy": figure.model, **asdict(figure)})
     return text.getvalue().rstrip("\n")
@@ -287,9 +289,13 @@ def _latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]
 
 
 def _latex_row(cells: list[str]) -> str:
-    return f"{' & '.join(re.sub('^-(?=[0-9])', '$-$', _escaped(cell)) for cell in cells)} \\\\"
+    row = " & ".join(re.sub("^-(?=[0-9])", "$-$", _escaped(cell)) for cell in cells)
+    # The rule or the row above would take a bracket or a star for its own argument.
+    return f"{'{}' if row.startswith(('[', '*')) else ''}{row} \\\\"
 
 
 def _escaped(text: str) -> str:
-    parts = [part.translate(_LATEX) for part in re.split("`([^`]*)`", text)]  # every second one was code
+    parts = [
+        part.translate(_LATEX) for part in re.split("`([^`]*)`", one_line(text))
+    ]  # every second one was code
     return "".join(f"\\texttt{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

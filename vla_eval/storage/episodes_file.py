@@ -10,23 +10,45 @@ from pathlib import Path
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord
+from vla_eval.storage.planned import PlannedEpisodes
+from vla_eval.strict_json import Source, read_file
 
 logger = logging.getLogger(__name__)
 
+MAX_NAMED = 5
 
-def parse_records(data: bytes, path: Path) -> dict[EpisodeKey, EpisodeRecord]:
+
+def read_lines(path: Path) -> bytes:
+    """Return the bytes of a file of lines, none if it is not there.
+
+    Raises:
+        RunFolderError: what lies there is no file, or cannot be read.
+    """
+    source = Source(where=str(path), what="a file of JSON lines", remedy="", error=RunFolderError)
+    try:
+        return read_file(path, source)
+    except (FileNotFoundError, NotADirectoryError):
+        return b""
+
+
+def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
     """Return the record that counts of each key, in the order in which the keys first appear.
 
     Args:
         data: whole lines.
         path: where they are from, for messages.
+        planned: which episodes the run has.
 
     Raises:
-        RunFolderError: a line is no record, or a key has two results.
+        RunFolderError: a line is no record, a key has two results, or an episode is not the run's.
     """
     records: dict[EpisodeKey, EpisodeRecord] = {}
+    strangers: list[str] = []
     for number, line in enumerate(data.split(b"\n")[:-1], start=1):
         record = _parse_record(line, f"{path}:{number}")
+        objection = planned.objection(record)
+        if objection is not None:
+            strangers.append(f"  line {number}: {shown_key(record.key)}: {objection}")
         known = records.get(record.key)
         if known is None or known.outcome == "error":
             records[record.key] = record
@@ -35,7 +57,19 @@ def parse_records(data: bytes, path: Path) -> dict[EpisodeKey, EpisodeRecord]:
                 f"{path}:{number}: a second result of {shown_key(record.key)}. The file was changed by "
                 f"something else; remove one of the two lines or start a new run folder."
             )
+    if strangers:
+        raise _not_planned(strangers, path)
     return records
+
+
+def _not_planned(strangers: list[str], path: Path) -> RunFolderError:
+    more = [f"  … and {len(strangers) - MAX_NAMED} more"] if len(strangers) > MAX_NAMED else []
+    listed = "\n".join((*strangers[:MAX_NAMED], *more))
+    return RunFolderError(
+        f"{path}: expected the episodes that this run's configuration (run.json) plans, found "
+        f"{len(strangers)} that it does not:\n{listed}\nThey are from another run, or a file was changed: "
+        f"move these lines to the folder of their own run, or start a new run folder."
+    )
 
 
 def _parse_record(line: bytes, where: str) -> EpisodeRecord:
@@ -49,38 +83,37 @@ def _parse_record(line: bytes, where: str) -> EpisodeRecord:
     return EpisodeRecord.from_json(text, where=where)
 
 
-def repair_records(path: Path) -> dict[EpisodeKey, EpisodeRecord]:
+def repair_records(path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
     """Read the records; make a last line that was torn by a kill whole, or cut it off.
 
     Args:
         path: the file; nothing is done if it is not there.
+        planned: which episodes the run has.
 
     Raises:
-        RunFolderError: a line is damaged; the file is left as it is.
+        RunFolderError: a line is damaged, or an episode is not the run's; the file is left as it is.
     """
-    if not path.exists():
-        return {}
-    data = path.read_bytes()
+    data = read_lines(path)
     tail = data[data.rfind(b"\n") + 1 :]
     if tail:
-        is_whole = _is_json(tail)
+        is_whole = is_json(tail)
         if is_whole:
             logger.warning("%s: the last line lacked its end; it is complete now", path)
             data += b"\n"
         else:
             logger.warning("%s: an incomplete last line of %d bytes was cut off", path, len(tail))
             data = data[: -len(tail)]
-    records = parse_records(data, path)
+    records = parse_records(data, path, planned)
     if tail:  # only now: a file that is refused stays as it was found
         _set_end(path, size=len(data), complete=is_whole)
     return records
 
 
-def _is_json(tail: bytes) -> bool:
+def is_json(tail: bytes) -> bool:
     """Whether a line is whole but for its end: no beginning of a JSON object is itself JSON."""
     try:
         json.loads(tail)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     return True
 
@@ -98,11 +131,10 @@ def _set_end(path: Path, *, size: int, complete: bool) -> None:
 
 def cut_tail(path: Path) -> None:
     """Cut off an incomplete last line of a file that no result depends on."""
-    if path.exists():
-        data = path.read_bytes()
-        end = data.rfind(b"\n") + 1
-        if end != len(data):
-            os.truncate(path, end)
+    data = read_lines(path)
+    end = data.rfind(b"\n") + 1
+    if end != len(data):
+        os.truncate(path, end)
 
 
 def shown_key(key: EpisodeKey) -> str:

@@ -9,6 +9,8 @@ from vla_eval.storage.run_file import RUN_FILE
 EPISODES_FILE = "episodes.jsonl"
 TIMINGS_FILE = "timings.jsonl"
 LOCK_FILE = "run.lock"
+LOGS, VIDEOS, RRDS = "logs", "videos", "rrd"
+SUBFOLDERS = (LOGS, VIDEOS, RRDS)
 # What a process that was killed before it wrote run.json may have left behind.
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
@@ -26,6 +28,8 @@ def make_folder(path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
     path.mkdir(parents=True, exist_ok=True)
+    for name in SUBFOLDERS:
+        _check_subfolder(path / name)
     names = set(os.listdir(path))
     if RUN_FILE in names or names <= UNSTARTED:
         return
@@ -40,6 +44,19 @@ def make_folder(path: Path) -> None:
         f"{path}: holds other files ({shown}) and no {RUN_FILE}: it is not a run folder, and nothing is "
         f"written into it. Use another --out."
     )
+
+
+def _check_subfolder(path: Path) -> None:
+    """Raise `RunFolderError` where a run would have to write into what is no folder, or into a closed one."""
+    if not path.is_dir() and (path.exists() or path.is_symlink()):
+        raise RunFolderError(
+            f"{path}: expected a folder, found something else. Move it away, or use another --out."
+        )
+    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+        raise RunFolderError(
+            f"{path}: expected a folder that can be written into, found one without the permission. Change "
+            f"that, or use another --out."
+        )
 
 
 def not_a_run_folder(path: Path) -> RunFolderError:
@@ -58,6 +75,7 @@ def not_a_run_folder(path: Path) -> RunFolderError:
 
 
 def _run_folders(folder: Path) -> list[str]:
-    if not folder.is_dir():
+    try:
+        return sorted(entry.name for entry in folder.iterdir() if (entry / RUN_FILE).is_file())
+    except OSError:  # no folder, or one that may not be looked into: there is nothing to suggest
         return []
-    return sorted(entry.name for entry in folder.iterdir() if (entry / RUN_FILE).is_file())

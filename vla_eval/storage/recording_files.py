@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from vla_eval.records import EpisodeRecord
-
-VIDEOS, RRDS = "videos", "rrd"  # subfolders of a run folder
+from vla_eval.storage.folders import RRDS, VIDEOS
 
 
 def recording_stem(record: EpisodeRecord) -> str:

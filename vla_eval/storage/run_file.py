@@ -4,19 +4,22 @@ Knows nothing of episodes; the values it keeps are plain JSON and mean nothing t
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vla_eval.errors import RunChangedError, RunFolderError
+from vla_eval.errors import RunChangedError, RunFolderError, one_line
 from vla_eval.storage.durable import replace_file
+from vla_eval.storage.planned import PlannedEpisodes, planned_config
+from vla_eval.strict_json import Source, as_dataclass, read_file, read_json, read_version
 
 FORMAT_VERSION = 1
 """Of the whole run folder. Raise it when a file changes its meaning; others are refused."""
 
 RUN_FILE = "run.json"
 NOT_SET = "(not set)"
+MAX_LISTED, MAX_LINE = 20, 400  # changes in one message, and characters of each
 DEVICE = "device"  # the part of the environment that is known only once a worker has started
 
 type JsonValue = bool | int | float | str | Sequence[JsonValue] | Mapping[str, JsonValue] | None
@@ -110,22 +113,27 @@ class RunFile:
             RunFolderError: it is damaged, or of another version.
             FileNotFoundError: there is none.
         """
-        path = folder / RUN_FILE
-        try:
-            data: dict[str, Any] = json.loads(path.read_bytes())  # Any: JSON
-            version = data.pop("format_version")
-            if version == FORMAT_VERSION:
-                sessions = tuple(_session(item) for item in data.pop("sessions"))
-                return cls(description=RunDescription(**data), sessions=sessions)
-        except (ValueError, KeyError, TypeError, AttributeError) as exc:
-            raise RunFolderError(
-                f"{path}: expected the description of a run, found something else ({exc!r:.120}). The file "
-                f"was changed by another program; restore it or start a new run folder."
-            ) from exc
-        raise RunFolderError(
-            f"{path}: format version {version}, this program reads version {FORMAT_VERSION}. Use the version "
-            f"of mikasa-vla-eval that wrote it, or another --out."
-        )
+        source = _source(folder)
+        data = read_json(read_file(folder / RUN_FILE, source), source)
+        read_version(data, "format_version", FORMAT_VERSION, source)
+        sessions = as_dataclass(_Sessions, {"sessions": data.pop("sessions", None)}, source).sessions
+        if not sessions:
+            raise source.refuse("no sessions", "expected at least one")
+        return cls(description=as_dataclass(RunDescription, data, source), sessions=sessions)
+
+    def planned(
+        self, folder: Path, groups: Collection[tuple[str, str, int]] | None = None
+    ) -> PlannedEpisodes:
+        """Return which episodes the run has.
+
+        Args:
+            folder: of the run, for messages.
+            groups: task, policy and n_action_steps of each, where they are known.
+
+        Raises:
+            RunFolderError: a field of the configuration has another type than a configuration's.
+        """
+        return PlannedEpisodes(config=planned_config(self.description.config, _source(folder)), groups=groups)
 
     def check_unchanged(self, new: RunDescription, where: Path) -> None:
         """Raise `RunChangedError` if the configuration or a recipe is not what it was."""
@@ -195,9 +203,20 @@ def leaves(value: JsonValue, *, prefix: str) -> Iterator[tuple[str, str]]:
         yield prefix, json.dumps(value, ensure_ascii=False, sort_keys=True, default=_plain)
 
 
-def _session(data: dict[str, Any]) -> Session:  # Any: JSON
-    changes = tuple(Change(**change) for change in data.pop("environment_changes"))
-    return Session(**data, environment_changes=changes)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sessions:
+    """As they are in the file, beside the description."""
+
+    sessions: tuple[Session, ...]
+
+
+def _source(folder: Path) -> Source:
+    return Source(
+        where=str(folder / RUN_FILE),
+        what="the description of a run",
+        remedy="The file was changed by another program; restore it or start a new run folder.",
+        error=RunFolderError,
+    )
 
 
 def _fields(value: RunDescription | Session) -> dict[str, Any]:  # Any: JSON
@@ -212,4 +231,8 @@ def _plain(value: object) -> dict[str, JsonValue]:
 
 
 def _listed(changes: Sequence[Change]) -> str:
-    return "\n".join(f"  {change}" for change in changes)
+    """Return one line per change, whatever the values are."""
+    lines = [one_line(str(change)) for change in changes[:MAX_LISTED]]
+    shown = [line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}…" for line in lines]
+    more = [f"… and {len(changes) - MAX_LISTED} more"] if len(changes) > MAX_LISTED else []
+    return "\n".join(f"  {line}" for line in (*shown, *more))

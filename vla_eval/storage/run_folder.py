@@ -11,7 +11,7 @@ Knows nothing of tasks, policies or statistics.
 import errno
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +21,13 @@ from typing import Self
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
-from vla_eval.storage.episodes_file import cut_tail, parse_records, repair_records, shown_key
+from vla_eval.storage.episodes_file import (
+    cut_tail,
+    parse_records,
+    read_lines,
+    repair_records,
+    shown_key,
+)
 from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, make_folder, not_a_run_folder
 from vla_eval.storage.run_file import (
     DEVICE,
@@ -67,14 +73,21 @@ class RunFolder:
     It is a context manager. Only one process at a time can have it open; that ends with the process.
     """
 
-    def __init__(self, path: Path, description: RunDescription, *, allow_environment_change: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        description: RunDescription,
+        *,
+        allow_environment_change: bool,
+        groups: Collection[tuple[str, str, int]] | None,
+    ) -> None:
         """Use `open`: this is called with the folder locked."""
         self.path = path
         self._allow_environment_change = allow_environment_change
         self._lock: FolderLock | None = None
         self._start: FolderStart | None = None
         self._run_file = self._load(description)
-        records = repair_records(path / EPISODES_FILE)
+        records = repair_records(path / EPISODES_FILE, self._run_file.planned(path, groups))
         self._finished = {key for key, record in records.items() if record.outcome != "error"}
         self._has_lines = bool(records)
         cut_tail(path / TIMINGS_FILE)
@@ -85,17 +98,27 @@ class RunFolder:
         sync_folder(path)
 
     @classmethod
-    def open(cls, path: Path, description: RunDescription, *, allow_environment_change: bool = False) -> Self:
+    def open(
+        cls,
+        path: Path,
+        description: RunDescription,
+        *,
+        allow_environment_change: bool = False,
+        groups: Collection[tuple[str, str, int]] | None = None,
+    ) -> Self:
         """Start a run in a new or empty folder, or continue the one that is there.
 
         Args:
             path: the folder; it is made if it is not there.
             description: what the run is started with; it must be what it was before.
             allow_environment_change: continue although commit, versions or device have changed.
+            groups: task, policy and n_action_steps of each episode that is planned; None: as far as the
+                description says it.
 
         Raises:
             RunChangedError: configuration, recipes or environment are not what they were.
-            RunFolderError: another process has it open, its files are damaged, or it is somebody else's.
+            RunFolderError: another process has it open, its files are damaged, it holds episodes that are
+                not planned, or it is somebody else's.
             StorageFullError: the disk is full.
         """
         try:
@@ -103,7 +126,9 @@ class RunFolder:
             make_folder(path)
             lock = FolderLock(path / LOCK_FILE)
             try:
-                folder = cls(path, description, allow_environment_change=allow_environment_change)
+                folder = cls(
+                    path, description, allow_environment_change=allow_environment_change, groups=groups
+                )
             except BaseException:
                 start.undo()
                 lock.release()
@@ -141,7 +166,8 @@ class RunFolder:
             timing: how long it took; not made durable, and lost rather than an error if it cannot be kept.
 
         Raises:
-            RunFolderError: the episode has a result already, or the folder is closed.
+            RunFolderError: the episode has a result already, its values contradict each other, or the folder
+                is closed.
             StorageFullError: it could not be stored; the folder is as it was before.
         """
         if self._episodes is None:
@@ -151,6 +177,7 @@ class RunFolder:
                 f"{self.path}: {shown_key(record.key)} has a result already; a second one would be counted "
                 f"twice. Skip the keys in finished_keys()."
             )
+        record.check(where=f"{self.path}: {shown_key(record.key)}")  # or nobody could read the folder again
         self._has_lines = True  # also if the line could not be written as a whole
         self._episodes.append(record.to_json())
         if record.outcome != "error":
@@ -238,13 +265,11 @@ def read_run(path: Path) -> StoredRun:
     """
     try:
         run_file = RunFile.load(path)
-        data = (path / EPISODES_FILE).read_bytes() if (path / EPISODES_FILE).exists() else b""
+        data = read_lines(path / EPISODES_FILE)
     except (FileNotFoundError, NotADirectoryError) as exc:
         raise not_a_run_folder(path) from exc
-    except OSError as exc:
-        raise RunFolderError(f"{path}: cannot be read ({exc.strerror or exc}).") from exc
     # What follows the last newline is being written at this moment, or was when its writer was killed.
-    records = parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE)
+    records = parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE, run_file.planned(path))
     return StoredRun(
         path=path,
         description=run_file.description,

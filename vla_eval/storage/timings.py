@@ -1,16 +1,19 @@
 """Read `timings.jsonl`: wall-clock seconds per episode. No result depends on it.
 
-A file that is not there, or a line that is damaged, is a timing that is not known; never a zero.
+A file that is not there, or a line that was torn when the machine went down, is a timing that is not known;
+never a zero.
 """
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.storage.episodes_file import is_json, read_lines
 from vla_eval.storage.folders import TIMINGS_FILE
+from vla_eval.strict_json import Source, as_dataclass, read_json
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,19 +33,24 @@ class Latency:
 
 
 def read_timings(folder: Path) -> dict[EpisodeKey, EpisodeTiming]:
-    """Return the timing of each episode of a run folder, the last one where it was run again."""
+    """Return the timing of each episode of a run folder, the last one where it was run again.
+
+    Raises:
+        RunFolderError: a line was changed to something that is no timing.
+    """
     path = folder / TIMINGS_FILE
     found: dict[EpisodeKey, EpisodeTiming] = {}
-    if not path.is_file():
-        return found
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            data = json.loads(line)
-            key = EpisodeKey(**data.pop("key"))
-            found[key] = EpisodeTiming(key=key, **data)
-        except (ValueError, KeyError, TypeError, AttributeError):
-            continue  # torn by a kill: the episode has a result and no timing
+    for number, line in enumerate(read_lines(path).split(b"\n"), start=1):
+        if line and is_json(line):  # else torn: the episode has a result and no timing
+            source = _source(f"{path}:{number}")
+            timing = as_dataclass(EpisodeTiming, read_json(line, source), source)
+            found[timing.key] = timing
     return found
+
+
+def _source(where: str) -> Source:
+    remedy = "The file was changed by something else. No result depends on it: remove the line, or the file."
+    return Source(where=where, what="the timing of an episode", remedy=remedy, error=RunFolderError)
 
 
 def measure_latency(

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.policies.checkpoint import TOKENIZER_FOLDER
-from vla_eval.policies.checkpoint_json import shown
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import read_weights
 from vla_eval.policies.steps.gripper import ENCODINGS, GripperEncoding
+from vla_eval.strict_json import shown
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 

@@ -1,0 +1,105 @@
+"""Which episodes a run has, by its configuration: what else is in its folder is not counted.
+
+Knows nothing of files.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
+from pathlib import PurePath
+from typing import Any
+
+from vla_eval.records import EpisodeRecord
+from vla_eval.strict_json import Count, Positive, Source, as_dataclass
+
+MAX_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedConfig:
+    """The part of a configuration that says which episodes there are; None is not known.
+
+    Attributes:
+        tasks: ids, maybe with their namespace.
+        task_versions: task id -> version of its rules.
+        policies: names, files or folders.
+        policy_names: what records call the policies.
+        n_action_steps: None also where each policy has its default.
+        episodes, runs, seed_start: how many, and of which seeds.
+    """
+
+    tasks: tuple[str, ...] | None = None
+    task_versions: dict[str, int] | None = None
+    policies: tuple[str, ...] | None = None
+    policy_names: tuple[str, ...] | None = None
+    n_action_steps: tuple[Positive, ...] | None = None
+    episodes: Positive | None = None
+    runs: Positive | None = None
+    seed_start: Count | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Described:
+    """So that a message says `config.episodes`."""
+
+    config: PlannedConfig
+
+
+def planned_config(config: Mapping[str, Any], source: Source) -> PlannedConfig:  # Any: JSON
+    """Return the part of `config` that says which episodes there are; the other fields may be anything.
+
+    Raises:
+        VlaEvalError: of `source.error`: a field has another type.
+    """
+    known = {one.name: config[one.name] for one in fields(PlannedConfig) if one.name in config}
+    return as_dataclass(_Described, {"config": known}, source).config
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedEpisodes:
+    """The episodes of a run.
+
+    Attributes:
+        config: what the configuration says of them.
+        groups: (task, policy, n_action_steps) of all, where that is known.
+    """
+
+    config: PlannedConfig
+    groups: Collection[tuple[str, str, int]] | None = None
+
+    def objection(self, record: EpisodeRecord) -> str | None:
+        """Return why a record is none of this run; None if it may be one."""
+        config = self.config
+        key, task = record.key, record.task
+        tasks = _known(config.task_versions, config.tasks)
+        if tasks is not None and task not in tasks:
+            return f"the tasks are {_names(tasks)}"
+        if config.policy_names is not None and key.policy not in config.policy_names:
+            return f"the policies are {_names(config.policy_names)}"
+        if config.n_action_steps is not None and key.n_action_steps not in config.n_action_steps:
+            return f"n_action_steps are {_names(config.n_action_steps)}"
+        if self.groups is not None and key[:3] not in self.groups:
+            return "no such policy is run on this task with these n_action_steps"
+        if config.runs is not None and key.run >= config.runs:
+            return f"the runs are 0 to {config.runs - 1}"
+        if config.episodes is not None and config.seed_start is not None:
+            last = config.seed_start + config.episodes - 1
+            if not config.seed_start <= key.seed <= last:
+                return f"the seeds are {config.seed_start} to {last}"
+        return None
+
+
+def bare_name(name: str) -> str:
+    """Return what records call a policy given as a file, or a task given with its namespace."""
+    return PurePath(name).name.removesuffix(".yaml").removesuffix(".yml")
+
+
+def _known(versions: Mapping[str, int] | None, tasks: Collection[str] | None) -> Collection[str] | None:
+    if versions is not None:
+        return versions
+    return None if tasks is None else [bare_name(task) for task in tasks]
+
+
+def _names(items: Collection[object]) -> str:
+    names = [str(item) for item in items]
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
