@@ -1,6 +1,6 @@
 """What the shortcut audit said of the tasks as they ship: `audited.json`, made by a command.
 
-    mikasa-vla audit --format json > vla_eval/audited.json
+    mikasa-vla audit --format json > vla_eval/results/audited.json
 
 Knows neither statistics nor simulators, so that a report can quote it.
 """
