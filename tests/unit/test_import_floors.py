@@ -25,13 +25,6 @@ ALSO_CHEAP = (
     "data.recording",
     "data.replay",
 )
-    "envs.factory",
-    "envs.fake",
-    "policies.scripted",
-    "viz.recorder",
-    "data.recording",
-    "data.replay",
-)
 CHECKS = ("testing.check_env", "testing.check_policy", "testing.check_task")  # run before torch is wanted
 
 # Imports the modules one after the other and notes which of them brings a foreign package first.
