@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import vla_eval
+from vla_eval.config import shipped
 from vla_eval.storage import provenance
 from vla_eval.storage.provenance import checkout_state, collect_environment
 
@@ -32,6 +34,11 @@ def package(tmp_path: Path) -> Path:
     git(folder.parent, "add", ".")
     git(folder.parent, "commit", "-m", "first")
     return folder
+
+
+def test_what_is_looked_at_is_the_whole_package() -> None:
+    root = Path(vla_eval.__file__).parent
+    assert root == provenance.PACKAGE_FOLDER == shipped.PACKAGE_ROOT
 
 
 class TestCheckout:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-PACKAGE_ROOT = Path(__file__).parent
+import vla_eval
+
+PACKAGE_ROOT = Path(vla_eval.__file__).parent
 
 
 def search_folders(kind: str) -> tuple[Path, ...]:

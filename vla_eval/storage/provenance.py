@@ -13,10 +13,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from vla_eval import __version__
+import vla_eval
 from vla_eval.storage.run_file import JsonValue
 
-PACKAGE_FOLDER = Path(__file__).parent
+PACKAGE_FOLDER = Path(vla_eval.__file__).parent
 PACKAGES = ("torch", "mani_skill", "sapien", "gymnasium", "numpy", "scipy", "lerobot")
 """Foreign packages whose version can move a result."""
 
@@ -34,7 +34,7 @@ def collect_environment() -> dict[str, JsonValue]:
         version, None if not installed), `python`, `platform`, `cpu`, `mesa`, `nvidia_driver`.
     """
     return {
-        "vla_eval": {"version": __version__, **checkout_state(PACKAGE_FOLDER)},
+        "vla_eval": {"version": vla_eval.__version__, **checkout_state(PACKAGE_FOLDER)},
         "packages": {name: package_version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
