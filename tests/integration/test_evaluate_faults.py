@@ -167,11 +167,12 @@ class TestMistakes:
         self.check(bench, Exception, "no argument 'cue_step'. Did you mean 'cue_steps'", env={"cue_step": 1})
 
     def test_the_last_policy_of_the_list_is_tried_before_the_first_one_is_through(self, bench: Bench) -> None:
+        bench.write_policy(cameras=["wrist"])
+        wrong = (bench.folder / "night.yaml").rename(bench.folder / "wrong.yaml")
         bench.write_policy(pause=0.05)
-        fields = {"policies": [str(bench.folder / "night.yaml"), "tour", "oracle"], "episodes": 50}
-        fields["env"] = {**SHORT, "n_items": 0}
-        with pytest.raises(SpecMismatchError, match="'tour'"):
-            bench.run("out", **fields)
+        policies = [str(bench.folder / "night.yaml"), str(wrong), "oracle"]
+        with pytest.raises(SpecMismatchError, match="camera 'wrist'"):
+            bench.run("out", policies=policies, episodes=50)
 
         assert len(bench.records("out")) == 1
 

@@ -39,7 +39,7 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         audit(COLOR, "needs memory", protocol="strict"),
         audit(SHELL, "can be toured", "won by staying at the cue", version=99),
     ]
-    monkeypatch.setattr(audited, "FILE", tmp_path / "audited.json")
+    monkeypatch.setattr(audited, "FILE", tmp_path / "shipped_audit.json")
     audited.FILE.write_text(render_audit(rows, "json"), encoding="utf-8")
     shipped_verdicts.cache_clear()
     yield

@@ -1,6 +1,6 @@
-"""What the shortcut audit said of the tasks as they ship: `audited.json`, made by a command.
+"""What the shortcut audit said of the tasks as they ship: `shipped_audit.json`, made by a command.
 
-    mikasa-vla audit --format json > vla_eval/results/audited.json
+    mikasa-vla audit --format json > vla_eval/results/shipped_audit.json
 
 Knows neither statistics nor simulators, so that a report can quote it.
 """
