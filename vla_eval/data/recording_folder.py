@@ -27,6 +27,7 @@ from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_fo
 from vla_eval.storage.episodes_file import cut_tail, read_lines
 from vla_eval.storage.run_file import (
     DEVICE,
+    RUN_FILE,
     JsonValue,
     RunDescription,
     RunFile,
@@ -35,6 +36,7 @@ from vla_eval.storage.run_file import (
     find_changes,
 )
 from vla_eval.storage.run_folder import DISK_TROUBLE
+from vla_eval.storage.unstarted import FolderStart
 from vla_eval.strict_json import Source, as_dataclass, read_json
 
 logger = logging.getLogger(__name__)
@@ -42,14 +44,16 @@ logger = logging.getLogger(__name__)
 STATE_FOLDER = "recording"
 LOCK_FILE = "recording.lock"
 ATTEMPTS_FILE = "attempts.jsonl"
+_OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOCK_FILE)  # of a recording that has no attempt yet
 
 
 class RecordingFolder:
     """The folder of a recording that this process writes into; make it with `open`."""
 
-    def __init__(self, out: Path, lock: FolderLock, run_file: RunFile) -> None:
+    def __init__(self, out: Path, lock: FolderLock, run_file: RunFile, start: FolderStart) -> None:
         """Use `open`."""
         self.out = out
+        self._start = start
         self._lock = lock
         self._run_file = run_file
         self._attempts: dict[str, LineFile] = {}
@@ -71,6 +75,7 @@ class RecordingFolder:
         state = out / STATE_FOLDER
         try:
             _refuse_foreign(out)
+            start = FolderStart(state, own=_OWN_FILES)
             state.mkdir(parents=True, exist_ok=True)
             lock = FolderLock(state / LOCK_FILE)
             try:
@@ -78,6 +83,7 @@ class RecordingFolder:
                 run_file.save(state)
                 sync_folder(out)
             except BaseException:
+                start.undo()
                 lock.release()
                 raise
         except OSError as exc:
@@ -86,7 +92,7 @@ class RecordingFolder:
             raise RunFolderError(
                 f"{out}: cannot be recorded into ({exc.strerror or exc}). Use another --out."
             ) from exc
-        return cls(out, lock, run_file)
+        return cls(out, lock, run_file, start)
 
     def __enter__(self) -> Self:
         """Return the folder."""
@@ -95,10 +101,12 @@ class RecordingFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the files and let other processes in."""
+        """Close the files and let other processes in; a start that failed leaves nothing behind."""
         for file in self._attempts.values():
             file.close()
         self._attempts = {}
+        if isinstance(value, Exception):
+            self._start.undo()
         self._lock.release()
 
     @property

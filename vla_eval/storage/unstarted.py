@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 from collections.abc import Collection
 from pathlib import Path
 
@@ -34,21 +35,28 @@ class FolderStart:
     def _undo(self) -> None:
         if not self._path.is_dir():
             return
-        new = set(os.listdir(self._path)) - self._before
-        logs = self._path / LOGS_FOLDER
-        if not new <= self._own | {LOGS_FOLDER} or (LOGS_FOLDER in new and not _holds_logs(logs)):
+        new = [self._path / name for name in sorted(set(os.listdir(self._path)) - self._before)]
+        folders = [entry for entry in new if entry.is_dir() and not entry.is_symlink()]
+        files = [entry for entry in new if entry not in folders]
+        known = self._own.issuperset(file.name for file in files)
+        if not known or not all(_is_bare(folder) or _is_of_logs(folder) for folder in folders):
             return
-        for name in new - {LOGS_FOLDER}:
-            (self._path / name).unlink()
-        if LOGS_FOLDER in new:
-            for log in logs.iterdir():
-                log.unlink()
-            logs.rmdir()
+        for file in files:
+            file.unlink()
+        for folder in folders:
+            shutil.rmtree(folder)
         for folder in self._made:  # the innermost first
             if any(folder.iterdir()):  # somebody else has begun to use it
                 return
             folder.rmdir()
 
 
-def _holds_logs(folder: Path) -> bool:
-    return all(entry.suffix == ".log" and entry.is_file() for entry in folder.iterdir())
+def _is_of_logs(folder: Path) -> bool:
+    return folder.name == LOGS_FOLDER and all(
+        entry.suffix == ".log" and entry.is_file() for entry in folder.iterdir()
+    )
+
+
+def _is_bare(folder: Path) -> bool:
+    """Whether there is no file in it, at any depth."""
+    return all(entry.is_dir() and not entry.is_symlink() for entry in folder.rglob("*"))
