@@ -1,6 +1,7 @@
 """The report page: equal to the JSON report, nothing made up, nothing that could become markup or load."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -318,6 +319,12 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ReportError, match=r"file/page/index\.html: cannot be written"):
         write_page([full_run()], tmp_path / "file" / "page")
+
+
+def test_a_folder_whose_name_is_no_utf_8_is_shown_escaped(tmp_path: Path) -> None:
+    run = replace(full_run(), path=Path(os.fsdecode(b"runs/\xfc")))
+    page = write_page([run], tmp_path / "page").read_text(encoding="utf-8")
+    assert "runs/\\udcfc" in page
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")

@@ -1,5 +1,6 @@
 """`mikasa-vla view`: which recordings it finds, and what it says where there are none."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from rerun.experimental import RrdReader
 
 from vla_eval.cli.main import main
+from vla_eval.cli.view import cache_place
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.recording_files import rrd_file
 from vla_eval.storage.run_folder import RunDescription, RunFolder
@@ -149,3 +151,8 @@ class TestDataset:
 def test_a_run_has_no_numbered_episodes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(folder), "--episode", "0", "--print"]) == 1
     assert "--episode is of datasets" in capsys.readouterr().err
+
+
+def test_a_dataset_whose_folder_s_name_is_no_utf_8_has_a_place_in_the_cache(tmp_path: Path) -> None:
+    one, other = (tmp_path / os.fsdecode(name) for name in (b"\xfc", b"\xfd"))
+    assert cache_place(one) != cache_place(other)

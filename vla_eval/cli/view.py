@@ -87,9 +87,14 @@ def _of_dataset(args: argparse.Namespace) -> list[Path]:
         raise ViewingError(
             f"{args.run}: is a dataset; {', '.join(given)} is of runs. Use --episode or --seed."
         )
-    place = hashlib.sha256(str(args.run.resolve()).encode()).hexdigest()[:12]
     wish = EpisodeWish(episodes=tuple(args.episode or ()), seed=args.seed, most=MOST_OPENED)
-    return write_dataset_rrds(args.run, wish, cache_dir() / "rrd" / f"{args.run.resolve().name}-{place}")
+    return write_dataset_rrds(args.run, wish, cache_dir() / "rrd" / cache_place(args.run))
+
+
+def cache_place(dataset: Path) -> str:
+    """Return a name for the recordings of a dataset: datasets of one name in two folders have two."""
+    folder = dataset.resolve()
+    return f"{folder.name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:12]}"
 
 
 def _check_screen(args: argparse.Namespace) -> None:

@@ -75,7 +75,7 @@ def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None 
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(page, encoding="utf-8")
+        path.write_text(page, encoding="utf-8", errors="backslashreplace")  # as on standard output
     except OSError as exc:
         raise ReportError(f"{path}: cannot be written ({exc.strerror or exc}). Name another --html.") from exc
     return path
