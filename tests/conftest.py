@@ -15,6 +15,7 @@ from vla_eval.workers.start import worker_context  # after the line above
 worker_context(
     preload=(
         "vla_eval.envs.maniskill",
+        "vla_eval.evaluation.worker",
         "vla_eval.policies.lerobot",
         "vla_eval.data.recording_worker",
         "vla_eval.data.replay_worker",
