@@ -16,7 +16,7 @@ from vla_eval.errors import CheckpointError, TaskArgumentError
 from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.policies.checkpoint import TrainingFacts, write_facts
 from vla_eval.policies.checkpoint_notes import normalization_notes
-from vla_eval.storage.run_file import RunDescription, RunFile
+from vla_eval.storage.run_file import RunDescription, RunFile, Session
 
 IMAGES = "observation.images.base"
 STATE = {"mean": [1, 2], "std": [3, 4], "q01": [9, 9]}
@@ -128,7 +128,8 @@ def test_a_run_of_a_version_that_did_not_note_them_can_be_read(tmp_path: Path) -
         command="",
         normalization={"p": {"of": "d"}},
     )
-    RunFile(description=described, sessions=()).save(tmp_path)
+    session = Session(started_at="2026-01-01T00:00:00+00:00", command="", options={})
+    RunFile(description=described, sessions=(session,)).save(tmp_path)
     assert RunFile.load(tmp_path).description == described
     data = json.loads((tmp_path / "run.json").read_text())
     del data["normalization"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.workers.pool import start as worker_start
+from vla_eval.workers import start as worker_start
 from vla_eval.workers.start import begin, simulator_modules, worker_context, worker_environment
 
 PARENT = """
