@@ -1,19 +1,19 @@
-# The verbs a person types. Paths are relative, so that the folder may have spaces in its name.
+# The verbs for people. Paths are relative, so that the folder may have spaces in its name.
 .DEFAULT_GOAL := help
-# Where it is set, each of the many processes of the tests would compile torch's sources again.
+# If it is set, each of the many test processes compiles torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test test-all lint docs bench clean
 
 BIN := .venv/bin
-# Each takes some 2 GB and 10 s to begin.
+# Each takes about 2 GB, and 10 s to start.
 TEST_PROCESSES ?= 2
 PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 help:  ## list these verbs
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
-setup:  ## make .venv and, where there is none, a Vulkan driver
+setup:  ## create .venv and install a Vulkan driver if there is none
 	@bash scripts/setup.sh
 
 demo: setup  ## evaluate scripted policies and two learned ones, print the tables, write the report pages

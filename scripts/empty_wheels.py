@@ -1,11 +1,11 @@
-"""Build empty wheels that stand in for packages which must not, or cannot, be installed.
+"""Build empty wheels in place of packages that must not, or cannot, be installed.
 
 - `opencv-python`: sapien requires it, lerobot requires `opencv-python-headless`. Both fill the folder
   `cv2`, so whichever is installed last wins, and removing one breaks the other.
 - `mplib`, from Python 3.13 on: mani_skill requires a version of it that exists up to 3.12. Only
   ManiSkill's own motion planning examples import it.
 
-A stand-in holds metadata only. Its version is the pinned one with a label that says what it is, such as
+Such a wheel holds metadata only. Its version is the pinned one with a label that says what it is, such as
 `4.13.0.92+headless`. Knows nothing of pip: `scripts/setup.sh` installs what is built here.
 
 Usage: python scripts/empty_wheels.py constraints.txt OUTPUT_FOLDER
@@ -46,7 +46,7 @@ def pinned_version(name: str, constraints: Path) -> str:
 
 
 def main(constraints: Path, folder: Path) -> None:
-    """Build the stand-ins that this Python needs."""
+    """Build the empty wheels that this Python needs."""
     version = pinned_version("opencv-python-headless", constraints)
     build_wheel("opencv-python", f"{version}+headless", "Empty: opencv-python-headless has cv2", folder)
     if sys.version_info >= (3, 13):

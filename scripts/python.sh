@@ -3,7 +3,7 @@
 
 OS_RELEASE=${OS_RELEASE:-/etc/os-release}
 
-# A pyenv shim may exist and refuse, and a Python built without its libraries breaks pandas: run it.
+# A pyenv shim may exist and fail, and a Python built without its libraries breaks pandas: run it.
 try_python() {
   "$1" -c 'import sys
 (3, 12) <= sys.version_info[:2] <= (3, 13) or sys.exit("it is Python %d.%d" % sys.version_info[:2])
@@ -42,7 +42,7 @@ find_python() {
   return 1
 }
 
-# Print the apt package that brings a Python to make .venv with, or nothing if none is needed.
+# Print the apt package with a Python for .venv, or nothing if none is needed.
 python_package() {
   local bare
   if find_python can_make_venv >/dev/null; then return; fi
@@ -53,12 +53,12 @@ python_package() {
   case "$(. "$OS_RELEASE" && echo "${ID:-}:${VERSION_ID:-}")" in
     ubuntu:24.04 | ubuntu:24.10) echo python3.12-venv ;;
     debian:13 | ubuntu:25.04 | ubuntu:25.10) echo python3.13-venv ;;
-    # Nothing suitable in the distribution: an older Python can still run uv, which fetches one.
+    # Nothing suitable in the distribution: an older Python can still run uv, which downloads one.
     *) if ! { command -v python3 && can_make_venv python3; } >/dev/null; then echo python3-venv; fi ;;
   esac
 }
 
-# uv comes from the package index, and brings a Python of its own into the user's folder.
+# uv comes from the package index and installs a Python into the user's folder.
 fetch_python() {
   say "no Python 3.12 or 3.13 on this machine: fetching one with uv"
   python3 -m venv --clear .venv-uv && .venv-uv/bin/python -m pip install --quiet uv &&

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Make .venv with the pinned dependencies and, where there is none, a Vulkan driver.
 #
-# Run it as often as you like: what is there already is left as it is. As root it installs missing
+# Run it as often as you like: what is already installed is not changed. As root it installs missing
 # system packages with apt; otherwise it prints the commands for an administrator and stops.
 #
 #   PYTHON=/path/to/python3.12   the interpreter to use instead of the one that is found
-#   MIKASA_SKIP_SYSTEM=1         do not look at drivers and system libraries at all
+#   MIKASA_SKIP_SYSTEM=1         do not check drivers and system libraries
 #   MIKASA_NO_UV=1               install packages with pip alone
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -25,7 +25,7 @@ die() {
   exit 1
 }
 
-# Everything that decides what is in the environment, and where it lies: console scripts hold its path.
+# Everything that decides what is in the environment, and its path, which console scripts contain.
 fingerprint() {
   { cat pyproject.toml constraints.txt scripts/setup.sh scripts/empty_wheels.py
     grep -E '^(version|home)' "$VENV/pyvenv.cfg"
@@ -36,7 +36,7 @@ is_up_to_date() {
   [ -f "$STAMP" ] && [ -x "$VENV_PYTHON" ] && [ "$(cat "$STAMP")" = "$(fingerprint)" ]
 }
 
-# An environment that was moved, or whose interpreter is gone or too old, is made anew.
+# Rebuild an environment that was moved, or whose interpreter is missing or too old.
 is_usable_venv() {
   [ -f "$VENV/pyvenv.cfg" ] && grep -qF "$PWD/$VENV" "$VENV/pyvenv.cfg" && is_right_python "$VENV_PYTHON"
 }
@@ -51,7 +51,7 @@ make_venv() {
   "$PYTHON" -m venv --clear "$VENV"
 }
 
-# Tell of large downloads and of the installation, keep the rest for the log: first pip's words, then uv's.
+# Print large downloads and the installation, write the rest to the log. First pip's output, then uv's.
 show_progress() {
   sed -u -nE \
     -e 's/^ *Downloading (.*\/)?([^-/]+-[^-]+)-.*\(([0-9.]+ GB|[0-9]{3,}\.[0-9] MB)\).*/setup:   downloading \2 (\3)/p' \
@@ -61,7 +61,7 @@ show_progress() {
 }
 
 # uv unpacks a wheel once per machine and links it into each environment; pip unpacks 7 GB each time.
-# It reads neither pip's files nor its variables, so what it needs of them is handed on.
+# It reads neither pip's files nor its variables, so the settings that it needs are passed on.
 uv_install() {
   local index handed=("UV_HTTP_TIMEOUT=${UV_HTTP_TIMEOUT:-180}")
   if [ -n "${PIP_NO_INDEX:-}${MIKASA_NO_UV:-}" ]; then return 1; fi
@@ -74,7 +74,7 @@ uv_install() {
     tee -a "$LOG" | show_progress
 }
 
-# Where uv cannot, pip may: it knows this machine's mirrors, wheel folders and certificates.
+# If uv fails, pip may succeed: it knows this machine's mirrors, wheel folders and certificates.
 install_packages() {
   if uv_install "$@"; then return; fi
   say "  by pip"
@@ -90,7 +90,7 @@ pip_install() {
   fi
 }
 
-# Stand-ins for packages that would overwrite others, or do not exist for this Python.
+# Empty placeholders for packages that would overwrite others, or do not exist for this Python.
 install_empty_wheels() {
   local folder
   folder=$(mktemp -d)

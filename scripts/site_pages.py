@@ -1,4 +1,4 @@
-"""Pages of the documentation that are made from the code when the site is built; a hook of MkDocs.
+"""Generate pages of the documentation from the code when the site is built; a hook of MkDocs.
 
 They are not committed, so they cannot be out of date: the command line from its argparse parsers, the
 tasks from the catalogue, the tables of recipes from the READMEs beside them, the changelog. The pages

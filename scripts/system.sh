@@ -23,14 +23,14 @@ installed_mesa() {
 
 candidate_mesa() { apt-cache policy mesa-vulkan-drivers 2>/dev/null | awk '/Candidate:/ { print $2 }'; }
 
-# A container may show the GPU for computing and leave out the graphics part of the driver.
+# A container may have the GPU for computing but lack the graphics libraries of the driver.
 has_nvidia_vulkan() {
   { [ -e /proc/driver/nvidia/version ] || [ -e /dev/nvidiactl ] || [ -e /dev/dxg ]; } &&
     has_library libGLX_nvidia.so.0
 }
 
 has_vulkan_driver() {
-  # Whoever names driver files knows what they do.
+  # A user who names driver files has made a choice.
   if [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ] || has_nvidia_vulkan; then return 0; fi
   if command -v dpkg-query >/dev/null; then
     is_new_mesa "$(installed_mesa)"
@@ -47,7 +47,7 @@ has_backports() {
 }
 
 # Print the machine's own entry of the suite in $2, in file $1, with the backports suite in its place:
-# mirror and keyring stay as the administrator chose them.
+# the administrator's mirror and keyring are kept.
 backports_from_deb822() {
   awk -v suite="$2" '
     BEGIN { RS = ""; FS = "\n" }

@@ -15,7 +15,7 @@ skip`), as a robot that goes on moving during inference must do; or the whole ch
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,14 +26,13 @@ from vla_eval.errors import RecipeError, SpecMismatchError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChunkingSpec:
-    """How chunks are executed; see the module's text.
+class ChunkingSettings:
+    """How chunks are executed, at any n_action_steps: the section `chunking` of an evaluation.
 
     Raises:
         RecipeError: a value out of its range.
     """
 
-    n_action_steps: int
     mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
     delay_steps: int = 0
     delay_alignment: Literal["skip", "stale"] = "skip"
@@ -41,11 +40,33 @@ class ChunkingSpec:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name, least in (("n_action_steps", 1), ("delay_steps", 0), ("ensemble_decay", 0)):
-            if getattr(self, name) < least:
-                raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ {least}.")
-        bounds = {"n_action_steps": (1, MAX_STEPS), "delay_steps": (0, MAX_STEPS)}
-        check_bounds(self, bounds, prefix="chunking.")
+        for name in ("delay_steps", "ensemble_decay"):
+            if getattr(self, name) < 0:
+                raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ 0.")
+        check_bounds(self, {"delay_steps": (0, MAX_STEPS)}, prefix="chunking.")
+
+    def at(self, n_action_steps: int) -> "ChunkingSpec":
+        """Return the chunking at a number of action steps."""
+        settings = {field.name: getattr(self, field.name) for field in fields(ChunkingSettings)}
+        return ChunkingSpec(n_action_steps=n_action_steps, **settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkingSpec(ChunkingSettings):
+    """How chunks are executed at one n_action_steps: what a policy and a rollout get.
+
+    Raises:
+        RecipeError: a value out of its range.
+    """
+
+    n_action_steps: int
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.n_action_steps < 1:
+            raise RecipeError(f"chunking.n_action_steps is {self.n_action_steps}, expected ≥ 1.")
+        check_bounds(self, {"n_action_steps": (1, MAX_STEPS)}, prefix="chunking.")
+        ChunkingSettings.__post_init__(self)  # super() does not know the class that `slots` makes
 
     @property
     def n_skipped(self) -> int:

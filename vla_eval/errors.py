@@ -88,7 +88,7 @@ class RecordingError(VlaEvalError):
 
 
 class ViewingError(VlaEvalError):
-    """A video or a rerun recording could not be written, found or opened."""
+    """A video or a rerun file could not be written, found or opened."""
 
 
 class TrainingError(VlaEvalError):

@@ -57,7 +57,7 @@ def _goes_with(name: str, other: str) -> Rule:
 
 
 def is_name(text: str) -> bool:
-    """Whether this can be a task's or policy's name: part of the name of a recording, in one line."""
+    """Whether this can be a task's or policy's name: part of a file's name, in one line."""
     return 0 < len(text) <= MAX_NAME and text.isprintable() and not {"/", "\\"} & set(text)
 
 

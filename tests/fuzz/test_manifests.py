@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tests.fuzz.json_cases import BYTES, VALUES, accepted_or_refused, as_bytes, near
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.imported import IMPORT_FILE, ImportedEpisode, ImportFacts, read_import
+from vla_eval.data.info_file import INFO_FILE, check_info
 from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
@@ -31,6 +32,7 @@ from vla_eval.data.manifest import (
     read_replay,
     to_json,
 )
+from vla_eval.data.shard_writer import SHARD_EPISODES, shard_episodes
 
 EMPTY = FileDigest(n_bytes=0, sha256="e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
 EPISODE = RecordedEpisode(
@@ -94,7 +96,15 @@ IMPORT = ImportFacts(
     files={"meta/info.json": EMPTY},
     vla_eval_version="1",
 )
+FEATURE = {"dtype": "video", "shape": [128, 128, 3], "names": None}
+INFO = {
+    **{"codebase_version": "v3.0", "robot_type": "panda", "fps": 20, "total_episodes": 1, "total_frames": 2},
+    **{"chunks_size": 1000, "features": {"observation.images.base": FEATURE}, "splits": {"train": "0:1"}},
+    "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+}
 WRITTEN: dict[Path, dict[str, Any]] = {
+    INFO_FILE: INFO,
     MANIFEST_FILE: json.loads(to_json(EPISODE)),
     FAILED_FILE: json.loads(to_json(FailedSeed(seed=7, n_steps=60))),
     RECORDING_FILE: json.loads(to_json(FACTS)),
@@ -107,6 +117,7 @@ READERS: dict[Path, Callable[[Path], object]] = {
     RECORDING_FILE: check_dataset,
     REPLAY_FILE: read_replay,
     IMPORT_FILE: read_import,
+    INFO_FILE: check_info,
 }
 FILES = st.dictionaries(
     st.sampled_from(("meta/info.json", "../x", "/etc/passwd", "a/../../x", "", ".", "a" * 300, "\0", "a\nb")),
@@ -124,7 +135,7 @@ def changed(name: Path) -> st.SearchStrategy[Any]:
 def root(tmp_path: Path) -> Path:
     """A dataset as far as these files go."""
     (tmp_path / MIKASA_FOLDER).mkdir(parents=True)
-    (tmp_path / "meta/info.json").touch()
+    (tmp_path / INFO_FILE).touch()
     return tmp_path
 
 
@@ -135,6 +146,7 @@ def root(tmp_path: Path) -> Path:
         (RECORDING_FILE, FACTS),
         (REPLAY_FILE, REPORT),
         (IMPORT_FILE, IMPORT),
+        (INFO_FILE, None),
     ],
     ids=str,
 )
@@ -146,6 +158,11 @@ def test_what_is_valid_is_accepted(root: Path, name: Path, expected: object) -> 
 def test_a_line_separator_within_a_sentence_ends_no_line(root: Path) -> None:
     (root / MANIFEST_FILE).write_text(to_json(EPISODE) + "\n")
     assert read_manifest(root) == (EPISODE,)
+
+
+def test_a_shard_with_such_a_sentence_is_read(root: Path) -> None:
+    (root / SHARD_EPISODES).write_text(to_json(EPISODE) + "\n")
+    assert shard_episodes(root) == (EPISODE,)
 
 
 @given(data=st.data())

@@ -105,14 +105,14 @@ def act_config() -> ACTConfig:
 
 
 @pytest.fixture(scope="module", autouse=True, params=["small", pytest.param("real", marks=pytest.mark.slow)])
-def eyes(request: pytest.FixtureRequest) -> Iterator[str]:
+def backbone(request: pytest.FixtureRequest) -> Iterator[str]:
     """ACT's ResNet-18, or one convolution in its place."""
     with tiny_resnet() if request.param == "small" else contextlib.nullcontext():
         yield request.param
 
 
 @pytest.fixture(scope="module")
-def act(eyes: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def act(backbone: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(with_features(act_config()), tmp_path_factory.mktemp("act") / "model")
 
 

@@ -239,7 +239,7 @@ class TestKills:
 
         assert process.returncode == exit_code
         assert stdout == ""
-        assert "To go on: mikasa-vla eval --task" in stderr
+        assert "To resume: mikasa-vla eval --task" in stderr
         assert wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
         self.finish(bench, "out")
 

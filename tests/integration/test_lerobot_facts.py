@@ -30,7 +30,7 @@ from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec
 
 pytestmark = pytest.mark.usefixtures("no_network")
-eyes, env, act = small_checkpoints.eyes, small_checkpoints.env, small_checkpoints.act
+backbone, env, act = small_checkpoints.backbone, small_checkpoints.env, small_checkpoints.act
 
 
 class TestTrainingAgainstEvaluation:

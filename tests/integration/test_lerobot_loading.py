@@ -24,7 +24,7 @@ from vla_eval.storage.run_folder import read_run
 from vla_eval.testing.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
 
 pytestmark = pytest.mark.usefixtures("no_network")
-eyes, env = small_checkpoints.eyes, small_checkpoints.env
+backbone, env = small_checkpoints.backbone, small_checkpoints.env
 act, pi0, make = small_checkpoints.act, small_checkpoints.pi0, small_checkpoints.make
 
 
@@ -193,9 +193,9 @@ class TestFolders:
         assert checkpoint_sha256(folder) != before
 
     def test_eval_takes_a_folder_and_notes_weights_and_dataset(
-        self, act: Path, eyes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, act: Path, backbone: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        if eyes == "small":
+        if backbone == "small":
             monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
         folder = tmp_path / "mine"
         folder.mkdir()

@@ -31,7 +31,7 @@ from vla_eval.testing import check_policy
 from vla_eval.testing.tiny_models import make_tiny_pi0
 
 pytestmark = pytest.mark.usefixtures("no_network")
-eyes, env = small_checkpoints.eyes, small_checkpoints.env
+backbone, env = small_checkpoints.backbone, small_checkpoints.env
 act, pi0, make = small_checkpoints.act, small_checkpoints.pi0, small_checkpoints.make
 
 BATCH_TOLERANCE = 1e-5  # float32, sums of some hundred terms in another order

@@ -9,14 +9,7 @@ import sapien
 import torch
 from mani_skill.utils.structs import Pose
 
-from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.register import env_class
-
-
-def make(task: str, **kwargs: Any) -> Any:
-    spec = task_spec(task)
-    settings = {"obs_mode": "none", "reward_mode": "none", "control_mode": "pd_ee_delta_pose"}
-    return env_class(spec)(render_backend="none", **settings, **{**spec.kwargs, **kwargs})
+from tests.integration.made_tasks import make
 
 
 def put(env: Any, actor: Any, position_m: Any, yaw_rad: float = 0.0) -> Any:

@@ -25,10 +25,10 @@ from vla_eval.config.decoding import decode
 from vla_eval.data import recording as recording_module
 from vla_eval.data import replay as replay_module
 from vla_eval.data.dataset_folder import check_dataset, open_recorded
+from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
-from vla_eval.data.memory_loader import MemoryDataset
 from vla_eval.data.recording import RecordedDataset, record
 from vla_eval.data.recording_folder import LOCK_FILE, STATE_FOLDER
 from vla_eval.data.recording_jobs import AttemptJob, ShardJob
@@ -216,7 +216,7 @@ class TestKill:
         assert training_dataset(out / TASK, allow_unreplayed=False).sha256
         window = {"action": [0.0, 0.05]}
         source = open_recorded(out / TASK, delta_timestamps=window)
-        served = MemoryDataset(source, cache=tmp_path / "cache")
+        served = DecodedFramesDataset(source, cache=tmp_path / "cache")
         batch = next(iter(DataLoader(served, batch_size=4)))
         assert batch["action"].shape == (4, 2, 7)
         # lerobot's own dataset decodes the same pictures.

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.integration import made_tasks
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.memory_env import PARK_X_M
-from vla_eval.tasks.register import env_class
 from vla_eval.tasks.sequences import bunch_place_m
-from vla_eval.tasks.spec import TaskSpec
 
 ABOVE_CUBE_M = torch.tensor([0.0, 0.0, 0.036])  # within 2 cm of the point to touch, 1 cm over the cube
 
@@ -23,21 +21,8 @@ def make(task: str, **kwargs: Any) -> Any:
     """An environment, built once per task and arguments; its scene is used again, which is exact enough."""
     key = f"{task} {sorted(kwargs.items())}"
     if key not in ENVS:
-        ENVS[key] = _make(task_spec(task), kwargs)
+        ENVS[key] = made_tasks.make(task, **{"reward_mode": "dense", "reconfiguration_freq": 0, **kwargs})
     return ENVS[key]
-
-
-def _make(spec: TaskSpec, kwargs: dict[str, Any]) -> Any:
-    settings = {
-        "obs_mode": "none",
-        "reward_mode": "dense",
-        "control_mode": "pd_ee_delta_pose",
-        "render_backend": "none",
-        "reconfiguration_freq": 0,
-        **spec.kwargs,
-        **kwargs,
-    }
-    return env_class(spec)(**settings)
 
 
 def visible(env: Any) -> list[int]:
@@ -205,7 +190,7 @@ def test_bunches_sequences_and_chains_of_a_seed_differ() -> None:
         ({"gap_steps": 2}, "shown together"),
         ({"dwell_steps": 0}, "dwell_steps=0: expected 1"),
         ({"cube_half_size_m": 0.05}, "cube_half_size_m=0.05: expected 0.01 to 0.03"),
-        ({"phase_gate_success": False}, "response phase only in these tasks"),
+        ({"phase_gate_success": False}, "in these tasks touches count only in the response phase"),
     ],
 )
 def test_impossible_arguments_are_refused_with_a_reason(kwargs: dict[str, Any], message: str) -> None:

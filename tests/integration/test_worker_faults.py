@@ -1,6 +1,5 @@
 """What policies do to the processes around them: broken pipes, daemons, a fork server that is no more."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -163,10 +162,5 @@ def test_a_fork_server_that_is_killed_costs_no_episode(tmp_path: Path) -> None:
     assert run_with_server(signal.SIGKILL, tmp_path / "out", setup_seconds=200) == "0 0"
 
 
-def test_a_fork_server_that_is_stopped_is_noticed_and_replaced(tmp_path: Path) -> None:
-    assert run_with_server(signal.SIGSTOP, tmp_path / "out", setup_seconds=20) == "1 1"
-
-    lines = [json.loads(line) for line in (tmp_path / "out" / "episodes.jsonl").read_text().splitlines()]
-    (error,) = [line["error"] for line in lines if line["error"]]
-    assert error["kind"] == "SetupTimeout"
-    assert "starting its process for more than 20 s" in error["message"]
+def test_a_fork_server_that_is_stopped_costs_no_episode(tmp_path: Path) -> None:
+    assert run_with_server(signal.SIGSTOP, tmp_path / "out", setup_seconds=200) == "0 0"

@@ -86,7 +86,7 @@ def recorded(_recorded: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def small_act() -> Iterator[None]:
-    """ACT with a small network for its eyes: most of a training's time went there."""
+    """ACT with a small network as its vision encoder: most of a training's time went there."""
     from vla_eval.testing.tiny_models import tiny_resnet
 
     with tiny_resnet():

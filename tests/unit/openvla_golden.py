@@ -10,26 +10,20 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from tests.unit.golden_values import GoldenValues
-from vla_eval.policies.openvla.network import OpenVLANetwork, Prompts
+from tests.unit import golden_folder
+from vla_eval.policies.openvla.network import OpenVLANetwork
 from vla_eval.policies.openvla.sizes import N_BINS, NetworkOptions, NetworkSizes
 from vla_eval.policies.openvla.vision import DINO_MLP_RATIO
 from vla_eval.policies.openvla.weight_names import to_ours
+from vla_eval.policies.steps.prompts import Prompts
 from vla_eval.policies.weights import put_weights
 
 FOLDER = Path(__file__).parents[1] / "golden" / "openvla_oft"
 TOLERANCE = 2e-5  # absolute, float32 on CPU; from the README of the golden files
 
 
-@functools.cache
-def values() -> GoldenValues:
-    return GoldenValues(FOLDER / "io.safetensors")
-
-
-@functools.cache
-def config() -> dict[str, Any]:
-    data: dict[str, Any] = json.loads((FOLDER / "config.json").read_text())
-    return data
+values = functools.partial(golden_folder.stored_values, FOLDER)
+config = functools.partial(golden_folder.description, FOLDER)
 
 
 def sizes_of(described: Mapping[str, Any]) -> dict[str, int]:
@@ -63,6 +57,7 @@ def sizes_of(described: Mapping[str, Any]) -> dict[str, int]:
 
 SMALL = sizes_of(config())
 SIZES = NetworkSizes(**SMALL)
+padded = functools.partial(golden_folder.padded, pad_token=SIZES.pad_token)
 CHUNK: int = config()["num_actions_chunk"]
 ACTION: int = config()["action_dim"]
 PROPRIO: int = config()["proprio_dim"]
@@ -95,7 +90,7 @@ def network(**options: Any) -> OpenVLANetwork:
     return made.eval()
 
 
-def pictures(n_cameras: int) -> Tensor:
+def images(n_cameras: int) -> Tensor:
     """Return (samples, cameras, 3, edge, edge) in [0, 1]."""
     return values()["in.images"][:, :n_cameras].permute(0, 1, 4, 2, 3).float() / 255
 
@@ -116,13 +111,6 @@ def training_prompts() -> Prompts:
         row[: int((label != ignored).nonzero()[0])].tolist() for row, label in zip(ids, labels, strict=True)
     ]
     return padded(rows)
-
-
-def padded(rows: list[list[int]]) -> Prompts:
-    longest = max(map(len, rows))
-    ids = torch.tensor([[*row, *[SIZES.pad_token] * (longest - len(row))] for row in rows])
-    lengths = torch.tensor([len(row) for row in rows])[:, None]
-    return Prompts(ids, torch.arange(longest) < lengths)
 
 
 def word_tokenizer() -> Any:

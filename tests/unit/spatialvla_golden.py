@@ -11,14 +11,15 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from tests.unit.golden_values import GoldenValues
+from tests.unit import golden_folder
 from vla_eval.policies.spatialvla.action_grid import AXES, ActionGrid, Gaussian, gaussian_grid
 from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.policies.spatialvla.depth import zoe_config, zoe_depth
 from vla_eval.policies.spatialvla.described import GRID_PARTS
-from vla_eval.policies.spatialvla.network import Inputs, Prompts, SpatialVLANetwork
+from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.sizes import NetworkSizes
 from vla_eval.policies.spatialvla.weight_names import to_ours
+from vla_eval.policies.steps.prompts import Prompts
 from vla_eval.policies.weights import put_weights
 
 FOLDER = Path(__file__).parents[1] / "golden" / "spatialvla"
@@ -38,15 +39,8 @@ DEPTH = {
 """Sizes of a tiny depth model, for what the golden files do not hold."""
 
 
-@functools.cache
-def values() -> GoldenValues:
-    return GoldenValues(FOLDER / "io.safetensors")
-
-
-@functools.cache
-def config() -> dict[str, Any]:
-    data: dict[str, Any] = json.loads((FOLDER / "config.json").read_text())
-    return data
+values = functools.partial(golden_folder.stored_values, FOLDER)
+config = functools.partial(golden_folder.description, FOLDER)
 
 
 def sizes_of(described: Mapping[str, Any]) -> dict[str, int]:
@@ -164,6 +158,7 @@ def golden_grid(gaussians: Mapping[str, Any]) -> ActionGrid:
 
 SMALL = sizes_of(config())
 SIZES = NetworkSizes(**SMALL)
+padded = functools.partial(golden_folder.padded, pad_token=SIZES.pad_token)
 CHUNK: int = config()["action_chunk_size"]
 ROOT_OF_WIDTH = math.sqrt(SIZES.llm_width)
 
@@ -193,9 +188,9 @@ def camera(name: str = "mikasa") -> Tensor:
     return resized_intrinsics(matrix, **size, to_px=SIZES.image_px)
 
 
-def inputs(pictures: list[list[int]], prompts: Prompts, matrix: Tensor | None = None) -> Inputs:
-    """Return samples with these of the golden pictures, each seen by the camera of MIKASA, unless said."""
-    chosen = torch.tensor(pictures)
+def inputs(images: list[list[int]], prompts: Prompts, matrix: Tensor | None = None) -> Inputs:
+    """Return samples with these of the golden images, each seen by the camera of MIKASA, unless said."""
+    chosen = torch.tensor(images)
     shown = values()["in.images"][chosen].permute(0, 1, 4, 2, 3).float() / 255
     matrix = camera() if matrix is None else matrix
     return Inputs(shown, matrix.expand(*chosen.shape, 3, 3), prompts, values()["in.predicted_depth"][chosen])
@@ -217,10 +212,3 @@ def training_prompts(name: str) -> Prompts:
         before = row[: int((label != -100).nonzero()[0])]
         rows.append(before[before != SIZES.image_token].tolist())
     return padded(rows)
-
-
-def padded(rows: list[list[int]]) -> Prompts:
-    longest = max(map(len, rows))
-    ids = torch.tensor([[*row, *[SIZES.pad_token] * (longest - len(row))] for row in rows])
-    lengths = torch.tensor([len(row) for row in rows])[:, None]
-    return Prompts(ids, torch.arange(longest) < lengths)

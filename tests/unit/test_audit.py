@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from vla_eval.audit.audit_text import render_audit
 from vla_eval.audit.evaluations import CONTROLS, Counts, audit_configs, audit_task, kind_of, verdict
-from vla_eval.audit.table import render_audit
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.records import EpisodeRecord

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.unit.stored_runs import episodes, stored
+from vla_eval.audit.audit_text import render_audit
 from vla_eval.audit.evaluations import Counts, TaskAudit, verdict
-from vla_eval.audit.table import render_audit
 from vla_eval.results import shipped_audit as audited
 from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.shipped_audit import STRICT, protocol_of, shipped_verdicts
@@ -18,7 +18,7 @@ from vla_eval.tasks.catalog import TASKS
 COLOR, SHELL = "RememberColor3-v0", "ShellGameTouch-v0"
 
 
-def audit(task: str, *words: str, protocol: audited.Protocol = "paper", version: int = 1) -> TaskAudit:
+def audit(task: str, *words: str, protocol: audited.AuditProtocol = "paper", version: int = 1) -> TaskAudit:
     won = Counts(n_episodes=30, success_once=30, success_at_end=30, first_choice=30, chance=0.3)
     return TaskAudit(
         task=task,

@@ -109,6 +109,23 @@ class TestList:
         assert "CANNOT BE READ: policies/mine.yaml: there is no field 'adaptor'" in out
         assert "oracle " in out
 
+    def test_policies_are_grouped_by_what_has_to_be_done_before_they_are_evaluated(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        _, out, _ = run(capsys, "list", "policies")
+
+        group_of, group = {}, ""
+        for line in out.splitlines():
+            if line.startswith("  "):
+                group_of[line.split()[0]] = group
+            else:
+                group = line
+        assert group_of["oracle"] == group_of["tour"] == "baselines and controls:"
+        assert group_of["memory_color3"] == "ready to evaluate:"
+        assert group_of["act"] == group_of["memory"] == "to fine-tune, from scratch:"
+        assert group_of["pi0"] == group_of["octo_small"] == "to fine-tune, from a published base:"
+        assert group_of["spatialvla_tiny"].startswith("for tests")
+
 
 class TestShow:
     @pytest.mark.parametrize("task", list(TASKS))

@@ -37,9 +37,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (
             "eval",
-            EVAL + "recording: none\n",
-            ["--record-video", "all"],
-            "'recording' is 'none', which has no",
+            EVAL + "capture: none\n",
+            ["--capture-video", "all"],
+            "'capture' is 'none', which has no",
         ),
         ("eval", EVAL + "chunking: 3\n", ["--set", "chunking.mode=stale"], "'chunking' is 3, which has no"),
         ("eval", EVAL, ["--set", "tasks.x=1"], "'tasks' is a list"),
@@ -54,7 +54,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("eval", EVAL, ["--episodes", "100000000"], "episodes is 100000000"),
         ("eval", EVAL, ["--seed-start", "4294967296"], "the largest seed"),
         ("eval", EVAL, ["--seed-start", "-1"], "seed_start is -1"),
-        ("finetune", FINETUNE + "evaluation: 5\n", ["--eval-every", "2"], "'evaluation' is 5, which has no"),
+        ("finetune", FINETUNE + "held_out: 5\n", ["--held-out-every", "2"], "'held_out' is 5, which has no"),
         ("finetune", FINETUNE + "finetune: 5\n", ["--steps", "2"], "'finetune' is 5, which has no"),
         ("finetune", FINETUNE + "finetune: 5\n", ["--set", "steps=2"], "'finetune': expected a mapping"),
         ("finetune", FINETUNE, ["--run-seed", "4294967296"], "run_seed is 4294967296"),
@@ -74,11 +74,11 @@ def test_a_mistake_in_file_or_flag_is_one_message(
 
 
 def test_a_field_without_a_value_takes_what_a_flag_says(folder: Path) -> None:
-    data = {"name": "x", "tasks": ["a"], "policies": ["b"], "recording": None}
+    data = {"name": "x", "tasks": ["a"], "policies": ["b"], "capture": None}
 
-    apply_overrides(data, ["recording.video=all"], cls=EvalConfig)
+    apply_overrides(data, ["capture.video=all"], cls=EvalConfig)
 
-    assert decode(EvalConfig, data, where="x").recording.video == "all"
+    assert decode(EvalConfig, data, where="x").capture.video == "all"
 
 
 def test_fields_of_an_optional_part_can_be_set() -> None:
@@ -105,8 +105,8 @@ def test_fields_of_an_optional_part_can_be_set() -> None:
         (FinetuneConfig, {"policy": "p", "dataset": "d", "run_seed": -1}, "run_seed is -1"),
         (
             FinetuneConfig,
-            {"policy": "p", "dataset": "d", "evaluation": {"every_steps": 1, "seed_start": 2**32}},
-            r"evaluation\.seed_start is 4294967296",
+            {"policy": "p", "dataset": "d", "held_out": {"every_steps": 1, "seed_start": 2**32}},
+            r"held_out\.seed_start is 4294967296",
         ),
         (DatasetRecipe, {"name": "d", "tasks": ["t"], "encoder": {"crf": 1000}}, "crf is 1000"),
         (DatasetRecipe, {"name": "d", "tasks": ["t"], "episodes": 10**9}, "episodes is 1000000000"),

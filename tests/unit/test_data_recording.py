@@ -155,7 +155,7 @@ class TestSeedQueue:
         in_flight: list[int] = []
         n_tries = 0
         for position in order * 50:
-            while len(queue) and len(in_flight) < len(order):
+            while queue.has_next() and len(in_flight) < len(order):
                 taken = queue.take(None)
                 assert taken is not None
                 in_flight.append(taken)
@@ -181,7 +181,7 @@ class TestSeedQueue:
         known = {seed: fake_attempt(seed, succeeds=True) for seed in (1000, 1002)}  # 1001 was in flight
         queue = SeedQueue(recipe(episodes=3), known, lambda seed: seed)
         assert queue.take(None) == 1001
-        assert len(queue) == 0
+        assert not queue.has_next()
 
     def test_all_seeds_are_kept_where_the_recipe_says_so(self) -> None:
         kept, failed, _ = self.tried({1000}, [0], episodes=3, keep="all")

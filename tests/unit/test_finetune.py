@@ -20,7 +20,7 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
-from vla_eval.data.memory_loader import MemoryDataset
+from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
 from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts
@@ -109,15 +109,15 @@ class TestRuns:
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         brightest: list[float] = []
-        served = MemoryDataset.__getitem__
+        served = DecodedFramesDataset.__getitem__
 
         def watched(dataset: Any, index: int) -> Any:
             sample = served(dataset, index)
             brightest.append(float(sample["observation.images.base"].max()))
             return sample
 
-        monkeypatch.setattr(MemoryDataset, "__getitem__", watched)
-        monkeypatch.delattr(MemoryDataset, "__getitems__", raising=False)
+        monkeypatch.setattr(DecodedFramesDataset, "__getitem__", watched)
+        monkeypatch.delattr(DecodedFramesDataset, "__getitems__", raising=False)
         finetune(act(recorded, tmp_path / "run", image_transforms=transforms))
         assert brightest
         assert (max(brightest) == 0) == (transforms is not None)
@@ -199,6 +199,7 @@ class TestRuns:
             with pytest.raises(CheckpointError, match=r"names the code 'os\.system'"):
                 finetune(pi0(recorded, tmp_path / "next", tokenizer, base_checkpoint=str(base)))
         assert not trace.exists()
+        assert not (tmp_path / "next").exists()  # a mistake leaves no empty run folder
 
     def test_a_base_that_lacks_a_tensor_is_not_trained_on(
         self, recorded: Path, tmp_path: Path, tokenizer: Path

@@ -175,8 +175,6 @@ def test_every_shipped_recipe_is_one_that_lerobot_accepts(recorded: Path, tmp_pa
             continue
         # Without the base, which is not on this machine; its cameras' names go with it.
         changes: dict[str, Any] = {"base_checkpoint": None, "rename_cameras": {}, "lora": None}
-        if name == "spatialvla_kept_grid":  # what it keeps is the base's
-            changes["policy"] = {"action_grid": "refitted"}
         config = FinetuneConfig(policy=name, dataset=str(recorded), finetune=changes)
         made = policy_config(load_finetune_recipe(config).value, dataset, device="cpu")
         assert list(made.image_features) == ["observation.images.base", "observation.images.wrist"]

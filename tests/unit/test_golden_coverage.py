@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from tests.unit import openvla_golden, spatialvla_golden
+from tests.unit import golden_folder, openvla_golden, spatialvla_golden
 from tests.unit import test_octo_parity as octo
 from tests.unit import test_octo_policy as octo_policy
 from tests.unit import test_octo_whole_path as octo_whole_path
@@ -57,39 +57,39 @@ def test_every_value_of_octo_is_compared() -> None:
 
 
 def test_every_value_of_spatialvla_is_compared() -> None:
-    spatialvla_golden.values.cache_clear()
+    golden_folder.stored_values.cache_clear()
     vision, inference, training = network.TestVision(), network.TestInference(), network.TestTraining()
-    vision.test_the_depth_model_is_shown_padded_pictures()
+    vision.test_the_depth_model_is_shown_padded_images()
     for camera in ("default", "mikasa"):
         vision.test_points_in_space_position_encoding_and_features(camera)
-    vision.test_every_picture_has_a_camera_of_its_own()
+    vision.test_every_image_has_a_camera_of_its_own()
     vision.test_siglips_last_state()
     for index in range(network.N_PROMPTS):
         inference.test_logits_tokens_and_actions(index)
-    inference.test_two_pictures()
-    for name, pictures in network.TRAININGS:
+    inference.test_two_images()
+    for name, images in network.TRAININGS:
         for regime, attention in network.REGIMES:
-            training.test_logits_loss_and_gradients_of_a_padded_batch(name, pictures, regime, attention)
+            training.test_logits_loss_and_gradients_of_a_padded_batch(name, images, regime, attention)
     for name, prefix in tokens.GRIDS:
         tokens.TestGrid().test_edges_are_the_originals(name, prefix)
     for name in ("uniform", "gaussian"):
         tokens.TestTokens().test_there_back_and_there_again_are_the_originals(name)
     tokens.TestTokens().test_every_token_in_every_column_is_decoded_as_the_original_does()
     tokens.TestRefit().test_the_original_interpolates_between_the_same_middles_but_takes_roll_for_pitch()
-    policy.TestPictures().test_the_originals_are_the_same()
+    policy.TestImages().test_the_originals_are_the_same()
     steps.TestNormalizer().test_q01_q99_is_that_of_the_original_and_back_what_was_not_cut()
     assert spatialvla_golden.values().unread() == OF_CONVERSION
 
 
 def test_every_value_of_openvla_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    openvla_golden.values.cache_clear()
+    golden_folder.stored_values.cache_clear()
     published = tmp_path / "published"
     published.mkdir()
     openvla_golden.write_published(published)
     inference, training = openvla_network.TestInference(), openvla_network.TestTraining()
     for n_cameras in (1, 2):
-        inference.test_features_and_tokens_of_the_pictures(n_cameras)
-    inference.test_the_pictures_are_normalised_for_either_eye()
+        inference.test_features_and_tokens_of_the_images(n_cameras)
+    inference.test_the_images_are_normalised_for_either_eye()
     inference.test_a_raw_image_is_resized_and_normalised_as_by_the_originals_processor()
     for case in openvla_network.CASES:
         inference.test_hidden_states_and_actions(*case)
@@ -98,7 +98,7 @@ def test_every_value_of_openvla_is_compared(tmp_path: Path, monkeypatch: pytest.
     training.test_the_sequence_of_a_padded_batch_is_the_originals()
     openvla_tokens.test_decoding_all_at_once_is_the_originals()
     openvla_policy.TestNormalization().test_actions_and_state_are_normalised_as_in_the_originals_training()
-    openvla_paper_compat.test_pictures_go_through_jpeg_of_quality_95()
+    openvla_paper_compat.test_images_go_through_jpeg_of_quality_95()
     actions = openvla_convert.test_normalised_numbers_become_the_originals_actions_and_the_gripper_maniskills
     actions(published, tmp_path / "actions")
     openvla_convert.test_the_state_is_normalised_by_the_originals_mask(published, tmp_path / "state")

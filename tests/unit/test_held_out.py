@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from tests.unit import tiny_trainings
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.policies.checkpoint import find_checkpoint
@@ -33,7 +33,7 @@ TINY_ACT = {
     **{"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "latent_dim": 8, "dropout": 0.1},
 }
 SHORT = {"steps": 4, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
-ON_FAKE = HeldOutEvaluation(
+ON_FAKE = HeldOutConfig(
     every_steps=2, episodes=3, simulator="fake", env={"horizon_steps": 8}, workers=1, n_action_steps=2
 )
 
@@ -91,7 +91,7 @@ class TestEvaluation:
     ) -> None:
         lines: list[str] = []
         last_only = dataclasses.replace(ON_FAKE, every_steps=4)
-        finetune(act(recorded, tmp_path / "with", evaluation=last_only), say=lines.append)
+        finetune(act(recorded, tmp_path / "with", held_out=last_only), say=lines.append)
         finetune(act(recorded, tmp_path / "without"))
 
         assert same_weights(tmp_path / "with", tmp_path / "without")
@@ -114,7 +114,7 @@ class TestEvaluation:
         quick_evaluation: list[EvalConfig],
     ) -> None:
         straight, broken = tmp_path / "straight", tmp_path / "broken"
-        finetune(act(recorded, straight, evaluation=ON_FAKE))
+        finetune(act(recorded, straight, held_out=ON_FAKE))
         assert [name for name, _ in metrics(straight)] == ["1", "2", "eval 2", "3", "4", "eval 4"]
 
         def kill(folder: Path) -> Any:
@@ -122,22 +122,22 @@ class TestEvaluation:
 
         with monkeypatch.context() as patch, pytest.raises(Killed):
             patch.setattr(held_out_module, "read_run", kill)
-            finetune(act(recorded, broken, evaluation=ON_FAKE))
+            finetune(act(recorded, broken, held_out=ON_FAKE))
         assert [name for name, _ in metrics(broken)] == ["1", "2"]
-        finetune(act(recorded, broken, evaluation=ON_FAKE))
+        finetune(act(recorded, broken, held_out=ON_FAKE))
 
         assert same_weights(straight, broken)
         assert metrics(broken) == metrics(straight)
         n_evaluations = len(quick_evaluation)
-        finetune(act(recorded, broken, evaluation=ON_FAKE))  # all is there
+        finetune(act(recorded, broken, held_out=ON_FAKE))  # all is there
         assert len(quick_evaluation) == n_evaluations
 
     def test_other_settings_evaluate_the_checkpoints_that_are_there_again(
         self, recorded: Path, tmp_path: Path, quick_evaluation: list[EvalConfig]
     ) -> None:
-        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, evaluation=ON_FAKE))
+        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, held_out=ON_FAKE))
         more = dataclasses.replace(ON_FAKE, episodes=4)
-        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, evaluation=more))
+        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, held_out=more))
 
         assert [config.episodes for config in quick_evaluation] == [3, 4]
         assert [name for name, _ in metrics(tmp_path / "run")] == ["1", "2", "eval 2", "eval 2"]
@@ -145,7 +145,7 @@ class TestEvaluation:
 
 class TestSeeds:
     def check(self, dataset: Path, **fields: Any) -> str:
-        settings = HeldOutEvaluation(**{"every_steps": 10, **fields})
+        settings = HeldOutConfig(**{"every_steps": 10, **fields})
         recipe = FinetuneRecipe(type="act", save_every_steps=5)
         return check_held_out(settings, recipe, training_dataset(dataset, allow_unreplayed=True))
 
@@ -201,7 +201,7 @@ class TestTrackers:
         monkeypatch.setitem(sys.modules, "trackio", trackio)
 
         section = {"steps": 2, "trackio_project": "memory"}
-        finetune(act(recorded, tmp_path / "run", finetune=section, evaluation=ON_FAKE))
+        finetune(act(recorded, tmp_path / "run", finetune=section, held_out=ON_FAKE))
 
         assert (calls[0]["project"], calls[0]["name"], calls[0]["resume"]) == ("memory", "run", "allow")
         assert calls[1:] == ["finish"]
@@ -211,7 +211,7 @@ class TestTrackers:
         assert logged[2][1]["success_once"] == lines[2]["success_once"]
         assert capsys.readouterr().out == ""
         # A tracker is no part of what a run is compared by.
-        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, evaluation=ON_FAKE))
+        finetune(act(recorded, tmp_path / "run", finetune={"steps": 2}, held_out=ON_FAKE))
 
     def test_a_tracker_that_is_not_installed_is_an_error_that_says_what_to_install(
         self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -240,7 +240,7 @@ def test_the_command_line_asks_for_evaluations(
     seen = tiny_trainings.asked_for(monkeypatch)
     arguments = ["finetune", "--policy", "act", "--dataset", str(recorded)]
     assert main(arguments) == 0
-    assert main([*arguments, "--eval-every", "5000", "--eval-episodes", "7"]) == 0
-    assert [config.evaluation for config in seen] == [None, HeldOutEvaluation(every_steps=5000, episodes=7)]
-    assert main([*arguments, "--eval-episodes", "7"]) == 1
+    assert main([*arguments, "--held-out-every", "5000", "--held-out-episodes", "7"]) == 0
+    assert [config.held_out for config in seen] == [None, HeldOutConfig(every_steps=5000, episodes=7)]
+    assert main([*arguments, "--held-out-episodes", "7"]) == 1
     assert "every_steps" in capsys.readouterr().err

@@ -10,6 +10,7 @@ import pytest
 
 from tests.unit.stored_runs import episodes, stored
 from vla_eval.page.build import build_page
+from vla_eval.results.cells import markdown_block, markdown_code
 from vla_eval.results.report import build_table, render
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import render_sweep
@@ -71,6 +72,20 @@ def test_a_row_of_markdown_is_one_line_with_all_its_cells(name: str) -> None:
         assert len({len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines}) == 1
         assert all(line == "" or line.startswith(("|", "- ")) for line in text.split("\n"))
         assert not re.search(r"<[A-Za-z/!?]", text)
+
+
+@pytest.mark.parametrize("name", ["[a](http://b)", "![a][b]", "`a`", "**a**", "a](b"])
+def test_no_cell_of_markdown_is_a_link_or_code_or_bold(name: str) -> None:
+    for text in outputs(run_of(name), "markdown"):
+        cells = "".join(line for line in text.split("\n") if line.startswith("|"))
+        acting = re.sub(r"\\.", "", cells)
+        assert not re.search(r"\]\(|\]\[|`|\*", acting)
+
+
+def test_code_and_blocks_of_markdown_end_where_they_should() -> None:
+    assert markdown_code("a`b``c|d") == "``` a`b``c\\|d ```"
+    assert markdown_block("a: |\n  ```\n  # out\n", "yaml") == "````yaml\na: |\n  ```\n  # out\n````"
+    assert markdown_block("a", "yaml") == "```yaml\na\n```"
 
 
 @pytest.mark.parametrize("name", NAMES)

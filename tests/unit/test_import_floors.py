@@ -21,7 +21,7 @@ ALSO_CHEAP = (
     "envs.factory",
     "envs.fake",
     "policies.scripted",
-    "viz.recorder",
+    "viz.capture",
     "data.recording",
     "data.replay",
 )

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from vla_eval.policies.memory.action_head import ActionHead
-from vla_eval.policies.memory.eyes import LEAST_COLOR_VARIANCE, Eye, standing_out
 from vla_eval.policies.memory.goal_layer import GoalLayer, Goals
 from vla_eval.policies.memory.network import MemoryNetwork
 from vla_eval.policies.memory.sizes import QUARTERS, NetworkSizes
+from vla_eval.policies.memory.vision_encoder import LEAST_COLOR_VARIANCE, VisionEncoder, standing_out
 
 
 class TestStandingOut:
@@ -41,7 +41,7 @@ class TestEye:
         red, blue = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
         picture[:, 0:4, 8:12] = red[:, None, None]
         picture[:, 0:4, 12:16] = blue[:, None, None]
-        spots = Eye(NetworkSizes(patch_px=8, image_px=32))(picture[None]).spots[0]
+        spots = VisionEncoder(NetworkSizes(patch_px=8, image_px=32))(picture[None]).spots[0]
         left, right = spots.unflatten(0, (-1, QUARTERS))[1, :2]
         torch.testing.assert_close(left[1:4], 2 * red - 1)
         torch.testing.assert_close(right[1:4], 2 * blue - 1)
@@ -51,7 +51,7 @@ class TestEye:
         assert left[5] in torch.linspace(-1, 1, 16)[:2]
 
     def test_spots_lie_in_the_places_in_whose_order_they_are_told(self) -> None:
-        spots = Eye(NetworkSizes(patch_px=8, image_px=32))(torch.rand(1, 3, 32, 32)).spots[0]
+        spots = VisionEncoder(NetworkSizes(patch_px=8, image_px=32))(torch.rand(1, 3, 32, 32)).spots[0]
         x, y = spots.unflatten(0, (-1, QUARTERS))[..., -2:].unbind(-1)
         column, row = torch.arange(4).repeat(4), torch.arange(4).repeat_interleave(4)  # of 4 by 4 places
         quarter = torch.arange(QUARTERS)

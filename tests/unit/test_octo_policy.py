@@ -203,18 +203,12 @@ class TestTraining:
                 octo_config({**TINY, **fields})
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("octo_small", "octo_base", "octo_tiny", "octo_small_positions", "octo_small_window2"),
-        *("octo_small_full", "octo_small_cached"),
-    ],
-)
+@pytest.mark.parametrize("name", ["octo_small", "octo_base", "octo_tiny"])
 def test_each_recipe_is_a_configuration(name: str) -> None:
     section = load_recipe("policies", name, PolicyRecipe).value.finetune
     assert section is not None and section.type == "mikasa_octo"
     config = MikasaOctoConfig(device="cpu", **section.policy)
-    assert (config.window, config.chunk_size) == (2 if name.endswith("window2") else 10, 4)
+    assert (config.window, config.chunk_size) == (10, 4)
 
 
 # ----------------------------------------------------------------------------------- from data to a table
@@ -250,9 +244,9 @@ def episode(slot: int) -> EpisodeStart:
 
 def frames(slot: int, first: int, stop: int) -> tuple[Observation, ...]:
     rng = np.random.default_rng(slot)
-    pictures = rng.integers(0, 256, (stop, 2, 128, 128, 3), dtype=np.uint8)
+    images = rng.integers(0, 256, (stop, 2, 128, 128, 3), dtype=np.uint8)
     return tuple(
-        Observation(step=n, images={"base_camera": pictures[n, 0], "hand_camera": pictures[n, 1]}, state={})
+        Observation(step=n, images={"base_camera": images[n, 0], "hand_camera": images[n, 1]}, state={})
         for n in range(first, stop)
     )
 
@@ -261,8 +255,8 @@ def in_float64(policy: LeRobotPolicy) -> LeRobotPolicy:
     """So that a difference is no more than float32 of the actions: twenty steps add up rounding."""
     network: Any = policy._loaded.policy
     network.double()
-    pictures = network._pictures
-    network._pictures = lambda camera, images: pictures(camera, images).double()
+    resized = network._images
+    network._images = lambda camera, images: resized(camera, images).double()
     return policy
 
 

@@ -1,4 +1,4 @@
-"""Octo from pictures and a sentence to the executed action, through the evaluation's own adapter."""
+"""Octo from images and a sentence to the executed action, through the evaluation's own adapter."""
 
 import json
 from pathlib import Path
@@ -51,7 +51,7 @@ def sentence(ids: Tensor) -> str:
 
 def converted(folder: Path, *, window: int) -> Path:
     fields = {**golden_fields(), "window": window}
-    # The stored frames have the model's size, so that nothing is resized; pictures are not cropped.
+    # The stored frames have the model's size, so that nothing is resized; images are not cropped.
     fields |= {"augment": False}
     fields["t5"]["vocabulary"] = CONFIG["t5"]["vocab_size"]
     (folder / "original").mkdir()

@@ -58,7 +58,7 @@ def test_a_converted_checkpoint_has_the_originals_weights_and_statistics(
 ) -> None:
     out = convert_openvla(published, tmp_path / "ours", OFT)
     loaded, values = load_checkpoint(out, LoadOptions(device="cpu")), golden.values()
-    inputs = Inputs(golden.pictures(2)[1:], golden.prompts("prompt2"), values["in.proprio"][1:])
+    inputs = Inputs(golden.images(2)[1:], golden.prompts("prompt2"), values["in.proprio"][1:])
     with torch.no_grad():
         normalized = loaded.policy.network.actions(inputs)
     expected = values["infer.img2.prompt2.proprio.actions_normalized"]
@@ -84,11 +84,11 @@ def test_the_state_is_normalised_by_the_originals_mask(published: Path, tmp_path
     assert False in golden.config()["proprio_statistics"]["mask"]  # and what it leaves alone is cut, too
     loaded = load_checkpoint(convert_openvla(published, tmp_path / "ours", OFT), LoadOptions(device="cpu"))
     values = golden.values()
-    pictures = golden.pictures(2)
+    images = golden.images(2)
     batch = loaded.preprocessor(
         {
-            "observation.images.base": pictures[:, 0],
-            "observation.images.wrist": pictures[:, 1],
+            "observation.images.base": images[:, 0],
+            "observation.images.wrist": images[:, 1],
             "observation.state": values["in.proprio_raw"].float(),
             "task": ["pick", "pick"],
         }

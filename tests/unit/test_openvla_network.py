@@ -10,9 +10,10 @@ from torch.nn import functional
 
 from tests.unit import openvla_golden as golden
 from tests.unit.openvla_golden import TOLERANCE
+from tests.unit.original_names import openvla_names
 from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.policies.openvla.sizes import NetworkOptions, NetworkSizes
-from vla_eval.policies.openvla.weight_names import to_original, to_ours, unused
+from vla_eval.policies.openvla.weight_names import to_ours, unused
 from vla_eval.policies.steps.images import Size, resize_bicubic
 
 CASES = [
@@ -22,7 +23,7 @@ CASES = [
     ("img2.prompt2.proprio", 2, "prompt2", True),
 ]
 TRAININGS = [("train.img1", 1, False), ("train.img2", 2, False), ("train.img2.proprio", 2, True)]
-FIRST = Inputs(golden.pictures(2)[:1], golden.prompts("prompt1"))
+FIRST = Inputs(golden.images(2)[:1], golden.prompts("prompt1"))
 VISIBLE = 1e-4  # tanh GELU, the least of these, moves actions by 1.5e-4 to 5e-4
 
 
@@ -37,7 +38,7 @@ def made(*, proprio: bool = False) -> OpenVLANetwork:
 
 def gradients_by_original_name(network: OpenVLANetwork) -> dict[str, Tensor]:
     ours = {key: value.grad for key, value in network.named_parameters() if value.grad is not None}
-    gradients = to_original(ours)
+    gradients = openvla_names(ours)
     # Weights of the class token and of its position are added up, since the original has only their sum;
     # the gradient of a sum is that of either part.
     name = "embeddings.cls_token"
@@ -51,21 +52,21 @@ def proprio_of(rows: slice, *, proprio: bool) -> Tensor | None:
 
 def answer(network: OpenVLANetwork, n_cameras: int = 2, prompt: str = "prompt1") -> Tensor:
     with torch.no_grad():
-        return network.actions(Inputs(golden.pictures(n_cameras)[:1], golden.prompts(prompt)))[0]
+        return network.actions(Inputs(golden.images(n_cameras)[:1], golden.prompts(prompt)))[0]
 
 
 class TestInference:
     @pytest.mark.parametrize("n_cameras", [1, 2])
-    def test_features_and_tokens_of_the_pictures(self, n_cameras: int) -> None:
+    def test_features_and_tokens_of_the_images(self, n_cameras: int) -> None:
         network, values = made(), golden.values()
         with torch.no_grad():
-            features = network.vision(golden.pictures(n_cameras))
+            features = network.vision(golden.images(n_cameras))
             tokens = network.projector(features)
         close(features, values[f"mid.img{n_cameras}.vision_features"])
         close(tokens, values[f"mid.img{n_cameras}.projected_patches"])
 
-    def test_the_pictures_are_normalised_for_either_eye(self) -> None:
-        both = made().vision.normalised(golden.pictures(1)[0])
+    def test_the_images_are_normalised_for_either_eye(self) -> None:
+        both = made().vision.normalised(golden.images(1)[0])
         close(both.flatten(0, 2), golden.values()["mid.pixel_values_sample0_image0"][0].flatten(0, 0))
 
     def test_a_raw_image_is_resized_and_normalised_as_by_the_originals_processor(self) -> None:
@@ -81,7 +82,7 @@ class TestInference:
         with torch.no_grad():
             sequence = network.sequence(
                 Inputs(
-                    golden.pictures(n_cameras)[sample],
+                    golden.images(n_cameras)[sample],
                     golden.prompts(prompt),
                     proprio_of(sample, proprio=proprio),
                 )
@@ -92,12 +93,12 @@ class TestInference:
         close(actions[0], values[f"infer.{name}.actions_normalized"])
 
     def test_a_batch_of_prompts_of_several_lengths_gives_each_what_it_gets_alone(self) -> None:
-        network, pictures = made(), golden.pictures(2)
+        network, images = made(), golden.images(2)
         rows = [[1, 512, 29901, 29871], [1, 512, 29901, 1724, 3158, 881, 29871]]
         with torch.no_grad():
-            together = network.actions(Inputs(pictures, golden.padded(rows)))
+            together = network.actions(Inputs(images, golden.padded(rows)))
             for index, row in enumerate(rows):
-                alone = network.actions(Inputs(pictures[index : index + 1], golden.padded([row])))
+                alone = network.actions(Inputs(images[index : index + 1], golden.padded([row])))
                 close(together[index : index + 1], alone, atol=5e-6)
 
 
@@ -106,7 +107,7 @@ class TestTraining:
     def test_loss_and_gradients_of_a_padded_batch(self, name: str, n_cameras: int, proprio: bool) -> None:
         network, values = copy.deepcopy(made(proprio=proprio)), golden.values()
         batch = Inputs(
-            golden.pictures(n_cameras), golden.training_prompts(), proprio_of(slice(2), proprio=proprio)
+            golden.images(n_cameras), golden.training_prompts(), proprio_of(slice(2), proprio=proprio)
         )
         hidden = network.action_states(network.sequence(batch))
         actions = network.action_head(hidden)
@@ -193,18 +194,18 @@ class TestTraps:
     def test_a_prompt_without_the_empty_token(self, network: OpenVLANetwork) -> None:
         ids = golden.values()["in.prompt1_input_ids"][0].tolist()
         with torch.no_grad():
-            actions = network.actions(Inputs(golden.pictures(2)[:1], golden.padded([ids])))[0]
+            actions = network.actions(Inputs(golden.images(2)[:1], golden.padded([ids])))[0]
         assert self.difference(network, actions) > VISIBLE
 
     def test_cameras_in_another_order(self, network: OpenVLANetwork) -> None:
         with torch.no_grad():
-            actions = network.actions(FIRST._replace(pictures=FIRST.pictures.flip(1)))[0]
+            actions = network.actions(FIRST._replace(images=FIRST.images.flip(1)))[0]
         assert self.difference(network, actions) > VISIBLE
 
     def test_padding_that_is_attended_to(self, network: OpenVLANetwork) -> None:
         prompts = golden.training_prompts()
         with torch.no_grad():
-            right = network.sequence(Inputs(golden.pictures(2), prompts))
+            right = network.sequence(Inputs(golden.images(2), prompts))
             wrong = right._replace(mask=torch.ones_like(right.mask))
             difference = (network.action_states(right) - network.action_states(wrong)).abs().amax(dim=(1, 2))
         assert difference[0] < TOLERANCE and difference[1] > VISIBLE  # the second row is the shorter one
@@ -213,7 +214,7 @@ class TestTraps:
 class TestWeightNames:
     def test_there_and_back_is_the_same_but_for_what_is_never_used(self) -> None:
         weights = golden.original_weights()
-        back = to_original(to_ours(weights, golden.SIZES))
+        back = openvla_names(to_ours(weights, golden.SIZES))
         assert set(back) == {name for name in weights if not unused(name, golden.SIZES)}
         for name, tensor in back.items():
             assert torch.equal(tensor, weights[name]), name

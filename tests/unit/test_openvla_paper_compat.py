@@ -55,18 +55,18 @@ def test_the_gripper_is_inverted_about_one_half() -> None:
     assert chunk("gripper_sign")[:, -1].tolist() == [1, 1, 1, 1, 0, -1, -1, -1]
 
 
-def test_pictures_go_through_jpeg_of_quality_95() -> None:
+def test_images_go_through_jpeg_of_quality_95() -> None:
     policy: Any = Counting()
     PaperCompatPolicy(policy, ["jpeg"], n_action_steps=4).act(window())
     theirs = golden.values()["data.jpeg_decoded"].float()
     difference = (torch.from_numpy(policy.seen[0]).float() - theirs).abs()
-    # TensorFlow's encoder is another one: at most 19 levels apart on this picture, by the golden README.
+    # TensorFlow's encoder is another one: at most 19 levels apart on this image, by the golden README.
     assert float(difference.max()) <= 19
     raw = golden.values()["data.image"].float()
     assert float(difference.mean()) < 0.5 * float((raw - theirs).abs().mean())
 
 
-def test_a_plain_picture_survives_jpeg() -> None:
+def test_a_plain_image_survives_jpeg() -> None:
     image = np.full((16, 16, 3), 200, np.uint8)
     assert np.abs(jpeg_round_trip(image).astype(int) - 200).max() <= 1
     assert Image.fromarray(image).size == (16, 16)

@@ -11,8 +11,9 @@ from torch.nn import functional
 from tests.unit import openvla_golden as golden
 from vla_eval.policies.openvla.action_tokens import from_tokens, to_tokens
 from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
-from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
+from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.policies.openvla.sizes import NetworkOptions
+from vla_eval.policies.steps.prompts import Prompts
 
 TEXT = golden.SIZES.text_vocabulary
 SMALL = dataclasses.replace(
@@ -43,7 +44,7 @@ def test_an_action_comes_back_within_half_a_bin_and_the_outermost_tokens_are_the
 
 def test_decoding_all_at_once_is_the_originals() -> None:
     network, values = made("parallel_tokens"), golden.values()
-    inputs = Inputs(golden.pictures(2)[:1], golden.prompts("prompt1"))
+    inputs = Inputs(golden.images(2)[:1], golden.prompts("prompt1"))
     with torch.no_grad():
         hidden, told = network.action_states(network.sequence(inputs)), parallel_actions(network, inputs)
     for found, name in ((hidden, "hidden"), (told[0], "actions_normalized")):
@@ -53,7 +54,7 @@ def test_decoding_all_at_once_is_the_originals() -> None:
 
 def test_the_loss_of_tokens_all_at_once_is_the_originals_with_the_stop_token() -> None:
     network, chunk = made("parallel_tokens"), golden.values()["train.actions"]
-    inputs = Inputs(golden.pictures(2), golden.training_prompts())
+    inputs = Inputs(golden.images(2), golden.training_prompts())
     with torch.no_grad():
         loss = token_loss(network, inputs, chunk, torch.ones(chunk.shape[:2]))
         sequence = network.sequence(inputs)
@@ -76,7 +77,7 @@ class TestOneAfterTheOther:
         return made("tokens", 1)
 
     def test_each_token_is_what_a_pass_without_a_cache_tells(self, network: OpenVLANetwork) -> None:
-        inputs = Inputs(golden.pictures(1)[:1], golden.padded([ROWS[1]]))
+        inputs = Inputs(golden.images(1)[:1], golden.padded([ROWS[1]]))
         ids = torch.zeros(1, 7, dtype=torch.long)
         with torch.no_grad():
             for place in range(7):
@@ -89,11 +90,11 @@ class TestOneAfterTheOther:
     def test_prompts_of_several_lengths_get_together_what_they_get_alone(
         self, network: OpenVLANetwork
     ) -> None:
-        pictures = golden.pictures(1)
+        images = golden.images(1)
         with torch.no_grad():
-            together = generated_actions(network, Inputs(pictures, golden.padded(ROWS)))
+            together = generated_actions(network, Inputs(images, golden.padded(ROWS)))
             for index, row in enumerate(ROWS):
-                one = Inputs(pictures[index : index + 1], golden.padded([row]))
+                one = Inputs(images[index : index + 1], golden.padded([row]))
                 alone = generated_actions(network, one)
                 assert torch.equal(together[index], alone[0])
 
@@ -102,7 +103,7 @@ class TestOneAfterTheOther:
         network = OpenVLANetwork(SMALL, NetworkOptions(head="tokens", chunk=1))
         wanted = torch.tensor([[[0.5, -0.5, 0.1, 0.9, -0.9, 0.0, 1.0]]])
         prompts = Prompts(torch.tensor([[1, 9, 3]]), torch.ones(1, 3, dtype=torch.bool))
-        inputs = Inputs(golden.pictures(1)[:1, ..., :28, :28], prompts)
+        inputs = Inputs(golden.images(1)[:1, ..., :28, :28], prompts)
         optimizer = torch.optim.Adam(network.parameters(), 1e-2)
         for _ in range(30):
             loss = token_loss(network, inputs, wanted, torch.ones(1, 1))
@@ -114,7 +115,7 @@ class TestOneAfterTheOther:
         assert float((told - wanted).abs().max()) <= 1 / 255 + 1e-6
 
     def test_the_loss_is_the_cross_entropy_of_seven_tokens_and_stop(self, network: OpenVLANetwork) -> None:
-        action, inputs = torch.zeros(1, 1, 7), Inputs(golden.pictures(1)[:1], golden.padded([ROWS[0]]))
+        action, inputs = torch.zeros(1, 1, 7), Inputs(golden.images(1)[:1], golden.padded([ROWS[0]]))
         with torch.no_grad():
             loss = token_loss(network, inputs, action, torch.ones(1, 1))
             ids = torch.full((1, 7), TEXT - 128)  # 0 is in the middle of bin 128 of 255

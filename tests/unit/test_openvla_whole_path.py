@@ -21,7 +21,7 @@ from vla_eval.policies.openvla_paper import make_openvla
 # The stored images have the model's size, and the original ran without the crop.
 OPTIONS = ConvertOptions(
     chunk_size=golden.CHUNK,
-    picture_px=golden.SIZES.image_px,
+    camera_px=golden.SIZES.image_px,
     sizes=golden.SMALL,
     dtype="float32",
     allow_pickled=True,
@@ -88,8 +88,8 @@ def test_an_image_of_another_size_is_resized_and_cropped_as_by_the_original(
 ) -> None:
     policy = loaded(published, tmp_path, "img1.prompt1", image_augmentation=is_cropped).policy
     image = golden.values()["data.jpeg_decoded"].permute(2, 0, 1)[None].float() / 255
-    (key,) = policy.config.picture_fields
-    levels = policy._pictures({key: image}, changed=False)[0, 0] * 255
+    (key,) = policy.config.image_fields
+    levels = policy._images({key: image}, changed=False)[0, 0] * 255
     expected = golden.values()[f"data.{name}"].permute(2, 0, 1).float()
     assert image.shape[-1] != expected.shape[-1]
     torch.testing.assert_close(levels, expected, atol=1, rtol=0)  # by the README of the golden files
@@ -106,9 +106,9 @@ def test_the_loss_of_the_policy_and_its_parts_are_the_originals(
         golden.values(),
         golden.training_prompts(),
     )
-    pictures = golden.pictures(len(policy.config.picture_fields)).unbind(dim=1)
+    images = golden.images(len(policy.config.image_fields)).unbind(dim=1)
     batch: dict[str, Tensor] = {
-        **dict(zip(policy.config.picture_fields, pictures, strict=True)),
+        **dict(zip(policy.config.image_fields, images, strict=True)),
         OBS_LANGUAGE_TOKENS: prompts.ids,
         OBS_LANGUAGE_ATTENTION_MASK: prompts.mask,
         STATE_KEY: values["in.proprio"],

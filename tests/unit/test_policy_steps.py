@@ -222,7 +222,7 @@ class TestImages:
         cut_before = centre_crop(resize_lanczos3(image, Size(64, 64))[None], 0.9)[0]
         assert float((cut_before - expected).abs().max()) > 1
 
-    def test_a_crop_of_everything_changes_nothing_and_each_picture_has_its_own(self) -> None:
+    def test_a_crop_of_everything_changes_nothing_and_each_image_has_its_own(self) -> None:
         images = torch.rand(2, 3, 5, 4) * 255
         zeros, ones = torch.zeros(2), torch.ones(2)
         whole = crop_and_resize(images, Boxes(top=zeros, left=zeros, height=ones, width=ones))

@@ -86,6 +86,13 @@ def test_python_itself_holds_no_adapter(adapter: str) -> None:
             find(adapter)
 
 
+@pytest.mark.parametrize("adapter", ["vla_eval:x", "vla_eval.cli.main:main", "vla_eval.policies:x"])
+def test_the_rest_of_this_package_holds_no_adapter(adapter: str) -> None:
+    for find in (check_adapter, policy_factory):
+        with pytest.raises(UnknownNameError, match="module of this package and holds no policies"):
+            find(adapter)
+
+
 @pytest.mark.parametrize(
     "adapter", ["a b:c", "a/b:c", "../a:c", "a..b:c", ".a:c", "a:b:c", "a:b()", "a:\n", "1:2"]
 )

@@ -317,7 +317,7 @@ def test_a_run_that_was_continued_elsewhere_is_named() -> None:
     table = build_table(
         [StoredRun(path=run.path, description=run.description, records=run.records, sessions=(session,))]
     )
-    assert has_note(table, "runs/a was continued in another environment", "environment.device.gpu")
+    assert has_note(table, "runs/a was resumed in another environment", "environment.device.gpu")
 
 
 def test_figures_of_the_fake_simulator_are_called_worthless() -> None:

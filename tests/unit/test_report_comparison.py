@@ -38,7 +38,7 @@ def test_runs_are_compared_with_the_same_run() -> None:
     )
     row = only_row(table, "p")
     assert (row.n_pairs, row.paired_difference, row.paired_p_raw) == (4, 0.0, 1.0)
-    assert has_note(table, "p takes pairs of several runs as independent")
+    assert has_note(table, "p treats pairs of several runs as independent")
 
 
 def test_a_pair_of_deterministic_policies_is_one_observation_however_often_it_is_run() -> None:
@@ -128,12 +128,12 @@ def test_chance_is_not_guessed_where_there_is_nothing_to_choose_from() -> None:
     assert has_note(table, "chance is unknown for InterceptMedium-v0 K=1", "run `cue_blind`")
 
 
-def test_a_chance_of_few_episodes_is_called_vague() -> None:
+def test_a_chance_of_few_episodes_is_called_imprecise() -> None:
     # One failure: the interval of the blind arm is [0, 0.79]; 7 of 20: [0.18, 0.57].
     policy = episodes("p", "+" * 20)
-    assert has_note(build_table([stored(policy, episodes("cue_blind", "-"))]), "says little", "[0.00, 0.79]")
+    assert has_note(build_table([stored(policy, episodes("cue_blind", "-"))]), "is imprecise", "[0.00, 0.79]")
     settled = build_table([stored(policy, episodes("cue_blind", "+" * 7 + "-" * 13))])
-    assert not has_note(settled, "says little")
+    assert not has_note(settled, "is imprecise")
 
 
 def test_a_ceiling_at_chance_leaves_no_room_for_a_score() -> None:

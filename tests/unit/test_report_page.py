@@ -21,7 +21,7 @@ from vla_eval.page.svg import PALETTE
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
 from vla_eval.results.table_formats import table_cells
-from vla_eval.storage.recording_files import video_file
+from vla_eval.storage.capture_files import video_file
 from vla_eval.storage.run_folder import RunDescription, RunFolder, Session, StoredRun, read_run
 
 COLOR, INTERCEPT = "RememberColor3-v0", "InterceptMedium-v0"
@@ -172,9 +172,9 @@ def test_what_is_missing_is_said_in_words() -> None:
     assert "Only one n_action_steps" in sections["chunks"]
     assert "There is no baseline" in sections["paired"]
     assert "No task of this table has candidates" in sections["choices"]
-    assert "no timing was kept" in sections["latency"]
+    assert "have no timing" in sections["latency"]
     assert "No episode ended in an error" in sections["errors"]
-    assert "No videos were recorded" in sections["episodes"]
+    assert "No videos were captured" in sections["episodes"]
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_only_the_columns_that_were_asked_for_are_shown_in_their_order(fmt: Form
 def test_columns_that_are_mistyped_or_of_no_use_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'success'"):
         render(a_table(), "markdown", columns=["policy", "succes"])
-    with pytest.raises(ReportError, match="csv holds every column"):
+    with pytest.raises(ReportError, match="csv has every column"):
         render(a_table(), "csv", columns=["policy"])
 
 

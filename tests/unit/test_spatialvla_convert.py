@@ -24,7 +24,7 @@ from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
 from vla_eval.policies.spatialvla.action_tokens import from_tokens
 from vla_eval.policies.spatialvla.depth import PAD_PX
-from vla_eval.policies.spatialvla.described import _NOT_OF_EYE, _NOT_OF_ZOE, check_described
+from vla_eval.policies.spatialvla.described import _NOT_OF_ENCODER, _NOT_OF_ZOE, check_described
 from vla_eval.policies.spatialvla.ego3d import CENTRE_M
 from vla_eval.policies.spatialvla.network import FIRST_PLACE
 from vla_eval.policies.spatialvla.sections import OF_NO_EFFECT
@@ -64,30 +64,30 @@ def changed_weights(folder: Path, **tensors: torch.Tensor | None) -> None:
 
 @pytest.fixture(scope="module")
 def converted(_published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = dataclasses.replace(OPTIONS, picture_px=golden.SIZES.image_px)
+    options = dataclasses.replace(OPTIONS, camera_px=golden.SIZES.image_px)
     return convert_spatialvla(_published, tmp_path_factory.mktemp("converted") / "ours", options)
 
 
 class StoredDepth(torch.nn.Module):
-    """Says what the original's depth network was replaced by: the stored depth of each golden picture."""
+    """Says what the original's depth network was replaced by: the stored depth of each golden image."""
 
-    def forward(self, pictures: Tensor) -> Tensor:
+    def forward(self, images: Tensor) -> Tensor:
         values = golden.values()
         known = values["in.images"].permute(0, 3, 1, 2).float() / 255
-        distances = (pictures[:, None] - known).abs().amax(dim=(2, 3, 4))
+        distances = (images[:, None] - known).abs().amax(dim=(2, 3, 4))
         assert float(distances.amin(dim=1).max()) < 1e-6
         return values["in.predicted_depth"][distances.argmin(dim=1)]
 
 
 def test_an_episode_executes_what_the_original_predicts(converted: Path) -> None:
     values, statistics = golden.values(), golden.config()["statistics"][UNNORM_KEY]["action"]
-    pictures = values["in.images"].numpy()
-    env = StoredFrames({name: pictures for name in ("base_camera", "hand_camera")})
+    images = values["in.images"].numpy()
+    env = StoredFrames({name: images for name in ("base_camera", "hand_camera")})
     policy = make_lerobot(context(env, golden.CHUNK), checkpoint=str(converted), device="cpu")
     policy._loaded.policy.network.depth = StoredDepth()
     for index, prompt in enumerate(golden.config()["prompts"]):
         shown = int(values[f"infer{index}.image_index"])
-        env._frames = {name: pictures[shown : shown + 1] for name in env._frames}
+        env._frames = {name: images[shown : shown + 1] for name in env._frames}
         found = executed(
             env,
             policy,
@@ -107,10 +107,10 @@ def test_a_converted_checkpoint_predicts_as_the_original_without_being_told(conv
     loaded.policy.network.depth = StoredDepth()
     given = golden.inputs([[1]], golden.prompts(1))
     batch = loaded.preprocessor(
-        {"observation.images.base": given.pictures[:, 0], "task": [golden.config()["prompts"][1]]}
+        {"observation.images.base": given.images[:, 0], "task": [golden.config()["prompts"][1]]}
     )
     inputs = loaded.policy._inputs(batch)
-    torch.testing.assert_close(inputs.pictures, given.pictures)
+    torch.testing.assert_close(inputs.images, given.images)
     torch.testing.assert_close(inputs.intrinsics, given.intrinsics)
     assert torch.equal(inputs.prompts.ids, given.prompts.ids)
     expected = from_tokens(
@@ -143,7 +143,7 @@ def test_tokens_become_the_actions_of_the_original(published: Path, tmp_path: Pa
     assert torch.equal(actions[0, :, -1], 2 * expected[:, -1] - 1)  # ManiSkill's gripper
     with torch.no_grad():
         assert torch.isfinite(
-            loaded.policy.network.depth(golden.inputs([[1]], golden.prompts(1)).pictures[:, 0])
+            loaded.policy.network.depth(golden.inputs([[1]], golden.prompts(1)).images[:, 0])
         ).all()
     verified = verify_checkpoint(out, LoadOptions(device="cpu"))
     assert verified.chunk == (1, golden.CHUNK, 7) and {"action.q01", "action.q99"} <= set(verified.statistics)
@@ -173,7 +173,7 @@ def test_every_field_of_the_files_is_compared_used_or_of_no_effect(published: Pa
     check_described(published, NetworkSizes(**SMALL))
     files = golden.published_files(golden.config(), SMALL)
     passed = {path for path in leaves(files) if not refused(published, files, path, "something else")}
-    of_depth = OF_NO_EFFECT | _NOT_OF_EYE | _NOT_OF_ZOE
+    of_depth = OF_NO_EFFECT | _NOT_OF_ENCODER | _NOT_OF_ZOE
     zoe = {path for path in passed if "vision_zoe_config" in path}
     assert all(of_depth & set(path) for path in zoe)
     rest = [path for path in passed - zoe if not any(path[: len(known)] == known for known in NOT_COMPARED)]

@@ -8,14 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from tests.unit import spatialvla_golden as golden
+from tests.unit.original_names import spatialvla_names
 from tests.unit.spatialvla_golden import CHUNK, ELSEWHERE, LOGITS, ROOT_OF_WIDTH, SIZES
 from vla_eval.policies.spatialvla.action_tokens import to_tokens
-from vla_eval.policies.spatialvla.depth import cut_depth, shown_pictures
+from vla_eval.policies.spatialvla.depth import cut_depth, shown_images
 from vla_eval.policies.spatialvla.ego3d import frequencies, patch_points
 from vla_eval.policies.spatialvla.generation import generated_actions, generated_tokens, token_loss
 from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.sizes import TOKENS_PER_ACTION, Attention, NetworkSizes
-from vla_eval.policies.spatialvla.weight_names import to_original, to_ours
+from vla_eval.policies.spatialvla.weight_names import to_ours
 
 N_PROMPTS = len(golden.config()["prompts"])
 ALL = [[index] for index in range(len(golden.values()["in.images"]))]
@@ -55,8 +56,8 @@ def close_in_unit_of_data(normalized: Tensor, expected: Tensor) -> None:
 
 
 class TestVision:
-    def test_the_depth_model_is_shown_padded_pictures(self) -> None:
-        shown = shown_pictures(golden.inputs(ALL, golden.prompts(0)).pictures[:2, 0], DEPTH_PX)
+    def test_the_depth_model_is_shown_padded_images(self) -> None:
+        shown = shown_images(golden.inputs(ALL, golden.prompts(0)).images[:2, 0], DEPTH_PX)
         close(shown[..., ::16, ::16], golden.values()["vision.depth_network_input_strided16"])
 
     @pytest.mark.parametrize("camera", ["default", "mikasa"])
@@ -79,16 +80,16 @@ class TestVision:
         if camera == "mikasa":
             close(frequencies(points[:1]), values["vision.frequency_encoding"])
 
-    def test_every_picture_has_a_camera_of_its_own(self) -> None:
+    def test_every_image_has_a_camera_of_its_own(self) -> None:
         matrices = golden.values()["vision.per_sample_intrinsic.K"][:, None]
         with torch.no_grad():
             features = made().image_features(golden.inputs(ALL, golden.prompts(0), matrices))
         close(features / ROOT_OF_WIDTH, golden.values()["vision.per_sample_intrinsic.image_features_divided"])
 
     def test_siglips_last_state(self) -> None:
-        pictures = golden.inputs(ALL, golden.prompts(0)).pictures[:, 0]
+        images = golden.inputs(ALL, golden.prompts(0)).images[:, 0]
         with torch.no_grad():
-            seen = made().vision((pictures - 0.5) / 0.5).last_hidden_state
+            seen = made().vision((images - 0.5) / 0.5).last_hidden_state
         close(seen, golden.values()["vision.siglip_last_hidden"])
 
 
@@ -108,10 +109,10 @@ class TestInference:
         close(told.logits, values[f"infer{index}.step_logits"], atol=LOGITS)
         close_in_unit_of_data(actions[0], values[f"infer{index}.actions"])
 
-    def test_two_pictures(self) -> None:
+    def test_two_images(self) -> None:
         inputs, values = golden.inputs([[0, 1]], golden.prompts(1)), golden.values()
         ids = values["infer_img2.input_ids"][0]
-        n_patches = 2 * SIZES.n_patches  # of the one picture, then of the other, before the prompt
+        n_patches = 2 * SIZES.n_patches  # of the one image, then of the other, before the prompt
         assert bool((ids[:n_patches] == SIZES.image_token).all())
         assert torch.equal(ids[n_patches:], inputs.prompts.ids[0])
         with torch.no_grad():
@@ -143,14 +144,14 @@ class TestInference:
 
 
 class TestTraining:
-    @pytest.mark.parametrize(("name", "pictures"), TRAININGS)
+    @pytest.mark.parametrize(("name", "images"), TRAININGS)
     @pytest.mark.parametrize(("regime", "attention"), REGIMES)
     def test_logits_loss_and_gradients_of_a_padded_batch(
-        self, name: str, pictures: list[list[int]], regime: str, attention: Attention
+        self, name: str, images: list[list[int]], regime: str, attention: Attention
     ) -> None:
         network, values = copy.deepcopy(made()), golden.values()
-        inputs = golden.inputs(pictures, golden.training_prompts(name))
-        actions = values["in.actions"][: len(pictures)]
+        inputs = golden.inputs(images, golden.training_prompts(name))
+        actions = values["in.actions"][: len(images)]
         ids = to_tokens(actions, golden.grid(), network.sizes).flatten(1)
         close(
             inputs.intrinsics, values[f"{name}.intrinsic"].reshape(-1, 1, 3, 3).expand_as(inputs.intrinsics)
@@ -164,18 +165,22 @@ class TestTraining:
         compared = is_real if attention == "causal" else torch.ones_like(is_real)
         expected = values[f"{name}.{regime}.logits"]
         close(logits[compared], expected[compared], atol=LOGITS)
-        loss = token_loss(
-            network, golden.grid(), inputs, actions, torch.ones(len(pictures), CHUNK), attention
-        )
+        loss = token_loss(network, golden.grid(), inputs, actions, torch.ones(len(images), CHUNK), attention)
         loss.backward()
         close(loss, values[f"{name}.{regime}.loss"][0])
-        gradients = to_original(
+        gradients = spatialvla_names(
             {key: value.grad for key, value in network.named_parameters() if value.grad is not None}
         )
         names = golden.config()["gradient_norm_order"][f"{name}.{regime}"]
         for key, norm in zip(names, values[f"{name}.{regime}.grad_norms"], strict=True):
             if f"{name}.{regime}.grad.{key}" in values:
                 close(gradients[key], values[f"{name}.{regime}.grad.{key}"])
+            if key.endswith("k_proj.bias"):
+                # A key's bias adds the same to all scores of a query, which softmax does not see: its
+                # gradient is 0, and what is found is the rounding of float32 sums, another on each CPU.
+                rounding = 1e-6 * gradients[key.replace("bias", "weight")].norm()
+                assert max(gradients[key].norm(), norm) < rounding, key
+                continue
             torch.testing.assert_close(gradients[key].norm(), norm, rtol=1e-4, atol=1e-7, msg=key)
 
     def test_a_sample_counts_the_same_whatever_is_beside_it_unless_padding_is_seen(self) -> None:
@@ -251,7 +256,7 @@ class TestTraps:
         for layer in network.vision.encoder.layers:
             layer.mlp.activation_fn = nn.GELU()
         with torch.no_grad():
-            seen = network.vision((one().pictures[:, 0] - 0.5) / 0.5).last_hidden_state
+            seen = network.vision((one().images[:, 0] - 0.5) / 0.5).last_hidden_state
         assert float((seen - golden.values()["vision.siglip_last_hidden"][:1]).abs().max()) > 5 * ELSEWHERE
 
     def test_attention_that_leaves_out_its_cap(self, network: SpatialVLANetwork) -> None:
@@ -265,8 +270,8 @@ class TestTraps:
     def test_causal_attention(self, network: SpatialVLANetwork) -> None:
         assert self.difference(network, attention="causal") > VISIBLE
 
-    def test_pictures_that_siglip_sees_unnormalised(self, network: SpatialVLANetwork) -> None:
-        brighter = one()._replace(pictures=one().pictures * 0.5 + 0.5)
+    def test_images_that_siglip_sees_unnormalised(self, network: SpatialVLANetwork) -> None:
+        brighter = one()._replace(images=one().images * 0.5 + 0.5)
         assert self.difference(network, brighter) > VISIBLE
 
     def test_another_cameras_matrix(self, network: SpatialVLANetwork) -> None:
@@ -295,7 +300,7 @@ class TestTraps:
 
 def test_names_of_weights_there_and_back_are_the_same() -> None:
     weights = golden.original_weights()
-    assert set(to_original(to_ours(weights))) == set(weights)
+    assert set(spatialvla_names(to_ours(weights))) == set(weights)
     zoe = "vision_zoe_model.backbone.embeddings.cls_token"
     assert list(to_ours({zoe: torch.zeros(1)})) == ["depth.zoe.backbone.embeddings.cls_token"]
 

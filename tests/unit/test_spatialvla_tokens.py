@@ -20,8 +20,9 @@ from vla_eval.policies.spatialvla.action_grid import (
 )
 from vla_eval.policies.spatialvla.action_tokens import from_tokens, to_tokens
 from vla_eval.policies.spatialvla.grid_refit import refitted
-from vla_eval.policies.spatialvla.sizes import NetworkSizes, network_sizes
+from vla_eval.policies.spatialvla.sizes import NetworkSizes
 from vla_eval.policies.steps.gripper import Gripper
+from vla_eval.policies.steps.network_sizes import with_changes
 
 SIZES = golden.SIZES
 GRIDS = [
@@ -195,4 +196,4 @@ class TestRefit:
 )
 def test_sizes_that_cannot_be_are_named(changes: dict[str, int], message: str) -> None:
     with pytest.raises(UnknownNameError if "Did you mean" in message else RecipeError, match=message):
-        network_sizes(changes)
+        with_changes(NetworkSizes, changes)

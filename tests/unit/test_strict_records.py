@@ -1,5 +1,6 @@
 """What is read from a run folder is checked: what cannot be true is one message; the file stays as it is."""
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable
@@ -201,6 +202,15 @@ def test_a_record_that_could_not_be_read_back_is_not_stored(tmp_path: Path) -> N
 
 
 # ------------------------------------------------------------------------------------------ the plan
+
+
+def test_an_episode_that_is_not_planned_is_not_stored(tmp_path: Path) -> None:
+    with RunFolder.open(tmp_path / "r", description()) as folder:
+        stranger = dataclasses.replace(RECORD, seed=6)
+        with pytest.raises(RunFolderError, match=r"an episode that this run plans.*the seeds are 1 to 5"):
+            folder.append(stranger)
+        folder.append(RECORD)
+    assert read_run(tmp_path / "r").records == (RECORD,)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def flat(result: Any) -> tuple[Tensor, ...]:
 
 def images(shown: Any) -> list[Tensor]:
     """Return what a network is shown: Octo's images by camera, or all in one."""
-    return list(shown.images.values()) if hasattr(shown, "images") else [shown.pictures]
+    return list(shown.images.values()) if isinstance(shown.images, dict) else [shown.images]
 
 
 def test_images_points_and_their_sines_are_those_of_a_float32_step(
@@ -135,7 +135,7 @@ def test_images_points_and_their_sines_are_those_of_a_float32_step(
     points = calls_of(monkeypatch, ego3d, "patch_points")
     waves = calls_of(monkeypatch, ego3d, "frequencies")
     train("spatialvla_tiny", pictures=BOTH, **BFLOAT16)
-    torch.testing.assert_close(calls[1].args[1].pictures, calls[0].args[1].pictures, rtol=0, atol=0)
+    torch.testing.assert_close(calls[1].args[1].images, calls[0].args[1].images, rtol=0, atol=0)
     # The depth model is bfloat16, and so its depth another one; what is made of it is float32.
     ((depth, matrices, sizes), found_m) = points[0]
     assert depth.dtype == found_m.dtype == waves[0].result.dtype == torch.float32

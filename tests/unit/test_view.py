@@ -1,4 +1,4 @@
-"""`mikasa-vla view`: which recordings it finds, and what it says where there are none."""
+"""`mikasa-vla view`: which rerun files it finds, and what it says where there are none."""
 
 import os
 import shutil
@@ -12,13 +12,13 @@ from rerun.experimental import RrdReader
 from vla_eval.cli.main import main
 from vla_eval.cli.view import cache_place
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.recording_files import rrd_file
+from vla_eval.storage.capture_files import rrd_file
 from vla_eval.storage.run_folder import RunDescription, RunFolder
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three episodes each of two policies; the first two seeds of `p` are recorded."""
+    """Three episodes each of two policies; the first two seeds of `p` are captured."""
     path = tmp_path / "run"
     description = RunDescription(name="a", config={}, recipes={}, environment={}, options={}, command="")
     with RunFolder.open(path, description) as run:
@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_prints_the_recordings_of_the_seed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_prints_the_rerun_files_of_the_seed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(folder), "--seed", "2", "--print"]) == 0
     name = "RememberColor3-v0_p_K1_run0_seed2_success.rrd"
     assert capsys.readouterr().out == f"{folder / 'rrd' / name}\n"
@@ -44,8 +44,8 @@ def test_it_prints_the_recordings_of_the_seed(folder: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--seed", "3"], "none was recorded. Seeds with a recording: 1, 2."),
-        (["--seed", "99"], "no such episode. Seeds with a recording: 1, 2."),
+        (["--seed", "3"], "none was captured. Seeds with a rerun file: 1, 2."),
+        (["--seed", "99"], "no such episode. Seeds with a rerun file: 1, 2."),
         (["--task", "RememberColour3-v0"], "Did you mean 'RememberColor3-v0'?"),
     ],
 )
@@ -56,13 +56,13 @@ def test_what_is_not_there_is_answered(
     assert said in capsys.readouterr().err
 
 
-def test_a_run_without_recordings_says_how_to_make_some(
+def test_a_run_without_rerun_files_says_how_to_make_some(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for file in (folder / "rrd").iterdir():
         file.unlink()
     assert main(["view", str(folder)]) == 1
-    assert "--record-rrd all|failures|successes|N" in capsys.readouterr().err
+    assert "--capture-rrd all|failures|successes|N" in capsys.readouterr().err
 
 
 def test_without_a_screen_it_says_what_else_can_be_done(
@@ -81,7 +81,7 @@ class TestDataset:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def curves(self, path: Path) -> dict[str, list[float]]:
-        """Return each curve of a recording, as rerun's own reader gives it, in the order of steps."""
+        """Return each curve of a rerun file, as rerun's own reader gives it, in the order of steps."""
         found: dict[str, dict[int, float]] = {}
         for chunk in RrdReader(path).store().stream().to_chunks():
             batch = chunk.to_record_batch().to_pydict()

@@ -1,8 +1,8 @@
-"""Which tasks can be won without remembering? Controls play each task, and their counts give a verdict.
+"""Which tasks can be won without remembering? Run controls on each task; their counts give a verdict.
 
-Two protocols: `paper`, the tasks as they are by default, and `strict`, in which the arm is held until the
-choice and the first choice is final. No audit proves that a task needs a memory; it finds the roads to
-success that need none, among those that its controls try.
+There are two protocols: `paper`, the tasks with their defaults, and `strict`, in which the arm is held until
+the choice and the first choice is final. No audit proves that a task needs memory. It finds shortcuts among
+those that its controls try.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import p_above, p_more
-from vla_eval.results.shipped_audit import PROTOCOLS, Protocol
+from vla_eval.results.shipped_audit import PROTOCOLS, AuditProtocol
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
@@ -23,14 +23,14 @@ Kind = Literal["choice", "several", "ball", "no_choice"]
 
 CONTROLS: Mapping[Kind, tuple[str, ...]] = {
     "choice": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch", "body_memory"),
-    # One width of the gripper stands for one candidate; nobody has written a body that keeps several.
+    # One width of the gripper encodes one candidate; no control encodes several.
     "several": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch"),
     "ball": ("random", "hold", "oracle", "cue_blind", "one_frame"),
     "no_choice": ("random", "hold", "oracle", "cue_blind"),
 }
 WITHOUT_PHASES: frozenset[Kind] = frozenset({"ball", "no_choice"})
 ALPHA = 0.001
-"""Level of each test. Some 200 tests are made for all tasks: less than one false finding in five audits."""
+"""Level of each test. All tasks need about 200 tests: less than one false finding in five audits."""
 
 NEEDS_MEMORY = "needs memory"
 UNDECIDED = "not decided"
@@ -47,13 +47,13 @@ WITHOUT_ACTING = "won without acting"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
-    """What one control reached on one task.
+    """The counts of one control on one task.
 
     Attributes:
-        n_episodes: episodes with a result; errors are none.
+        n_episodes: episodes with a result; an error is not a result.
         success_once, success_at_end: in how many of them the success rule held at any step, at the last.
         first_choice: in how many the first candidate touched was right; None without candidates.
-        chance: mean `chance_success` of the episodes; None where it has to be measured.
+        chance: mean `chance_success` of the episodes; None if it has to be measured.
     """
 
     n_episodes: int
@@ -65,11 +65,11 @@ class Counts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskAudit:
-    """What the controls reached on one task of this version under one protocol, and what follows from it."""
+    """The counts of all controls on one task of this version under one protocol, and the verdict."""
 
     task: str
     version: int
-    protocol: Protocol
+    protocol: AuditProtocol
     chance: float | None
     counts: Mapping[str, Counts]
     verdict: tuple[str, ...]
@@ -77,7 +77,7 @@ class TaskAudit:
 
 
 def kind_of(task: TaskSpec) -> Kind:
-    """Return whether one candidate has to be chosen, several, or none; and there, whether a ball rolls."""
+    """Return whether the task has one right candidate, several, or none; if none, whether a ball rolls."""
     if task.candidates is None:
         return "ball" if "velocity_range_m_s" in task.kwargs else "no_choice"
     return "several" if "n_shown" in task.kwargs else "choice"
@@ -85,7 +85,7 @@ def kind_of(task: TaskSpec) -> Kind:
 
 def audit_configs(
     tasks: Sequence[str],
-    protocols: Sequence[Protocol],
+    protocols: Sequence[AuditProtocol],
     *,
     episodes: int,
     workers: int | Literal["auto"],
@@ -95,15 +95,15 @@ def audit_configs(
 
     Args:
         tasks: task ids.
-        protocols: which to play. Tasks without a choice have no phases, so the strict rule is the
-            paper's there: they are played under `paper` alone.
+        protocols: which to run. Tasks without a choice have no phases, so the strict rule equals the
+            paper's for them: they are run under `paper` only.
         episodes: per task and control, on seeds 1, 2, ….
         workers: processes, or one per core.
         settings: for example `simulator`.
 
     Raises:
         UnknownNameError: a task that is not in the catalogue.
-        RecipeError: nothing is left to play.
+        RecipeError: no evaluation remains.
     """
     _refuse_own_fields(settings or {})
     configs = []
@@ -144,19 +144,19 @@ def read_audit(configs: Sequence[EvalConfig], out: Path) -> tuple[TaskAudit, ...
     audits = []
     for config in configs:
         records = read_run(out / config.name).records
-        protocol: Protocol = "strict" if config.env else "paper"
+        protocol: AuditProtocol = "strict" if config.env else "paper"
         for task in config.tasks:
             audits.append(audit_task(task, protocol, [r for r in records if r.task == task_spec(task).id]))
     return tuple(audits)
 
 
-def audit_task(task: str, protocol: Protocol, records: Sequence[EpisodeRecord]) -> TaskAudit:
-    """Count what each control reached on a task, and say what follows from it."""
+def audit_task(task: str, protocol: AuditProtocol, records: Sequence[EpisodeRecord]) -> TaskAudit:
+    """Count the successes of each control on a task, and derive the verdict."""
     by_policy: dict[str, list[EpisodeRecord]] = {}
     for record in records:
         if record.outcome != "error":
             by_policy.setdefault(record.policy, []).append(record)
-    # In the order of the controls: that of the records is the one in which workers came to an end.
+    # In the order of the controls; the order of the records depends on when workers finished.
     counts = {
         policy: _count(by_policy[policy])
         for policy in CONTROLS[kind_of(task_spec(task))]
@@ -187,15 +187,15 @@ def _count(records: Sequence[EpisodeRecord]) -> Counts:
 
 
 def verdict(counts: Mapping[str, Counts], chance: float | None) -> tuple[str, ...]:
-    """Return what the counts say: the shortcuts found, or that the oracle's knowledge of the cue decides.
+    """Return the verdict: the shortcuts found, or that the oracle's knowledge of the cue decides.
 
-    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, where
-    chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`); so has doing nothing that
-    ever succeeds. Without a shortcut a task `needs memory` if the oracle beats the blind arm; else there
-    were too few episodes.
+    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, if
+    chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`). Doing nothing is a shortcut
+    if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats the blind arm;
+    otherwise there were too few episodes.
 
     Args:
-        counts: control -> what it reached.
+        counts: control -> its counts.
         chance: success rate of a perfect arm that ignores the cue.
     """
     oracle, blind = counts.get("oracle"), counts.get("cue_blind")
@@ -216,11 +216,11 @@ def _beats_memoryless(counts: Counts, chance: float | None, blind: Counts | None
 
 
 def beats_chance(counts: Counts, chance: float) -> bool:
-    """Whether so many successes would be too lucky for a success rate of `chance`."""
+    """Whether this number of successes is significantly above a success rate of `chance`."""
     return p_above(counts.success_once, counts.n_episodes, chance) < ALPHA
 
 
 def beats(one: Counts, other: Counts) -> bool:
-    """Whether the first succeeds more often than the second, beyond luck."""
+    """Whether the first succeeds significantly more often than the second."""
     first, second = ((c.success_once, c.n_episodes) for c in (one, other))
     return p_more(first, second) < ALPHA

@@ -1,7 +1,7 @@
-"""How much faster samples come from decoded frames than from video: both loaders in turn, in one process.
+"""Measure how much faster samples come from decoded frames than from video: both loaders in one process.
 
-Every figure is of one run on one machine, and the ratio is the one that matters: it hardly depends on
-how fast the machine is today.
+Every figure is of one run on one machine. The ratio is the one that matters: it hardly depends on the load
+of the machine.
 """
 
 import tempfile
@@ -14,7 +14,7 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 import torch
 
-from vla_eval.data.memory_loader import MemoryDataset
+from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import ConformanceError
 from vla_eval.features import ACTION_KEY
@@ -34,9 +34,9 @@ class LoaderReport:
         n_frames, n_cameras: its size.
         decoder: lerobot's video backend.
         n_samples: samples drawn at random per repeat.
-        first_seconds: to open the memory loader for the first time, decoding included.
+        first_seconds: to open the decoded frames for the first time, decoding included.
         again_seconds: to open it again.
-        lerobot_per_second, memory_per_second: samples.
+        lerobot_per_second, decoded_per_second: samples.
     """
 
     dataset: str
@@ -47,12 +47,12 @@ class LoaderReport:
     first_seconds: float
     again_seconds: float
     lerobot_per_second: float
-    memory_per_second: float
+    decoded_per_second: float
 
     @property
     def ratio(self) -> float:
-        """How many times faster the memory loader is."""
-        return self.memory_per_second / self.lerobot_per_second
+        """How many times faster samples come from decoded frames."""
+        return self.decoded_per_second / self.lerobot_per_second
 
 
 def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> LoaderReport:
@@ -61,9 +61,9 @@ def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> Load
     Decoded frames go to a folder that is deleted again, so that decoding is part of what is measured.
 
     Args:
-        root: a dataset; None makes one up.
+        root: a dataset; None: a synthetic one.
         n_samples: how many samples to draw per repeat.
-        repeats: how often both loaders take their turn.
+        repeats: how often both loaders are measured.
 
     Raises:
         DatasetError: there is no dataset at `root`.
@@ -80,8 +80,8 @@ def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> Load
 def _measure(root: Path, scratch: Path, *, n_samples: int, repeats: int) -> LoaderReport:
     fps = open_local_dataset(root).fps
     theirs = open_local_dataset(root, delta_timestamps={ACTION_KEY: [i / fps for i in range(CHUNK_SIZE)]})
-    ours, first_seconds = _timed(lambda: MemoryDataset(theirs, cache=scratch))
-    _, again_seconds = _timed(lambda: MemoryDataset(theirs, cache=scratch))
+    ours, first_seconds = _timed(lambda: DecodedFramesDataset(theirs, cache=scratch))
+    _, again_seconds = _timed(lambda: DecodedFramesDataset(theirs, cache=scratch))
     order = np.random.default_rng(0).integers(len(theirs), size=n_samples).tolist()
     for index in order[:N_CHECKED]:
         _check_same(ours[index], theirs[index], index)
@@ -98,7 +98,7 @@ def _measure(root: Path, scratch: Path, *, n_samples: int, repeats: int) -> Load
         first_seconds=first_seconds,
         again_seconds=again_seconds,
         lerobot_per_second=n_samples / min(slow),
-        memory_per_second=n_samples / min(fast),
+        decoded_per_second=n_samples / min(fast),
     )
 
 
@@ -113,6 +113,6 @@ def _check_same(ours: dict[str, Any], theirs: dict[str, Any], index: int) -> Non
         same = torch.equal(ours[key], value) if isinstance(value, torch.Tensor) else ours[key] == value
         if not same:
             raise ConformanceError(
-                f"sample {index}: '{key}' of the memory loader is not lerobot's, expected equal bits. Please "
+                f"sample {index}: '{key}' from decoded frames is not lerobot's, expected equal bits. Please "
                 f"report this with the output of `mikasa-vla doctor`."
             )

@@ -1,7 +1,7 @@
-"""How much faster an episode runs when frames that nobody looks at are not rendered.
+"""Measure how much faster an episode runs when frames that the policy does not read are not rendered.
 
 Every figure comes from one run: the same episode, the same actions, rendered eagerly and lazily in turn
-in one process, so that the ratio does not depend on how fast the machine is today.
+in one process, so that the ratio does not depend on the load of the machine.
 """
 
 import time
@@ -39,7 +39,7 @@ class _Looker:
 
 
 class Cost(NamedTuple):
-    """Seconds of an episode, wall clock and processor, and the digest of what happened in it."""
+    """Seconds of an episode, wall clock and CPU, and the digest of its record."""
 
     wall_seconds: float
     cpu_seconds: float
@@ -64,7 +64,7 @@ class BenchRow:
 
     @property
     def cpu_speed_up(self) -> float:
-        """Eager processor time over lazy."""
+        """Eager CPU time over lazy."""
         return self.eager_cpu_ms / self.lazy_cpu_ms
 
 

@@ -1,11 +1,15 @@
-"""What several verbs share: kinds of arguments, exit codes, what was typed."""
+"""Shared by several verbs: kinds of arguments, exit codes, the typed command."""
 
 import argparse
 import shlex
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from vla_eval.config.renamed import warn_renamed
 
 EXIT_EPISODE_ERRORS = 3
-"""All episodes were played, and some ended in an error."""
+"""All episodes were run, and some ended in an error."""
 
 
 def typed_command() -> str:
@@ -21,3 +25,51 @@ def workers_argument(text: str) -> int | str:
         return int(text)
     except ValueError as exc:
         raise argparse.ArgumentTypeError(f"expected 'auto' or a number, found '{text}'") from exc
+
+
+def add_overrides(parser: argparse.ArgumentParser, *, help: str) -> None:
+    """Declare `--set A.B=C`, as often as one likes."""
+    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="A.B=C", help=help)
+
+
+def add_old_flag(
+    parser: argparse.ArgumentParser,
+    old: str,
+    new: str,
+    *,
+    kind: Callable[[str], Any] = str,  # Any: what the flag's values are read as
+    nargs: str | None = None,
+) -> None:
+    """Let a flag also be typed by its old name, which no help shows.
+
+    Args:
+        parser: has the new flag already.
+        old: `--record-video`.
+        new: `--capture-video`.
+        kind: argparse's `type`, as the new flag has it.
+        nargs: argparse's, as the new flag has it.
+    """
+    parser.add_argument(
+        old,
+        dest=new.removeprefix("--").replace("-", "_"),
+        action=_OldFlag,
+        type=kind,
+        nargs=nargs,
+        help=argparse.SUPPRESS,
+        const=new,
+    )
+
+
+class _OldFlag(argparse.Action):
+    """Stores the value as the new flag does, and warns; `const` is the new flag."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,  # Any: argparse's own annotation
+        option_string: str | None = None,
+    ) -> None:
+        """Store and warn."""
+        warn_renamed(str(option_string), self.const)
+        setattr(namespace, self.dest, values)

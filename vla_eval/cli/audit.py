@@ -5,17 +5,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, typed_command, workers_argument
 from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 
-DESCRIPTION = """Play every task with the controls that need no memory, and with the oracle, and say by which
-road each can be won: without acting, by touching one candidate after another, by staying at the cue,
+DESCRIPTION = """Run the oracle and the controls that need no memory on every task, and name the shortcuts by
+which a task can be won: without acting, by touching one candidate after another, by staying at the cue,
 by storing the cue in the gripper. Nothing is rendered.
 
 Protocols: 'paper' is the task as it is; under 'strict' arm and gripper are held until the choice and the
-first choice is final. The same command again goes on where it stopped."""
+first choice is final. The same command resumes a stopped audit."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -42,26 +42,19 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
     )
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="overrides",
-        metavar="A.B=C",
-        help="change another field of the evaluations, for example simulator=fake",
-    )
+    add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play, then print the audit to standard output; everything else goes to standard error.
+    """Run the controls, then print the audit to standard output; everything else goes to standard error.
 
     Raises:
         VlaEvalError: a mistyped task, a run folder of other settings, or a fault of every episode.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
+    from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
-    from vla_eval.audit.table import render_audit
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
     configs = _configs(args)
@@ -73,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
             summary = evaluate_with_progress(config, out=out, command=command, stop=stop)
             n_errors += summary.n_errors
             if summary.was_stopped:
-                print(f"Stopped. To go on: {command}", file=sys.stderr)
+                print(f"Stopped. To resume: {command}", file=sys.stderr)
                 return stop.exit_code
     print(render_audit(read_audit(configs, args.out), args.format))
     return EXIT_EPISODE_ERRORS if n_errors else 0

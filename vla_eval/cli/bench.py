@@ -43,7 +43,7 @@ def _loader(args: argparse.Namespace) -> int:
     print("| loader | samples/s |")
     print("|:--|--:|")
     print(f"| lerobot | {report.lerobot_per_second:.0f} |")
-    print(f"| memory map | {report.memory_per_second:.0f} |")
+    print(f"| memory map | {report.decoded_per_second:.0f} |")
     print(
         f"ratio {report.ratio:.1f}; opening: {report.first_seconds:.2f} s, {report.again_seconds:.2f} s again"
     )

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any, get_args
 
+from vla_eval.cli.arguments import add_old_flag
 from vla_eval.cli.checkpoint_arguments import add_gripper
 from vla_eval.policies.openvla.sizes import Head
 
@@ -20,13 +21,14 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
     convert.add_argument("--image-aug", choices=("yes", "no"), help="trained with augmentation (as named)")
     convert.add_argument("--proprio", type=int, default=0, metavar="N", help="numbers of proprioception (0)")
-    convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="fields of the pictures, in order")
+    convert.add_argument("--images", nargs="+", metavar="FIELD", help="fields of the images, in order")
+    add_old_flag(convert, "--pictures", "--images", nargs="+")
     add_gripper(convert)
     convert.add_argument("--allow-pickled", action="store_true", help="read heads that are pickled tensors")
     merge = actions.add_parser(MERGE, help="put a LoRA adapter into its base", allow_abbrev=False)
     merge.add_argument("path", metavar="PATH", help="the adapter's checkpoint, or a run of ours")
     merge.add_argument("--out", metavar="DIR", required=True, help="folder to write")
-    merge.add_argument("--base-checkpoint", metavar="DIR", help="where the base lies, if it was moved")
+    merge.add_argument("--base-checkpoint", metavar="DIR", help="folder of the base, if it was moved")
 
 
 def run(args: argparse.Namespace) -> list[str]:
@@ -39,7 +41,7 @@ def run(args: argparse.Namespace) -> list[str]:
         return [str(merge_adapter(path, out, base_checkpoint=args.base_checkpoint))]
     from vla_eval.policies.conversion.openvla import ConvertOptions, convert_openvla
 
-    named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
+    named: dict[str, Any] = {"pictures": tuple(args.images)} if args.images else {}
     options = ConvertOptions(
         head=args.head,
         chunk_size=args.chunk,

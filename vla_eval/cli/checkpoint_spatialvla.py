@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.arguments import add_old_flag
+
 CONVERT = "convert-spatialvla"
 
 
@@ -13,7 +15,8 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     convert.add_argument("path", metavar="PATH", help="folder of the published checkpoint")
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
     convert.add_argument("--unnorm-key", metavar="NAME", help="whose statistics, where there are several")
-    convert.add_argument("--pictures", nargs="+", metavar="FIELD", help="pictures that are read (the base's)")
+    convert.add_argument("--images", nargs="+", metavar="FIELD", help="images that are read (the base's)")
+    add_old_flag(convert, "--pictures", "--images", nargs="+")
     convert.add_argument(
         "--head", choices=("tied", "own"), help="Gemma's output matrix: its input's, or its own (as told)"
     )
@@ -24,6 +27,6 @@ def run(args: argparse.Namespace) -> list[str]:
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.policies.conversion.spatialvla import ConvertOptions, convert_spatialvla
 
-    named: dict[str, Any] = {"pictures": tuple(args.pictures)} if args.pictures else {}
+    named: dict[str, Any] = {"pictures": tuple(args.images)} if args.images else {}
     options = ConvertOptions(unnorm_key=args.unnorm_key, head=args.head, **named)
     return [str(convert_spatialvla(Path(args.path), Path(args.out), options))]

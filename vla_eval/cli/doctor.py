@@ -15,7 +15,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser = subparsers.add_parser(
         "doctor",
         help="check this machine and say what to do",
-        description="Check Python, packages, drivers and disk, draw a picture and run an episode. "
+        description="Check Python, packages, drivers and disk, render an image and run an episode. "
         "The exit code is 1 if something is missing that evaluations need.",
         allow_abbrev=False,
     )

@@ -1,4 +1,4 @@
-"""How many episodes are done: a bar on a terminal, elsewhere now and then a line."""
+"""Show how many episodes are done: a bar on a terminal, elsewhere a line from time to time."""
 
 import sys
 import time
@@ -11,7 +11,7 @@ LINE_EVERY_SECONDS = 60.0
 
 
 class EpisodeBar:
-    """Shows on standard error how far it has come, and how long the rest will take at this rate.
+    """Shows on standard error how many episodes are done, and the remaining time at this rate.
 
     Args:
         clock: seconds that only grow.
@@ -25,7 +25,7 @@ class EpisodeBar:
         self._begun = self._last_line = clock()
 
     def begin(self, *, n_done: int, n_total: int, title: str = "") -> None:
-        """Begin anew, with `n_done` episodes that were there before."""
+        """Start a new count, of which `n_done` episodes are done already."""
         self.close()
         self._title, self._note = title, ""
         self._n_done = self._n_before = n_done

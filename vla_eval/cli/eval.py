@@ -1,11 +1,17 @@
-"""`mikasa-vla eval`: run an evaluation, or go on with it, and print its table."""
+"""`mikasa-vla eval`: run or resume an evaluation, and print its table."""
 
 import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command, workers_argument
+from vla_eval.cli.arguments import (
+    EXIT_EPISODE_ERRORS,
+    add_old_flag,
+    add_overrides,
+    typed_command,
+    workers_argument,
+)
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
@@ -20,7 +26,7 @@ DESCRIPTION = """Run the episodes of a configuration that have no result yet, an
 
 CONFIG is a file, or the name of one in configs/ (`mikasa-vla list configs`). Without it, name at least
 one --task and one --policy. Flags go on top of the file, --set on top of flags. The same command again
-goes on where it stopped, and retries episodes that ended in an error."""
+resumes where it stopped, and retries episodes that ended in an error."""
 EPILOG = """exit codes: 0 every episode has a result; 1 a mistake (see the message); 3 some episodes ended in
 an error (the same command retries them); 130, 143 stopped by Ctrl-C, SIGTERM."""
 
@@ -29,7 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "eval",
-        help="run an evaluation, or go on with it, and print its table",
+        help="run or resume an evaluation, and print its table",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -37,7 +43,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     _add_run_arguments(parser)
-    _add_recording_arguments(parser)
+    _add_capture_arguments(parser)
     _add_table_arguments(parser)
 
 
@@ -67,28 +73,22 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="overrides",
-        metavar="A.B=C",
-        help="change any field of the configuration",
-    )
+    add_overrides(parser, help="change any field of the configuration")
     parser.add_argument(
         "--allow-environment-change",
         action="store_true",
-        help="go on although package versions or the machine have changed; the table will say so",
+        help="resume although package versions or the machine have changed; the table will say so",
     )
 
 
-def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    for kind, what in (("video", "an mp4"), ("rrd", "a recording for the rerun viewer")):
+def _add_capture_arguments(parser: argparse.ArgumentParser) -> None:
+    for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
         parser.add_argument(
-            f"--record-{kind}",
+            f"--capture-{kind}",
             metavar="WHICH",
             help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
         )
+        add_old_flag(parser, f"--record-{kind}", f"--capture-{kind}")
 
 
 def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
         print(
-            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To go on: {command}",
+            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To resume: {command}",
             file=sys.stderr,
         )
         return stop.exit_code
@@ -152,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _which(text: str, *, flag: str) -> str | int:
-    """Read which episodes to record."""
+    """Read which episodes to capture."""
     if text.isascii() and text.isdigit():
         return int(text)
     known = ("none", "all", "failures", "successes")
@@ -170,10 +170,10 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             if value is not None:
                 data[name] = value
         for kind in ("video", "rrd"):
-            which = getattr(args, f"record_{kind}")
+            which = getattr(args, f"capture_{kind}")
             if which is not None:
-                flag = f"--record-{kind}"
-                set_field(EvalConfig, data, f"recording.{kind}", _which(which, flag=flag), where=flag)
+                flag = f"--capture-{kind}"
+                set_field(EvalConfig, data, f"capture.{kind}", _which(which, flag=flag), where=flag)
         apply_overrides(data, args.overrides, cls=EvalConfig)
 
     if args.config is not None:

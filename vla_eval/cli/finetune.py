@@ -1,11 +1,11 @@
-"""`mikasa-vla finetune`: fine-tune a policy on a dataset, or go on with it."""
+"""`mikasa-vla finetune`: fine-tune a policy on a dataset, or resume it."""
 
 import argparse
 import contextlib
 import sys
 from typing import Any
 
-from vla_eval.cli.arguments import typed_command
+from vla_eval.cli.arguments import add_old_flag, add_overrides, typed_command
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -14,9 +14,9 @@ from vla_eval.evaluation.grid import is_model_table
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 
-CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `evaluation`; or name
+CONFIG is a file with fields `policy`, `dataset`, `out`, `run_seed`, `finetune`, `held_out`; or name
 --policy and --dataset. Flags go on top of the file, --set on top of flags: it changes fields of the recipe's
-`finetune` section (--set policy.chunk_size=8). The same command again goes on after a kill, exactly.
+`finetune` section (--set policy.chunk_size=8). The same command again resumes it exactly, also after a kill.
 CONFIG may also be a table of learned policies, such as paper_vla_table: all its fine-tunings in turn, or
 those of some rows (--policy) and tasks (--task).
 Then: mikasa-vla eval --policy RUN --task TASK"""
@@ -26,7 +26,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "finetune",
-        help="train a policy on a dataset, or go on with it",
+        help="train a policy on a dataset, or resume the training",
         description=DESCRIPTION,
         epilog="docs/finetuning.md explains recipes, memory and resuming.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -47,21 +47,21 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--base-checkpoint", metavar="DIR", help="weights to start from")
     parser.add_argument("--device", metavar="D", help="auto, cpu, cuda")
     parser.add_argument(
-        "--eval-every", type=int, metavar="N", help="evaluate a checkpoint every N steps, on held-out seeds"
+        "--held-out-every",
+        type=int,
+        metavar="N",
+        help="evaluate a checkpoint every N steps, on held-out seeds",
     )
-    parser.add_argument("--eval-episodes", type=int, metavar="E", help="episodes of each evaluation (20)")
+    parser.add_argument(
+        "--held-out-episodes", type=int, metavar="E", help="episodes of each such evaluation (20)"
+    )
+    add_old_flag(parser, "--eval-every", "--held-out-every", kind=int)
+    add_old_flag(parser, "--eval-episodes", "--held-out-episodes", kind=int)
     parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-DATASET-SEED)")
     parser.add_argument(
         "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
     )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="overrides",
-        metavar="A.B=C",
-        help="change any field of the recipe's `finetune` section",
-    )
+    add_overrides(parser, help="change any field of the recipe's `finetune` section")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,8 +94,8 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
         if args.allow_unreplayed:
             data["allow_unreplayed"] = True
         for path, value in (
-            ("evaluation.every_steps", args.eval_every),
-            ("evaluation.episodes", args.eval_episodes),
+            ("held_out.every_steps", args.held_out_every),
+            ("held_out.episodes", args.held_out_episodes),
             ("finetune.steps", args.steps),
             ("finetune.batch_size", args.batch_size),
             ("finetune.base_checkpoint", args.base_checkpoint),

@@ -1,7 +1,7 @@
 """`mikasa-vla list`: which tasks, families of tasks, policies, configs, prompts, datasets there are."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from vla_eval.config.dataset import DatasetRecipe
@@ -15,6 +15,17 @@ from vla_eval.policies.registry import policy_adapters
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 Row = Sequence[str]
+Groups = Mapping[str, Sequence[Row]]
+"""Heading -> rows; a list without groups has one, without a heading."""
+UNGROUPED, BROKEN = "", "cannot be read"
+BASELINES = "baselines and controls"
+READY, TO_TRAIN, FROM_BASE = (
+    "ready to evaluate",
+    "to fine-tune, from scratch",
+    "to fine-tune, from a published base",
+)
+FOR_TESTS, ADAPTERS = "for tests: tiny, with random weights", "adapters without a recipe of their own"
+TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
 RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe]
 
 
@@ -32,21 +43,25 @@ def run(args: argparse.Namespace) -> int:
     for kind in kinds:
         if len(kinds) > 1:
             print(f"{kind}:")
-        for line in _aligned(_LISTS[kind]()):
+        for line in _lines(_LISTS[kind]()):
             print(f"  {line}" if len(kinds) > 1 else line)
     return 0
 
 
-def _aligned(rows: Sequence[Row]) -> list[str]:
-    """Return lines whose columns stand below each other; the last column is not padded."""
+def _lines(groups: Groups) -> Iterator[str]:
+    """Yield headings and rows; columns stand below each other in all groups, the last one is not padded."""
+    rows = [row for group in groups.values() for row in group]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
+    for heading, group in groups.items():
+        if heading and group:
+            yield f"{heading}:"
+        for row in group:
+            line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            yield f"  {line}" if heading else line
 
 
-def _tasks() -> list[Row]:
-    return [
+def _tasks() -> Groups:
+    rows = [
         (
             spec.id,
             f"{spec.horizon_steps} steps",
@@ -56,49 +71,74 @@ def _tasks() -> list[Row]:
         )
         for spec in TASKS.values()
     ]
+    return {UNGROUPED: rows}
 
 
-def _families() -> list[Row]:
+def _families() -> Groups:
     rows: list[Row] = []
     for spec in FAMILIES.values():
         needed = ", ".join(f"env.{name}" for name in spec.open_arguments)
         rows.append((spec.id, f"needs {needed}" if needed else "needs no argument"))
-    return rows
+    return {UNGROUPED: rows}
 
 
 def _chance(chance: float | None) -> str:
     return "measured" if chance is None else f"{chance:.2g}"
 
 
-def _policies() -> list[Row]:
-    rows = _recipes("policies", lambda _name: PolicyRecipe)
-    adapters = [name for name in policy_adapters() if name not in {row[0] for row in rows}]
-    return [*rows, *((name, "adapter without a recipe of its own") for name in adapters)]
+def _policies() -> Groups:
+    groups: dict[str, list[Row]] = {
+        heading: [] for heading in (BASELINES, READY, TO_TRAIN, FROM_BASE, FOR_TESTS, ADAPTERS, BROKEN)
+    }
+    recipes = list_recipes("policies")
+    for name in recipes:
+        try:
+            recipe = load_recipe("policies", name, PolicyRecipe).value
+        except RecipeError as exc:
+            groups[BROKEN].append(_broken(name, exc))
+        else:
+            groups[_group(name, recipe)].append((name, recipe.description))
+    groups[ADAPTERS] = [(name, "") for name in policy_adapters() if name not in recipes]
+    return groups
 
 
-def _configs() -> list[Row]:
+def _group(name: str, recipe: PolicyRecipe) -> str:
+    """Return the heading that a policy is listed under: what has to be done before it is evaluated."""
+    if recipe.finetune is None:
+        return READY if "checkpoint" in recipe.args else BASELINES
+    if name.endswith(TINY_SUFFIX):
+        return FOR_TESTS
+    return TO_TRAIN if recipe.finetune.base_checkpoint is None else FROM_BASE
+
+
+def _configs() -> Groups:
     return _recipes("configs", lambda name: ModelTable if is_model_table(name) else EvalConfig)
 
 
-def _prompts() -> list[Row]:
-    return [(name, load_prompts(name).value.description) for name in list_recipes("prompts")]
+def _prompts() -> Groups:
+    return {UNGROUPED: [(name, load_prompts(name).value.description) for name in list_recipes("prompts")]}
 
 
-def _datasets() -> list[Row]:
+def _datasets() -> Groups:
     return _recipes("datasets", lambda _name: DatasetRecipe)
 
 
-def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> list[Row]:
+def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> Groups:
     rows: list[Row] = []
     for name in list_recipes(folder):
         try:
             rows.append((name, load_recipe(folder, name, class_of(name)).value.description))
-        except RecipeError as exc:  # one broken file of the user's must not hide the others
-            rows.append((name, f"CANNOT BE READ: {exc}"))
-    return rows
+        except RecipeError as exc:
+            rows.append(_broken(name, exc))
+    return {UNGROUPED: rows}
 
 
-_LISTS: dict[str, Callable[[], list[Row]]] = {
+def _broken(name: str, exc: RecipeError) -> Row:
+    """Return a line for a file that cannot be read: it must not hide the others."""
+    return (name, f"CANNOT BE READ: {exc}")
+
+
+_LISTS: dict[str, Callable[[], Groups]] = {
     "tasks": _tasks,
     "families": _families,
     "policies": _policies,

@@ -1,4 +1,4 @@
-"""`mikasa-vla finetune` and `eval` of a table of learned policies: every part that is not there yet."""
+"""`mikasa-vla finetune` and `eval` of a table of learned policies: every part that is missing."""
 
 import argparse
 import contextlib
@@ -27,8 +27,8 @@ FINETUNE_FLAGS = {
     "batch_size": "--batch-size",
     "run_seed": "--run-seed",
     "base_checkpoint": "--base-checkpoint",
-    "eval_every": "--eval-every",
-    "eval_episodes": "--eval-episodes",
+    "held_out_every": "--held-out-every",
+    "held_out_episodes": "--held-out-episodes",
     "overrides": "--set",
 }
 EVAL_FLAGS = {
@@ -37,8 +37,8 @@ EVAL_FLAGS = {
     "seed_start": "--seed-start",
     "runs": "--runs",
     "overrides": "--set",
-    "record_video": "--record-video",
-    "record_rrd": "--record-rrd",
+    "capture_video": "--capture-video",
+    "capture_rrd": "--capture-rrd",
 }
 """Flags that a table does not take, by the name of their value.
 
@@ -98,7 +98,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
                 allow_environment_change=args.allow_environment_change,
             )
             if summary.was_stopped:
-                print(f"Stopped. To go on: {command}", file=sys.stderr)
+                print(f"Stopped. To resume: {command}", file=sys.stderr)
                 return stop.exit_code
             n_errors += summary.n_errors
             folders.append(folder)
@@ -139,12 +139,12 @@ def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> No
             try:
                 finetune(config, command=typed_command(), say=_say)
             except FolderInUseError:
-                _say("  another process is at it")
+                _say("  another process is training it")
             _free_memory()
 
 
 def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
-    """Find now what would otherwise stop the work after days: datasets and bases that are not there."""
+    """Find missing datasets and bases now, which would otherwise stop the work after days."""
     from vla_eval.policies.checkpoint import find_checkpoint
     from vla_eval.training.job import load_finetune_recipe
 

@@ -32,7 +32,7 @@ def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
 
 
 def check_baseline(baseline: str | None, policies: Sequence[str]) -> None:
-    """Refuse a baseline that is not evaluated: now, and not when the night is over.
+    """Refuse a baseline that is not evaluated, before the run and not after it.
 
     Raises:
         UnknownNameError: it is none of the policies.

@@ -1,4 +1,4 @@
-"""Progress of a run on standard error: a bar on a terminal, now and then a line in a log file."""
+"""Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
 
 import signal
 from collections.abc import Iterator
@@ -58,7 +58,7 @@ def stop_on_signals() -> Iterator[StopRequest]:
 def evaluate_with_progress(
     config: EvalConfig, *, out: Path, command: str, stop: StopRequest, allow_environment_change: bool = False
 ) -> EvaluationSummary:
-    """Run an evaluation, say on standard error how far it has come, and end early if asked to stop.
+    """Run an evaluation with progress on standard error, and end early if asked to stop.
 
     Raises:
         VlaEvalError: see `evaluate`.

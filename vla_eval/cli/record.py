@@ -1,11 +1,11 @@
-"""`mikasa-vla record`: record demonstrations, or go on with it."""
+"""`mikasa-vla record`: record demonstrations, or resume recording."""
 
 import argparse
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import typed_command, workers_argument
+from vla_eval.cli.arguments import add_overrides, typed_command, workers_argument
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
@@ -20,16 +20,16 @@ MEGABYTE = 1_000_000
 DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
 
 RECIPE is a file, or the name of one in datasets/. Without it, name at least one --task. Flags go on top of
-the file, --set on top of flags. The same command again goes on where it stopped."""
+the file, --set on top of flags. The same command again resumes where it stopped."""
 EPILOG = """exit codes: 0 all datasets are there; 1 a mistake (see the message); 130, 143 stopped by Ctrl-C,
-SIGTERM (the same command goes on)."""
+SIGTERM (the same command resumes)."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "record",
-        help="record demonstrations as LeRobot datasets, or go on with it",
+        help="record demonstrations as LeRobot datasets, or resume recording",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -43,18 +43,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="overrides",
-        metavar="A.B=C",
-        help="change any field of the recipe",
-    )
+    add_overrides(parser, help="change any field of the recipe")
     parser.add_argument(
         "--allow-environment-change",
         action="store_true",
-        help="go on although package versions or the machine have changed",
+        help="resume although package versions or the machine have changed",
     )
 
 
@@ -81,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         finally:
             progress.close()
     if summary.was_stopped:
-        print(f"Stopped. What was recorded is in {out}. To go on: {command}", file=sys.stderr)
+        print(f"Stopped. What was recorded is in {out}. To resume: {command}", file=sys.stderr)
         return stop.exit_code
     for dataset in summary.datasets:
         print(describe(dataset))
@@ -89,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def describe(dataset: "RecordedDataset") -> str:
-    """Return what has come of one task, in one line."""
+    """Return the result of one task, in one line."""
     facts = dataset.facts
     failed = ", ".join(str(one.seed) for one in dataset.failed) or "none"
     return (

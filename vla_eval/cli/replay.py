@@ -1,4 +1,4 @@
-"""`mikasa-vla replay`: do a dataset's episodes again and compare, or make it anew from its manifest."""
+"""`mikasa-vla replay`: run a dataset's episodes again and compare, or rebuild it from its manifest."""
 
 import argparse
 import sys
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 EXIT_MISMATCH = 1
 DESCRIPTION = """Execute the stored actions of a dataset in the simulator; compare states and success, and
-with --pixels pictures. One line per mismatch. The result of a whole dataset is kept in it, and training
+with --pixels images. One line per mismatch. The result of a whole dataset is kept in it, and training
 refuses a dataset whose replay has failed.
 
 DATASET is the folder of one dataset, or one that holds some (OUT of `mikasa-vla record`)."""
@@ -25,7 +25,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "replay",
-        help="check a dataset by doing its episodes again",
+        help="check a dataset by running its episodes again",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -33,7 +33,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
     parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
-    parser.add_argument("--pixels", action="store_true", help="render, and compare pictures and video, too")
+    parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
     parser.add_argument(
         "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
     )
@@ -41,7 +41,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         "--rebuild",
         type=Path,
         metavar="OUT",
-        help="do not compare: make the dataset anew in OUT, from its manifest alone",
+        help="do not compare: rebuild the dataset in OUT, from its manifest alone",
     )
 
 
@@ -82,10 +82,10 @@ def describe(dataset: Path, report: "ReplayReport") -> str:
     """Return the outcome of a dataset's replay, in one line."""
     verdict = "as recorded" if report.passed else f"{len(report.mismatches)} MISMATCHES"
     quality = "".join(f", {camera} ≥ {psnr:.1f} dB" for camera, psnr in report.lowest_psnr_db.items())
-    pictures = f"pictures compared{quality}" if report.pixels else "pictures not compared (--pixels)"
+    images = f"images compared{quality}" if report.pixels else "images not compared (--pixels)"
     return (
         f"{dataset}: {report.n_episodes} of {report.n_total} episodes replayed: {verdict}; states "
-        f"{report.states_compared}; {pictures}"
+        f"{report.states_compared}; {images}"
     )
 
 
@@ -97,7 +97,7 @@ def _rebuild(args: argparse.Namespace) -> int:
 
     if args.episodes is not None or args.pixels:
         raise RecipeError(
-            "--rebuild makes the whole dataset anew: it does not go with --episodes or --pixels."
+            "--rebuild makes the whole dataset again: it does not go with --episodes or --pixels."
         )
     with stop_on_signals() as stop:
         progress = RecordingProgress(stop)
@@ -106,11 +106,11 @@ def _rebuild(args: argparse.Namespace) -> int:
         finally:
             progress.close()
     if rebuilt is None:
-        print("Stopped. The same command goes on.", file=sys.stderr)
+        print("Stopped. The same command resumes.", file=sys.stderr)
         return stop.exit_code
     print(describe_dataset(rebuilt.dataset))
     print(
-        f"episodes whose raw pictures are those that were recorded: {rebuilt.n_same_pictures} "
+        f"episodes whose raw images are those that were recorded: {rebuilt.n_same_pictures} "
         f"of {rebuilt.dataset.facts.n_episodes}"
     )
     return 0

@@ -9,10 +9,10 @@ from typing import Any
 FORMATS = ("markdown", "csv", "json", "latex")
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
 
-Each RUN is a folder that `mikasa-vla eval` made; a run may still be going on. Several runs go into one
+Each RUN is a folder that `mikasa-vla eval` made; a run may still be unfinished. Several runs go into one
 table: rows with the same task, policy, n_action_steps and settings are put together.
 
-With --html, a page with plots, choices, errors and recordings is written instead, and its path printed."""
+With --html, a page with plots, choices, errors and videos is written instead, and its path printed."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -44,7 +44,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
     )
     parser.add_argument(
-        "--paper", action="store_true", help="print the paper's figures for the same tasks beside one's own"
+        "--paper", action="store_true", help="print the paper's figures for the same tasks beside yours"
     )
 
 

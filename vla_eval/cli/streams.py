@@ -1,7 +1,7 @@
 """Standard output and error for the command line, whatever they are connected to, or if they are closed.
 
-Messages are for whoever may read them: standard error that cannot be written must not stop a night's run.
-Standard output is the answer: if it cannot be written, the command says so and fails.
+Standard error carries messages: if it cannot be written, the run does not stop. Standard output carries the
+result: if it cannot be written, the command reports that and fails.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ class _Stream:
             self._meet(exc)
 
     def _meet(self, exc: OSError) -> None:
-        """Drop what cannot be written: there is nowhere else to say it."""
+        """Drop what cannot be written: there is no other stream to report it on."""
 
 
 class _Output(_Stream):

@@ -1,4 +1,4 @@
-"""`mikasa-vla view`: open recorded episodes of a run, or episodes of a dataset, in the rerun viewer."""
+"""`mikasa-vla view`: open captured episodes of a run, or episodes of a dataset, in the rerun viewer."""
 
 import argparse
 import hashlib
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --record-rrd …` recorded in the rerun viewer.
+DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
 
 RUN may also be a dataset (OUT/TASK of `mikasa-vla record`, or any LeRobotDataset v3): its episodes are shown.
 Without a choice, the first five are opened. On a machine without a screen, --web serves the viewer to a
@@ -21,9 +21,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     """Declare the arguments."""
     parser = subparsers.add_parser(
         "view",
-        help="open recorded episodes, or a dataset's, in the rerun viewer",
+        help="open captured episodes, or a dataset's, in the rerun viewer",
         description=DESCRIPTION,
-        epilog="docs/recordings.md says what is in a recording.",
+        epilog="docs/captures.md says what is in the files.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -41,7 +41,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find the recordings and open them.
+    """Find the rerun files and open them.
 
     Raises:
         VlaEvalError: RUN is neither run folder nor dataset, holds no such episode, or there is no screen.
@@ -59,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join(map(str, found)))
         return 0
     if len(found) > MOST_OPENED:
-        print(f"{len(found)} recordings; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr)
+        print(
+            f"{len(found)} rerun files; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr
+        )
     command = [sys.executable, "-m", "rerun", *map(str, found[:MOST_OPENED])]
     return subprocess.run([*command, "--web-viewer"] if args.web else command, check=False).returncode
 
@@ -92,7 +94,7 @@ def _of_dataset(args: argparse.Namespace) -> list[Path]:
 
 
 def cache_place(dataset: Path) -> str:
-    """Return a name for the recordings of a dataset: datasets of one name in two folders have two."""
+    """Return a name for the rerun files of a dataset: datasets of one name in two folders have two."""
     folder = dataset.resolve()
     return f"{folder.name}-{hashlib.sha256(os.fsencode(folder)).hexdigest()[:12]}"
 

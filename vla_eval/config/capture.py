@@ -1,4 +1,4 @@
-"""Which episodes are recorded, and how often pictures are taken. Knows nothing of files or viewers."""
+"""Which episodes are captured, and how often frames are rendered for it. Knows no files and no viewers."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,14 +11,14 @@ Which = Outcomes | int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingConfig:
-    """What to record of an evaluation; moves no result.
+class CaptureConfig:
+    """What to capture of an evaluation; moves no result.
 
     Attributes:
         video: which episodes get an mp4: by outcome, or the first N seeds of run 0 of each task, policy and
             n_action_steps.
-        rrd: which episodes get a recording for the rerun viewer, likewise.
-        frame_stride: control steps from one picture to the next.
+        rrd: which episodes get a file for the rerun viewer, likewise.
+        frame_stride: control steps from one frame to the next.
     """
 
     video: Which = "none"
@@ -27,26 +27,26 @@ class RecordingConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_bounds(self, {"frame_stride": (1, MAX_STEPS)}, prefix="recording.")
+        check_bounds(self, {"frame_stride": (1, MAX_STEPS)}, prefix="capture.")
         for name in ("video", "rrd"):
             which = getattr(self, name)
             if isinstance(which, int) and not 1 <= which <= MAX_EPISODES:
                 raise RecipeError(
-                    f"recording.{name} is {which}, expected 'none', 'all', 'failures', 'successes' or a "
+                    f"capture.{name} is {which}, expected 'none', 'all', 'failures', 'successes' or a "
                     f"number of episodes from 1 to {MAX_EPISODES}."
                 )
 
     @property
     def is_on(self) -> bool:
-        """Whether anything is recorded."""
+        """Whether anything is captured."""
         return self.video != "none" or self.rrd != "none"
 
 
 def may_be_wanted(which: Which, *, run: int, index: int) -> bool:
-    """Return whether an episode may have to be recorded, before it is known what comes of it.
+    """Return whether an episode may have to be captured, before its outcome is known.
 
     Args:
-        which: what is recorded.
+        which: what is captured.
         run: the episode's run.
         index: which of the seeds of a run it has, from 0.
     """
@@ -54,7 +54,7 @@ def may_be_wanted(which: Which, *, run: int, index: int) -> bool:
 
 
 def is_wanted(which: Which, *, run: int, index: int, is_success: bool) -> bool:
-    """Return whether an episode is to be kept, when it is over."""
+    """Return whether the capture of a finished episode is kept."""
     if which in ("failures", "successes"):
         return is_success == (which == "successes")
     return may_be_wanted(which, run=run, index=index)

@@ -48,7 +48,6 @@ class DatasetRecipe:
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
         check_run_name(self.name)
         if not self.tasks or len(set(self.tasks)) != len(self.tasks):
             raise RecipeError(f"tasks is {list(self.tasks)}, expected at least one, none of them twice.")
@@ -68,7 +67,7 @@ class DatasetRecipe:
 
     @property
     def last_seed(self) -> int:
-        """The highest seed that may be tried before the recording gives up."""
+        """The highest seed that may be tried before the recording fails."""
         return self.seed_start + self.episodes + self.max_failed_seeds - 1
 
     def _refuse_evaluation_seeds(self) -> None:
@@ -83,7 +82,7 @@ class DatasetRecipe:
 
 
 OPTION_FIELDS = ("name", "description", "workers", "timeouts")
-"""Fields of `DatasetRecipe` that content does not depend on: they may differ when a recording goes on."""
+"""Fields of `DatasetRecipe` that content does not depend on: they may differ when a recording is resumed."""
 
 
 def content_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data

@@ -1,8 +1,8 @@
 """Turn plain data of YAML or JSON strictly into frozen dataclasses. Knows nothing of what the recipes mean.
 
 Strict means: no unknown field, no field twice, no text where a list or a number is expected, no
-`true` where a number is expected, no number that is infinite. What a person mistyped is an error that says
-so, never a default.
+`true` where a number is expected, no number that is infinite. A mistyped name or value is an error,
+never a default.
 """
 
 import dataclasses
@@ -11,8 +11,9 @@ import math
 import reprlib
 import types
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+from vla_eval.config.renamed import current_names, use_current_names, warn_renamed
 from vla_eval.config.yaml_data import MAX_DEPTH
 from vla_eval.config.yaml_data import load_yaml as load_yaml
 from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
@@ -54,39 +55,62 @@ def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: 
         where: the flag, for messages.
 
     Raises:
-        RecipeError: there is no such field, or what lies on the way has no fields.
+        RecipeError: there is no such field, or a part of the path has no fields.
     """
-    _find_field(cls, path, where=where)
-    *parents, last = path.split(".")
-    for parent in parents:
-        if data.get(parent) is None:  # not given, or given without a value
-            data[parent] = {}
-        child = data[parent]
+    steps = _walk(cls, path, where=where)
+    for step in steps[:-1]:
+        _rename(step, data)
+        if data.get(step.name) is None:  # not given, or given without a value
+            data[step.name] = {}
+        child = data[step.name]
         if not isinstance(child, dict):
-            raise RecipeError(f"{where}: '{parent}' is {_short(child)}, which has no fields.")
+            raise RecipeError(f"{where}: '{step.name}' is {_short(child)}, which has no fields.")
         data = child
-    data[last] = value
+    _rename(steps[-1], data)
+    data[steps[-1].name] = value
 
 
-def _find_field(cls: type, path: str, *, where: str) -> None:
-    """Raise `RecipeError` unless the dataclass has a field at this dotted path; in a mapping all is free."""
+class _Step(NamedTuple):
+    """One name of a dotted path, the dataclass that has the field (None: a mapping), and what precedes it."""
+
+    cls: type | None
+    prefix: str
+    name: str
+
+
+def _walk(cls: type, path: str, *, where: str) -> list[_Step]:
+    """Return the steps of a dotted path, by their current names; in a mapping all names are free.
+
+    Raises:
+        RecipeError: a dataclass on the way has no such field.
+    """
     current: Any = cls  # Any: a type annotation
-    walked = ""
     names = path.split(".")
     if len(names) > MAX_DEPTH:
         raise RecipeError(f"{where}: nested more than {MAX_DEPTH} deep.")
-    for name in names:
+    steps: list[_Step] = []
+    prefix = ""
+    for index, name in enumerate(names):
         options = _options(current)
         found = next((option for option in options if _is_dataclass_type(option)), None)
         if found is None:
             if any(option is Any or get_origin(option) in (dict, Mapping) for option in options):
-                return
-            raise RecipeError(f"{where}: '{walked}' is {_describe(current)}, which has no fields.")
+                return [*steps, *(_Step(None, "", free) for free in names[index:])]
+            raise RecipeError(f"{where}: '{prefix[:-1]}' is {_describe(current)}, which has no fields.")
         hints = _hints(found)
-        walked = f"{walked}.{name}" if walked else name
-        if name not in hints:
-            raise RecipeError(f"{where}: {_no_such_field(walked, name, list(hints))}")
-        current = hints[name]
+        known = current_names(found).get(name, name)
+        if known not in hints:
+            raise RecipeError(f"{where}: {_no_such_field(f'{prefix}{name}', name, list(hints))}")
+        if known != name:
+            warn_renamed(f"'{prefix}{name}'", f"'{prefix}{known}'")
+        steps.append(_Step(found, prefix, known))
+        current, prefix = hints[known], f"{prefix}{known}."
+    return steps
+
+
+def _rename(step: _Step, data: dict[str, Any]) -> None:
+    if step.cls is not None:
+        use_current_names(step.cls, data, prefix=step.prefix)
 
 
 def _decoded(hint: Any, value: Any, *, path: str) -> Any:  # Any: type annotations and plain data
@@ -116,6 +140,8 @@ def _decoded(hint: Any, value: Any, *, path: str) -> Any:  # Any: type annotatio
 def _decoded_fields(cls: type, data: Mapping[str, Any], *, path: str) -> Any:  # Any: an object of `cls`
     hints = _hints(cls)
     prefix = f"{path}." if path else ""
+    data = dict(data)
+    use_current_names(cls, data, prefix=prefix)
     fields = [field for field in dataclasses.fields(cls) if field.init]
     for name in data:
         if name not in hints:
@@ -139,7 +165,7 @@ def _finite(value: float, *, path: str) -> float:
 
 
 def _check_plain(value: object, *, path: str, depth: int) -> None:
-    """Raise `RecipeError` unless this is what JSON can hold: what anyone may write, is stored as that."""
+    """Raise `RecipeError` unless this is what JSON can hold: free values are stored as JSON."""
     if depth > MAX_DEPTH:
         raise RecipeError(f"'{path.split('.')[0]}': nested more than {MAX_DEPTH} deep.")
     if isinstance(value, float):

@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 SimBackend = Literal["cpu", "gpu"]
 HUMAN_CAMERA = "human_camera"
-"""Name of the picture for people; no policy can ask for it."""
+"""Name of the camera for people; no policy can request it."""
 
 Simulator = Literal["maniskill", "fake"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderSettings:
-    """How pictures are made.
+    """How images are rendered.
 
     Attributes:
         wrist_mesh: the mesh of the wrist camera's housing: as ManiSkill ships it, or a simpler one
@@ -37,10 +37,10 @@ class EnvSettings:
         kwargs: the user's task arguments; they go on top of the catalogue row's own.
         simulator: `maniskill`, or `fake` (arrays only, for tests and dry runs).
         sim_backend: where the physics runs.
-        render: how pictures are made.
-        cameras: the cameras that may be asked for pictures; empty: no renderer is started.
+        render: how images are rendered.
+        cameras: the cameras that may be rendered; empty: no renderer is started.
         privileged: whether observations carry the true state of the world.
-        human_camera_stride: every so many control steps, and at the reset, pictures include `human_camera`,
+        human_camera_stride: every so many control steps, and at the reset, images include `human_camera`,
             a view for people; None: never.
         n_slots: how many episodes run side by side.
     """

@@ -13,24 +13,11 @@ from vla_eval.bounds import (
     check_seeds,
     require,
 )
-from vla_eval.chunking import ChunkingSpec
-from vla_eval.config.capture import RecordingConfig
+from vla_eval.chunking import ChunkingSettings
+from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
 from vla_eval.config.files import check_run_name
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChunkingConfig:
-    """How chunks of actions are executed; `vla_eval.chunking` explains it."""
-
-    mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
-    delay_steps: int = 0
-    delay_alignment: Literal["skip", "stale"] = "skip"
-    ensemble_decay: float = 0.01
-
-    def spec(self, n_action_steps: int) -> ChunkingSpec:
-        """Return the chunking of one evaluation."""
-        return ChunkingSpec(n_action_steps=n_action_steps, **dataclasses.asdict(self))
+from vla_eval.config.renamed import formerly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +30,6 @@ class TimeoutConfig:
     inference_seconds: float = 300.0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         least_and_most = (0.001, MAX_SECONDS)
         check_bounds(self, {f.name: least_and_most for f in dataclasses.fields(self)}, prefix="timeouts.")
 
@@ -66,7 +52,7 @@ class EvalConfig:
     runs: int = 1
     prompt_set: str = "paper"
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
-    chunking: ChunkingConfig = field(default_factory=ChunkingConfig)
+    chunking: ChunkingSettings = field(default_factory=ChunkingSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     simulator: Simulator = "maniskill"
     sim_backend: SimBackend = "cpu"
@@ -76,10 +62,9 @@ class EvalConfig:
     workers: int | Literal["auto"] = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: int = 10
-    recording: RecordingConfig = field(default_factory=RecordingConfig)
+    capture: CaptureConfig = field(default_factory=CaptureConfig, metadata=formerly("recording"))
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
         check_run_name(self.name)
         check_bounds(
             self,
@@ -97,8 +82,8 @@ class EvalConfig:
             require(values is None or len(values) > 0, name, values, "at least one")
             require(values is None or len(set(values)) == len(values), name, list(values or ()), "no doubles")
         for n_action_steps in self.n_action_steps or (1,):
-            self.chunking.spec(n_action_steps)  # checks the ranges
+            self.chunking.at(n_action_steps)  # checks the ranges
 
 
-OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "recording")
-"""Fields of `EvalConfig` that move no result: they may differ when a run is continued."""
+OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "capture")
+"""Fields of `EvalConfig` that move no result: they may differ when a run is resumed."""

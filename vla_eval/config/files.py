@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from vla_eval.bounds import (
-    require,
-)
+from vla_eval.bounds import require
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.shipped import search_folders
 from vla_eval.config.yaml_data import MAX_CHARACTERS, load_yaml
 from vla_eval.errors import MAX_SHOWN, RecipeError, unknown_name
+from vla_eval.record_rules import is_name
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
 
@@ -49,10 +48,11 @@ def check_run_name(name: str) -> None:
 
 def check_recorded_name(name: str, *, kind: str) -> None:
     """Raise `RecipeError` unless tables, paths and spreadsheets can hold a recipe's name as it is."""
-    if not (name.isprintable() and (name[:1].isalnum() or name[:1] == "_")):
+    if not (is_name(name) and (name[:1].isalnum() or name[:1] == "_")):
         raise RecipeError(
             f"{kind}: the file is called {name!r:.200}, expected a name that begins with a letter, a digit "
-            f"or '_' and has no line breaks or other control characters. Rename the file."
+            f"or '_' and has neither '/' nor '\\', no line breaks and no other control characters. Rename "
+            f"the file."
         )
 
 
@@ -75,7 +75,7 @@ def find_recipe(folder: Folder, name: str) -> Path:
         UnknownNameError: there is no such file; the message names what there is.
     """
     as_path = Path(name)
-    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    # os.path, unlike Path, returns False for what cannot be a path: too long, or with a NUL.
     if as_path.suffix in (".yaml", ".yml") and os.path.isfile(as_path):
         return as_path
     known = list_recipes(folder)
@@ -112,7 +112,7 @@ def load_recipe[T](
 
 
 def recipe_fields(folder: Folder, name: str) -> frozenset[str]:
-    """Return which fields a recipe sets: they tell kinds of one folder apart.
+    """Return which fields a recipe sets: they show which kind of recipe it is.
 
     Raises:
         UnknownNameError: there is no such recipe.

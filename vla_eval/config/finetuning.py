@@ -18,6 +18,7 @@ from vla_eval.bounds import (
     check_seeds,
 )
 from vla_eval.config.environment import Simulator
+from vla_eval.config.renamed import formerly
 from vla_eval.errors import RecipeError
 
 MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
@@ -42,7 +43,6 @@ class LoraRecipe:
     full_modules: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the ranges, and refuse what names no modules."""
         check_bounds(self, {"rank": (1, MAX_RANK), "alpha": (1, MAX_RANK)}, prefix="finetune.lora.")
         if self.target_modules == "all-linear":
             raise RecipeError(
@@ -71,8 +71,8 @@ class FinetuneRecipe:
         num_workers: processes that load samples, at most; no more than there are cores.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
         image_transforms: augmentation, fields of lerobot's `ImageTransformsConfig` (`max_num_transforms`,
-            `random_order`, `tfs`); {}: its own six; None: pictures as they are.
-        imagenet_statistics: normalise pictures by ImageNet's statistics, for backbones trained on it.
+            `random_order`, `tfs`); {}: its own six; None: images as they are.
+        imagenet_statistics: normalise images by ImageNet's statistics, for backbones trained on it.
         wandb_project, trackio_project: log there, too.
     """
 
@@ -95,7 +95,6 @@ class FinetuneRecipe:
     trackio_project: str | None = None
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
         check_bounds(
             self,
             {
@@ -125,8 +124,8 @@ class FinetuneRecipe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeldOutEvaluation:
-    """Evaluate checkpoints while the training goes on. Moves no weight.
+class HeldOutConfig:
+    """Evaluate checkpoints on held-out seeds during training. Moves no weight.
 
     Attributes:
         every_steps: a multiple of `save_every_steps`; the last checkpoint is evaluated in any case.
@@ -139,7 +138,7 @@ class HeldOutEvaluation:
 
     every_steps: int
     episodes: int = 20
-    seed_start: int = 900_000  # far above what recordings reach
+    seed_start: int = 900_000  # far above the seeds of demonstrations
     task: str | None = None
     n_action_steps: int | None = None
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
@@ -148,7 +147,6 @@ class HeldOutEvaluation:
     workers: int | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(
             self,
             {
@@ -158,9 +156,9 @@ class HeldOutEvaluation:
                 "slots_per_worker": (1, MAX_SLOTS),
                 "workers": (1, MAX_PROCESSES),
             },
-            prefix="evaluation.",
+            prefix="held_out.",
         )
-        check_seeds(self.seed_start, self.episodes, name="evaluation.seed_start")
+        check_seeds(self.seed_start, self.episodes, name="held_out.seed_start")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,7 +172,7 @@ class FinetuneConfig:
         run_seed: of initial weights, order of samples and noise.
         finetune: fields of the recipe's `finetune` section, set to other values.
         device: `auto`, `cpu`, `cuda`.
-        evaluation: evaluate checkpoints on held-out seeds meanwhile; None: do not.
+        held_out: evaluate checkpoints on held-out seeds during training; None: do not.
         allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
     """
 
@@ -184,11 +182,10 @@ class FinetuneConfig:
     run_seed: int = 0
     finetune: dict[str, Any] = field(default_factory=dict)  # Any: decoded as a FinetuneRecipe
     device: str = "auto"
-    evaluation: HeldOutEvaluation | None = None
+    held_out: HeldOutConfig | None = field(default=None, metadata=formerly("evaluation"))
     allow_unreplayed: bool = False
 
     def __post_init__(self) -> None:
-        """Check the range of the seed."""
         check_seeds(self.run_seed, name="run_seed")
 
 

@@ -1,6 +1,11 @@
-"""`policies/*.yaml`: which code and which weights, under one name."""
+"""`policies/*.yaml`: which code and which weights, under one name.
 
-from dataclasses import dataclass, field
+Some names of former recipes are rows of `configs/ablations.yaml` now; they still resolve.
+"""
+
+import functools
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from vla_eval.bounds import (
@@ -8,7 +13,14 @@ from vla_eval.bounds import (
     MAX_STEPS,
     check_bounds,
 )
-from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.config.decoding import decode, load_yaml
+from vla_eval.config.files import Recipe, load_recipe, to_data
+from vla_eval.config.finetuning import FinetuneRecipe, merge_fields
+from vla_eval.config.renamed import warn_renamed
+from vla_eval.config.shipped import search_folders
+from vla_eval.errors import UnknownNameError
+
+ABLATIONS = "ablations"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,5 +48,41 @@ class PolicyRecipe:
     finetune: FinetuneRecipe | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, {"default_n_action_steps": (1, MAX_STEPS), "max_workers": (1, MAX_PROCESSES)})
+
+
+def load_policy(name: str) -> Recipe[PolicyRecipe]:
+    """Return the recipe of a policy; of a former name, its row of `configs/ablations.yaml`, with a warning.
+
+    Raises:
+        UnknownNameError, RecipeError: see `load_recipe`.
+    """
+    try:
+        return load_recipe("policies", name, PolicyRecipe)
+    except UnknownNameError:
+        stem = Path(name.removesuffix(".yaml")).name
+        row = _ablation_rows().get(stem)
+        if row is None:
+            raise
+    base = load_recipe("policies", row["policy"], PolicyRecipe)
+    section = merge_fields(to_data(base.value.finetune), row["finetune"])
+    warn_renamed(
+        f"policies/{stem}.yaml",
+        f"row {stem} of configs/{ABLATIONS}.yaml ({row['policy']} with finetune {row['finetune']}; "
+        f"`mikasa-vla finetune {ABLATIONS} --policy {stem}`)",
+    )
+    value = replace(
+        base.value,
+        description=f"Row {stem} of configs/{ABLATIONS}.yaml.",
+        default_n_action_steps=row["n_action_steps"][0],
+        finetune=decode(FinetuneRecipe, section, where=f"configs/{ABLATIONS}.yaml, {stem}"),
+    )
+    return replace(base, name=stem, value=value)
+
+
+@functools.cache
+def _ablation_rows() -> dict[str, Any]:  # Any: plain data of YAML
+    """Return the rows that change something, by name: of the table that comes with the package."""
+    path = search_folders("configs")[-1] / f"{ABLATIONS}.yaml"
+    table = load_yaml(path.read_text(encoding="utf-8"), where=str(path))
+    return {row["name"]: row for row in table["rows"] if "finetune" in row}

@@ -49,7 +49,7 @@ def instructions_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> 
 
 
 def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, ...]:
-    """Return what a set says for a task: the sentence, then its paraphrases.
+    """Return a task's sentences in a set: the sentence, then its paraphrases.
 
     Raises:
         MissingInstructionError: the set has no sentence for this task, or an empty one.

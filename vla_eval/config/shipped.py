@@ -1,4 +1,4 @@
-"""Where files that come with the package lie: recipes and small trained weights. Standard library only."""
+"""Find files that come with the package: recipes and small trained weights. Standard library only."""
 
 from pathlib import Path
 
@@ -14,6 +14,6 @@ def search_folders(kind: str) -> tuple[Path, ...]:
         kind: name of the folder: `configs`, `policies`, `prompts`, `datasets` or `checkpoints`.
     """
     packaged = PACKAGE_ROOT / "recipes_data" / kind
-    # An editable checkout has no recipes_data: these folders lie beside the package.
+    # An editable checkout has no recipes_data: these folders are beside the package.
     shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / kind
     return tuple(dict.fromkeys((Path.cwd() / kind, shipped)))

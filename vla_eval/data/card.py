@@ -12,6 +12,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
+from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
 from vla_eval.storage.durable import replace_file
 from vla_eval.tasks.catalog import find_task
 
@@ -65,13 +66,13 @@ def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> st
 
 def _title(summary: DatasetSummary) -> str:
     task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
-    return f"{task or 'Imported demonstrations'}: {len(summary.lengths)} demonstrations"
+    return f"{markdown_cell(task or 'Imported demonstrations')}: {len(summary.lengths)} demonstrations"
 
 
 def _introduction(summary: DatasetSummary) -> str:
     task = find_task(summary.facts.task) if summary.facts else None
     about = f"{task.description} " if task else ""
-    sentences = "\n".join(f"> {sentence}" for sentence in summary.instructions)
+    sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
     return (
         f"{about}Two cameras of 128 × 128 pixels, 20 frames per second, one frame per control step, as a "
         f"LeRobotDataset v3.\n\nInstruction:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
@@ -92,13 +93,13 @@ def _statistics(summary: DatasetSummary) -> str:
         rows += [
             ("seeds", f"{min(seeds)} to {max(seeds)}"),
             ("seeds left out because the expert failed", _failed(summary)),
-            ("expert", "; ".join(experts)),
+            ("expert", markdown_cell("; ".join(experts))),
         ]
     action = summary.action
     numbers = zip(action.names, action.mean, action.std, action.low, action.high, strict=True)
     lines = [f"| {name} | {value} |" for name, value in rows]
     per_dim = [
-        f"| {name} | {mean:.4f} | {std:.4f} | {low:.4f} | {high:.4f} |"
+        f"| {markdown_cell(name)} | {mean:.4f} | {std:.4f} | {low:.4f} | {high:.4f} |"
         for name, mean, std, low, high in numbers
     ]
     return "\n".join(
@@ -117,7 +118,7 @@ def _failed(summary: DatasetSummary) -> str:
 
 
 def _fields(summary: DatasetSummary) -> str:
-    lines = [f"| `{name}` | {kind} |" for name, kind in summary.fields.items()]
+    lines = [f"| {markdown_code(name)} | {markdown_cell(kind)} |" for name, kind in summary.fields.items()]
     return "\n".join(["| field | type |", "|:--|:--|", *lines, ""])
 
 
@@ -130,21 +131,28 @@ def _origin(summary: DatasetSummary) -> str:
     said = "not replayed yet (`mikasa-vla replay`)"
     if replay is not None:
         verdict = "passed" if replay.passed else f"FAILED ({len(replay.mismatches)} mismatches)"
-        said = f"{verdict}: {replay.n_episodes} of {replay.n_total} episodes, states {replay.states_compared}"
+        compared = markdown_cell(replay.states_compared)
+        said = f"{verdict}: {replay.n_episodes} of {replay.n_total} episodes, states {compared}"
     rows = [
-        ("task rules", f"{facts.task}, version {facts.task_version}"),
+        ("task rules", f"{markdown_cell(facts.task)}, version {facts.task_version}"),
         ("replay", said),
-        ("renderer", ", ".join(f"{key} {value}" for key, value in sorted(facts.device.items()))),
-        ("recipe sha256", f"`{facts.recipe_sha256}`"),
-        ("manifest sha256", f"`{facts.files[MANIFEST_FILE.as_posix()].sha256}`"),
-        *((f"{name} sha256", f"`{digest}`") for name, digest in sorted(facts.recipe_files.items())),
+        (
+            "renderer",
+            markdown_cell(", ".join(f"{key} {value}" for key, value in sorted(facts.device.items()))),
+        ),
+        ("recipe sha256", markdown_code(facts.recipe_sha256)),
+        ("manifest sha256", markdown_code(facts.files[MANIFEST_FILE.as_posix()].sha256)),
+        *(
+            (f"{markdown_cell(name)} sha256", markdown_code(digest))
+            for name, digest in sorted(facts.recipe_files.items())
+        ),
     ]
     lines = "\n".join(f"| {name} | {value} |" for name, value in rows)
     recipe = yaml.safe_dump(facts.recipe, sort_keys=True, allow_unicode=True)
     return (
         f"`meta/mikasa/manifest.jsonl` has seed and actions of every episode: `mikasa-vla replay` checks the "
         f"dataset with it. Digests of all files are in `meta/mikasa/recording.json`.\n\n"
-        f"| | |\n|:--|:--|\n{lines}\n\nRecipe:\n\n```yaml\n{recipe}```\n"
+        f"| | |\n|:--|:--|\n{lines}\n\nRecipe:\n\n{markdown_block(recipe, 'yaml')}\n"
     )
 
 
@@ -154,11 +162,12 @@ def _import(summary: DatasetSummary) -> str:
     if facts is None:
         return ""
     lines = [
-        f"- layout of the source: `{facts.source_layout}`; digests of its files: `meta/mikasa/import.json`",
-        f"- instruction: {facts.instruction_source}",
-        f"- fields that the source does not have: {', '.join(facts.absent) or 'none'}",
-        f"- arrays of the source that were left out: {', '.join(facts.left_out) or 'none'}",
-        f"- actions are for the control mode `{facts.control_mode}`",
+        f"- layout of the source: {markdown_code(facts.source_layout)}; digests of its files: "
+        f"`meta/mikasa/import.json`",
+        f"- instruction: {markdown_cell(facts.instruction_source)}",
+        f"- fields that the source does not have: {markdown_cell(', '.join(facts.absent)) or 'none'}",
+        f"- arrays of the source that were left out: {markdown_cell(', '.join(facts.left_out)) or 'none'}",
+        f"- actions are for the control mode {markdown_code(facts.control_mode)}",
     ]
     if not facts.executable_by_pd_ee_delta_pose:
         lines.append(
@@ -177,23 +186,26 @@ def _differences(summary: DatasetSummary) -> str:
         "- The simulation is a new implementation of the tasks, not the authors' code "
         "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
         _expert_difference(facts, summary),
-        f"- Kept: {facts.recipe.get('keep', 'successes')}; the paper's recorder kept every episode of its "
-        f"batch, whether it succeeded or not.",
+        f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper's recorder kept "
+        f"every episode of its batch, whether it succeeded or not.",
         f"- Cut: {_cut(facts)}; the paper's recorder went on to the horizon.",
         "- Actions are end-effector deltas as they were executed; the paper's recordings for reinforcement "
         "learning hold joint deltas.",
         "- Pictures are video (lossy); the paper's are arrays of pixels.",
     ]
-    if facts.recipe.get("render", {}).get("wrist_mesh") == "simplified":
+    render = facts.recipe.get("render")
+    if isinstance(render, dict) and render.get("wrist_mesh") == "simplified":
         lines.append("- The wrist camera's housing is drawn with a simpler mesh.")
     return "\n".join([*lines, ""])
 
 
 def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
     text = "- The paper's experts were trained by PPO; here the expert is "
-    text += f"`{facts.recipe.get('expert', 'oracle')}`"
+    text += markdown_code(str(facts.recipe.get("expert", "oracle")))
     noise = facts.recipe.get("action_noise", 0.0)
-    text += f", with noise of std {noise:g} in its actions." if noise else ", without noise."
+    text += (
+        f", with noise of std {markdown_cell(str(noise))} in its actions." if noise else ", without noise."
+    )
     if summary.action.idle:
         text += (
             f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): "
@@ -205,7 +217,7 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
 def _cut(facts: DatasetFacts) -> str:
     if facts.recipe.get("cut") == "horizon":
         return "at the horizon"
-    return f"{facts.recipe.get('steps_after_success')} steps after the first success"
+    return f"{markdown_cell(str(facts.recipe.get('steps_after_success')))} steps after the first success"
 
 
 _SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {

@@ -10,6 +10,7 @@ import numpy as np
 from vla_eval.core import FloatArray
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.contact_sheet import SheetRow, contact_sheet
+from vla_eval.data.decoded_frames import frame_layout, read_columns
 from vla_eval.data.frame_cache import decode_camera
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import (
@@ -21,7 +22,6 @@ from vla_eval.data.manifest import (
     read_manifest,
     read_replay,
 )
-from vla_eval.data.memory_loader import frame_layout, read_columns
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 

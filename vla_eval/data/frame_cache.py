@@ -122,16 +122,16 @@ def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
         yield decoded
 
 
-def frames_in_memory(source: FrameSource) -> dict[str, ImageArray]:
-    """Decode all frames into this process's memory.
+def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
+    """Decode all frames into this process's RAM.
 
     Raises:
         DatasetError: they do not fit, or a video cannot be read.
     """
-    free = available_memory_bytes()
+    free = available_ram_bytes()
     if free is not None and source.n_bytes + HEADROOM_BYTES > free:
         raise DatasetError(
-            f"{_decoded_size(source)}, but {free / MIB:.0f} MiB of memory are free. "
+            f"{_decoded_size(source)}, but {free / MIB:.0f} MiB of RAM are free. "
             f"Use storage='disk' (a memory map), or select fewer episodes."
         )
     return {camera: np.concatenate(list(decode_camera(source, camera))) for camera in source.shapes}
@@ -162,8 +162,8 @@ def frames_on_disk(source: FrameSource, folder: Path) -> dict[str, Path]:
     return paths
 
 
-def available_memory_bytes() -> int | None:
-    """Return how much memory a process may still take without swapping, where Linux says so."""
+def available_ram_bytes() -> int | None:
+    """Return how much RAM a process may still take without swapping, where Linux says so."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:

@@ -13,9 +13,9 @@ class JobList[J: Job]:
         """Take the jobs."""
         self._jobs = deque(jobs)
 
-    def __len__(self) -> int:
-        """How many jobs have not been handed out."""
-        return len(self._jobs)
+    def has_next(self) -> bool:
+        """Whether there is a job that has not been handed out."""
+        return bool(self._jobs)
 
     def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> J | None:
         """Return the next job; see `workers.JobSource`."""

@@ -144,8 +144,8 @@ def read_npz(path: Path) -> tuple[SourceEpisode, Sequence[str]]:
 
 def read_lerobot(dataset: Any, layout: Layout) -> Iterator[SourceEpisode]:  # Any: LeRobotDataset
     """Yield the episodes of an opened LeRobotDataset of one of the two layouts."""
+    from vla_eval.data.decoded_frames import frame_layout, read_columns
     from vla_eval.data.frame_cache import decode_camera
-    from vla_eval.data.memory_loader import frame_layout, read_columns
 
     ours = layout == "lerobot_mikasa"
     cameras = LEROBOT_CAMERAS[layout]

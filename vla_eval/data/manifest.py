@@ -222,7 +222,7 @@ def read_manifest(dataset: Path) -> tuple[RecordedEpisode, ...]:
     Raises:
         DatasetError: there is no manifest, or it is damaged.
     """
-    episodes = _read_lines(dataset / MANIFEST_FILE, RecordedEpisode)
+    episodes = read_entries(dataset / MANIFEST_FILE, RecordedEpisode)
     numbers = [episode.episode_index for episode in episodes]
     if numbers != list(range(len(episodes))):
         raise DatasetError(
@@ -233,7 +233,7 @@ def read_manifest(dataset: Path) -> tuple[RecordedEpisode, ...]:
 
 def read_failed(dataset: Path) -> tuple[FailedSeed, ...]:
     """Return the seeds at which the expert failed; errors as `read_manifest`."""
-    return _read_lines(dataset / FAILED_FILE, FailedSeed)
+    return read_entries(dataset / FAILED_FILE, FailedSeed)
 
 
 def read_facts(dataset: Path) -> DatasetFacts:
@@ -276,7 +276,12 @@ def check_file_names(files: Mapping[str, FileDigest], *, where: Path) -> None:
             )
 
 
-def _read_lines[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
+def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
+    """Return the entries of a file, one per line.
+
+    Raises:
+        DatasetError: there is no such file, or a line is damaged.
+    """
     lines = _content(path).split(b"\n")
     if lines[-1]:
         raise DatasetError(f"{path}: expected a line end at its end; the last line is torn. {FETCH_AGAIN}")

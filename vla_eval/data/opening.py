@@ -8,6 +8,7 @@ from typing import Any  # lerobot is untyped
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from vla_eval.data.info_file import check_info
 from vla_eval.errors import DatasetError
 
 NEEDED = ("meta/info.json", "meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet")
@@ -29,11 +30,17 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
                 f"{root}: there is no complete LeRobotDataset (v3): no {pattern}. Name the folder of one "
                 f"dataset; `mikasa-vla dataset pull` fetches one from the Hub."
             )
+    check_info(root)
     repo_id = f"local/{root.resolve().name}"
     try:
         meta = LeRobotDatasetMetadata(repo_id, root=root)
     except (OSError, ValueError, KeyError, TypeError) as exc:
         raise DatasetError(f"{root}: lerobot cannot read its meta/ ({exc!r:.300}).") from exc
+    if meta.total_episodes != len(meta.episodes):
+        raise DatasetError(
+            f"{root}: meta/info.json says {meta.total_episodes} episodes, meta/episodes has "
+            f"{len(meta.episodes)}. Fetch the dataset again, or rebuild it from its manifest."
+        )
     for path in _files(meta):
         if path.is_absolute() or ".." in path.parts:
             raise DatasetError(

@@ -23,7 +23,7 @@ from typing import Self
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.errors import DatasetError, RunFolderError
-from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
+from vla_eval.storage.durable import LineFile, sync_folder
 from vla_eval.storage.episodes_file import cut_tail, read_lines
 from vla_eval.storage.run_file import (
     DEVICE,
@@ -35,8 +35,7 @@ from vla_eval.storage.run_file import (
     environment_changed,
     find_changes,
 )
-from vla_eval.storage.run_folder import DISK_TROUBLE
-from vla_eval.storage.unstarted import FolderStart
+from vla_eval.storage.starting import StartedFolder, starting
 from vla_eval.strict_json import Source, as_dataclass, read_json
 
 logger = logging.getLogger(__name__)
@@ -50,11 +49,10 @@ _OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOCK_FILE)  # of a recording that has
 class RecordingFolder:
     """The folder of a recording that this process writes into; make it with `open`."""
 
-    def __init__(self, out: Path, lock: FolderLock, run_file: RunFile, start: FolderStart) -> None:
+    def __init__(self, out: Path, started: StartedFolder, run_file: RunFile) -> None:
         """Use `open`."""
         self.out = out
-        self._start = start
-        self._lock = lock
+        self._started = started
         self._run_file = run_file
         self._attempts: dict[str, LineFile] = {}
 
@@ -73,26 +71,18 @@ class RecordingFolder:
             StorageFullError: the disk is full.
         """
         state = out / STATE_FOLDER
-        try:
+
+        def make(folder: Path) -> None:
             _refuse_foreign(out)
-            start = FolderStart(state, own=_OWN_FILES)
-            state.mkdir(parents=True, exist_ok=True)
-            lock = FolderLock(state / LOCK_FILE)
-            try:
-                run_file = _continued(state, description, allow_environment_change)
-                run_file.save(state)
-                sync_folder(out)
-            except BaseException:
-                start.undo()
-                lock.release()
-                raise
-        except OSError as exc:
-            if exc.errno in DISK_TROUBLE:
-                raise storage_full(out, exc) from exc
-            raise RunFolderError(
-                f"{out}: cannot be recorded into ({exc.strerror or exc}). Use another --out."
-            ) from exc
-        return cls(out, lock, run_file, start)
+            folder.mkdir(parents=True, exist_ok=True)
+
+        with starting(
+            state, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a recording", make=make
+        ) as started:
+            run_file = _continued(state, description, allow_environment_change)
+            run_file.save(state)
+            sync_folder(out)
+        return cls(out, started, run_file)
 
     def __enter__(self) -> Self:
         """Return the folder."""
@@ -106,8 +96,8 @@ class RecordingFolder:
             file.close()
         self._attempts = {}
         if isinstance(value, Exception):
-            self._start.undo()
-        self._lock.release()
+            self._started.start.undo()
+        self._started.lock.release()
 
     @property
     def environment(self) -> Mapping[str, JsonValue]:

@@ -11,7 +11,7 @@ from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import SLOT, Attempt
 from vla_eval.data.manifest import DatasetFacts, FailedSeed
-from vla_eval.evaluation.plan import Group
+from vla_eval.evaluation.plan import EpisodeGroup
 
 
 class SetupKey(NamedTuple):
@@ -32,7 +32,7 @@ class TaskPlan:
         recipe: the recipe of the dataset.
     """
 
-    group: Group
+    group: EpisodeGroup
     task_version: int
     expert_version: int
     recipe: DatasetRecipe

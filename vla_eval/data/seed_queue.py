@@ -42,9 +42,9 @@ class SeedQueue[J]:
         self._make_job = make_job
         self._in_flight: set[int] = set()
 
-    def __len__(self) -> int:
-        """Whether there is a seed to try now: 1 or 0."""
-        return 0 if self._next() is None else 1
+    def has_next(self) -> bool:
+        """Whether there is a seed to try now."""
+        return self._next() is not None
 
     @property
     def n_kept(self) -> int:

@@ -22,7 +22,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
 from vla_eval.data.frame_table import read_columns
-from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, from_json, write_lines
+from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
@@ -172,8 +172,7 @@ def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None
 def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:
     """Return the episodes of a finished shard."""
     path = shard / SHARD_EPISODES
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return tuple(from_json(RecordedEpisode, line, where=str(path)) for line in lines)
+    return read_entries(path, RecordedEpisode)
 
 
 def draft_path(path: Path) -> Path:

@@ -1,7 +1,7 @@
-"""Look at the machine: one small function per thing that can be wrong, and what to do about it.
+"""Check the machine: one small function per possible problem, with advice.
 
-`CHECKS` is the table; each function returns a `Finding` and never raises. What could take the process
-down with it (a graphics driver, a broken package) is tried in another process, by `doctor.probe`.
+`CHECKS` is the table; each function returns a `Finding` and never raises. What could crash the
+process (a graphics driver, a broken package) runs in another process, by `doctor.probe`.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""What a check answers, and how a risky one is tried in another process."""
+"""The result of a check, and how a risky check runs in another process."""
 
 import json
 import signal
@@ -30,7 +30,7 @@ class Finding:
 
 
 class ProbeFailure(Exception):
-    """A probe ended without an answer; the message is its last word."""
+    """A probe ended without an answer; the message is its last output."""
 
 
 type Probe = Callable[[str], Mapping[str, Any]]  # Any: JSON

@@ -91,12 +91,12 @@ def check_disk(_: Probe) -> Finding:
 
 
 def check_episode(probe: Probe) -> Finding:
-    """Whether a picture can be drawn and an episode run to its end."""
+    """Whether an image can be rendered and an episode run to its end."""
     try:
         answer = probe("episode")
     except ProbeFailure as exc:
-        return Finding(status="fail", found=str(exc), advice="Mend what is said above; see docs/install.md.")
-    found = "{task}: one {width}×{height} picture, {steps} steps in {seconds:.1f} s".format_map(answer)
+        return Finding(status="fail", found=str(exc), advice="Fix what is said above; see docs/install.md.")
+    found = "{task}: one {width}×{height} image, {steps} steps in {seconds:.1f} s".format_map(answer)
     return Finding(status="ok", found=found)
 
 

@@ -1,4 +1,4 @@
-"""What `doctor` tries in another process: `python -m vla_eval.doctor.probe NAME` prints JSON.
+"""What `doctor` runs in another process: `python -m vla_eval.doctor.probe NAME` prints JSON.
 
 Each function imports what it tests, because the import itself may fail or crash.
 """
@@ -49,13 +49,13 @@ def gpu_simulator() -> dict[str, Any]:
 
 
 def episode() -> dict[str, Any]:
-    """Draw one picture and run one episode with an arm that holds still."""
+    """Render one image and run one episode with an arm that holds still."""
     factory = importlib.import_module("vla_eval.envs.factory")
     started = time.perf_counter()
     env = factory.make_env(factory.EnvSettings(task=TASK, cameras=(CAMERA,)))
     image = env.reset({0: 0}, render=True)[0].observation.images[CAMERA]
     if image.min() == image.max():
-        raise RuntimeError("the picture has one colour only: the driver does not render")
+        raise RuntimeError("the image has one colour only: the driver does not render")
     for _ in range(env.spec.horizon_steps):
         env.step({0: env.hold_action(0)}, render=frozenset())
     env.close()

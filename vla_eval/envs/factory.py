@@ -1,6 +1,6 @@
-"""Make an environment from its settings. The one place that knows which simulators there are.
+"""Make an environment from its settings. The only module that knows which simulators exist.
 
-Each simulator is imported when it is asked for, so that no command pays for one that it does not use.
+Each simulator is imported on first use, so no command imports one that it does not use.
 """
 
 import importlib
@@ -44,10 +44,10 @@ def make_env(settings: EnvSettings) -> SimEnv:
 
 
 def describe_device(env: SimEnv) -> Mapping[str, str] | None:
-    """Return what the environment says of the device it runs on, if it says anything.
+    """Return the environment's description of its device, if it has one.
 
-    An environment may carry a `device` mapping (name of the render device, driver …). It is written
-    into the run folder: pictures may differ from device to device.
+    An environment may have a `device` mapping (name of the render device, driver …). It is written into
+    the run folder, because images may differ between devices.
     """
     device: Mapping[str, str] | None = getattr(env, "device", None)
     return dict(device) if device else None

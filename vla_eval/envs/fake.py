@@ -1,7 +1,7 @@
-"""A stand-in for the simulator: the same contract, arrays only. For tests and dry runs.
+"""A fake simulator: the same contract, arrays only. For tests and dry runs.
 
-The tool centre point is a point that moves as it is told; candidates lie in a row; the ball of the
-Intercept tasks rolls straight and is carried along once the point reaches it. No physics, no arm.
+The tool centre point is a point that follows the actions. Candidates lie in a row. The ball of the
+Intercept tasks rolls straight and moves with the point once the point reaches it. No physics, no arm.
 """
 
 from collections.abc import Mapping
@@ -22,14 +22,14 @@ from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
-M_PER_STEP = 0.039  # what ManiSkill's pd_ee_delta_pose really moves per step at action 1
+M_PER_STEP = 0.039  # measured displacement of ManiSkill's pd_ee_delta_pose per step at action 1
 CONTROL_HZ = 20.0
 TCP_START_M = (-0.07, 0.0, 0.318)
 CANDIDATE_SPACING_M = 0.1
 CANDIDATE_Z_M = 0.02
 REACH_M = 0.05
 MUG_REACH_M = 0.07  # the arm comes to rest on a mug, which is taller than a cube
-STATIC_ACTION = 0.2  # below it in each dimension the point counts as at rest
+STATIC_ACTION = 0.2  # the point counts as at rest if every dimension is below it
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
@@ -136,7 +136,7 @@ class FakeEnv:
         }
 
     def hold_action(self, slot: int) -> FloatArray:
-        """Return the action that leaves point and gripper as they are."""
+        """Return the action that moves neither point nor gripper."""
         action = np.zeros(len(ACTION.dims), dtype=np.float32)
         action[-1] = self._episodes[slot].gripper_width_m / GRIPPER_MAX_M * 2 - 1
         return action
@@ -189,7 +189,7 @@ class FakeEnv:
         return nearest if distances[nearest] <= self._touch_reach_m else None
 
     def _is_complete(self, episode: _Episode) -> bool:
-        """Whether all right candidates have been touched; where there are several, nothing else may be."""
+        """Whether all right candidates have been touched; if there are several, no other may be."""
         if len(episode.targets) == 1:
             return True
         touched = tuple(episode.touched)
@@ -250,7 +250,7 @@ class FakeEnv:
         return (*self._settings.cameras, HUMAN_CAMERA)
 
     def _picture(self, episode: _Episode, camera: str) -> ImageArray:
-        """Return a picture that shows the cue in its first rows, and otherwise depends on the state alone."""
+        """Return an image that shows the cue in its first rows and otherwise depends only on the state."""
         view = [*(known.name for known in CAMERAS), HUMAN_CAMERA].index(camera)
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]

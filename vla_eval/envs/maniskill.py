@@ -1,8 +1,8 @@
 """The ManiSkill adapter: torch ends here, numpy begins. Knows nothing of policies or records.
 
-On the CPU simulator every slot is an environment of its own; on the GPU simulator all slots are one
-vectorised environment in which slots that are not asked to act hold still. ManiSkill itself runs with
-`obs_mode="none"`: pictures are taken only where the caller asks for them.
+On the CPU simulator every slot is a separate environment. On the GPU simulator all slots are one
+vectorised environment, in which slots without an action hold still. ManiSkill itself runs with
+`obs_mode="none"`: images are rendered only on request.
 """
 
 import gc
@@ -16,6 +16,7 @@ import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
+from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
@@ -51,8 +52,8 @@ RENDERING_ADVICE = (
 )
 
 
-# ManiSkill collects garbage whenever it rebuilds a scene, which our tasks do at each reset. Over all the
-# objects of the imported modules that takes 150 ms; set aside once, they cost nothing.
+# ManiSkill collects garbage whenever it rebuilds a scene, which our tasks do at each reset. With all objects
+# of the imported modules this takes 150 ms; once frozen, they cost nothing.
 gc.freeze()
 
 
@@ -61,14 +62,14 @@ def make_maniskill_env(settings: EnvSettings) -> "ManiSkillEnv":
 
     Raises:
         UnknownNameError: no such task, argument or camera.
-        TaskArgumentError: arguments that are impossible.
+        TaskArgumentError: the arguments are impossible.
         RenderingError: cameras are wanted and the renderer does not start.
     """
     return ManiSkillEnv(settings)
 
 
 class ManiSkillEnv:
-    """`SimEnv` on ManiSkill; see the module's text."""
+    """`SimEnv` on ManiSkill; see the module docstring."""
 
     def __init__(self, settings: EnvSettings) -> None:
         """Build the scenes."""
@@ -142,7 +143,7 @@ class ManiSkillEnv:
         return any(step % stride == 0 or step == self.spec.horizon_steps for step in steps)
 
     def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
-        """Return (environment index, its slots that are meant), in order."""
+        """Return (environment index, its requested slots), in order."""
         grouped: dict[int, list[int]] = {}
         for slot in sorted(slots):
             grouped.setdefault(slot // self._slots_per_env, []).append(slot)
@@ -184,7 +185,7 @@ class ManiSkillEnv:
 
 
 def _take_human_picture(env: Any) -> ImageArray:
-    """Return (B, H, W, 3) uint8 of the camera for people; what policies see is not touched."""
+    """Return (B, H, W, 3) uint8 of the camera for viewers; policies' images are not affected."""
     env.scene.update_render(update_sensors=False, update_human_render_cameras=True)
     (camera,) = env.scene.human_render_cameras.values()
     camera.capture()
@@ -195,6 +196,8 @@ def _take_human_picture(env: Any) -> ImageArray:
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
     backend = _render_backend(settings)
+    if backend != "none":
+        use_lean_shaders()
     try:
         return cls(
             num_envs=num_envs,
@@ -214,14 +217,14 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
 
 
 def _robot(settings: EnvSettings, kwargs: Mapping[str, Any]) -> str:
-    """Return the arm that was asked for, or the Panda with the mesh that was."""
+    """Return the requested arm, or the Panda with the requested mesh."""
     mesh = settings.render.wrist_mesh
     if ROBOT not in kwargs:
         return WRIST_MESH_ROBOTS[mesh]
     if mesh != "shipped" or kwargs[ROBOT] in WRIST_MESH_ROBOTS.values():
         raise TaskArgumentError(
-            f"{ROBOT}={kwargs[ROBOT]!r} with render.wrist_mesh={mesh!r}: the mesh is the Panda's, which is "
-            "the arm where no other is asked for. Set one of the two."
+            f"{ROBOT}={kwargs[ROBOT]!r} with render.wrist_mesh={mesh!r}: the mesh belongs to the Panda, the "
+            "default arm. Set only one of the two."
         )
     return str(kwargs[ROBOT])
 
@@ -236,7 +239,7 @@ def _render_backend(settings: EnvSettings) -> str:
 
 
 def states(arm: Arm, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]:
-    """Return what every task offers with an arm, and the numbers of the prompt where the task has one."""
+    """Return the states that every task provides with an arm, and the numbers of the prompt if it has any."""
     offered = (
         TCP_POSE,
         StateSpec(name="qpos", dims=arm.joints, unit="rad, m", frame="joint"),
@@ -248,9 +251,9 @@ def states(arm: Arm, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]
 
 
 def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: Mapping[str, Any]) -> None:
-    """Raise unless every argument is one of the task's own (not of ManiSkill's base class), and of its type.
+    """Raise unless every argument belongs to the task (not to ManiSkill's base class) and has its type.
 
-    Types are checked of what the user gave.
+    Types are checked only for the user's arguments.
     """
     known: dict[str, Any] = {"horizon_steps": int}  # Any: type annotations
     for ancestor in reversed(cls.__mro__):
@@ -259,8 +262,8 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: M
             hints = get_type_hints(ancestor.__init__)
             own = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
             known.update({name: hints[name] for name in own})
-    # The sentence is chosen by the prompt set; an episode that depends on those before it is nothing to ask
-    # for; and a task makes its items itself.
+    # The instruction comes from the prompt set, an episode must not depend on earlier ones, and a task makes
+    # its items itself.
     for name in ("instruction", "reconfiguration_freq", "items"):
         known.pop(name, None)
     check_names("argument", kwargs, known, where=task)
@@ -269,10 +272,10 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: M
 
 
 def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> int:
-    """Return the length of an episode: as wanted, or as the row says.
+    """Return the length of an episode: as requested, or as in the row.
 
     Raises:
-        TaskArgumentError: no number, or none that leaves a step for the choice.
+        TaskArgumentError: not a number, or too short for a step of the choice.
     """
     horizon_steps = row.default_horizon_steps(longest_wait_steps) if wanted is None else wanted
     if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
@@ -280,7 +283,7 @@ def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> in
     if longest_wait_steps >= horizon_steps:
         raise TaskArgumentError(
             f"{row.id}: cue_steps and delay_steps can be {longest_wait_steps} together, but the episode ends "
-            f"after horizon_steps={horizon_steps}: no step is left for the choice. Raise horizon_steps or "
+            f"after horizon_steps={horizon_steps}: no step is left for the choice. Increase horizon_steps or "
             "shorten the phases."
         )
     return horizon_steps
@@ -306,13 +309,15 @@ def _take_pictures(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
     """Return camera name -> (B, H, W, 3) uint8.
 
     Raises:
-        RenderingError: no camera was declared when the environment was made.
+        RenderingError: no camera was declared when the environment was made, or the scene has an environment
+            map.
     """
     if not cameras:
         raise RenderingError(
-            "Images were asked for, but this environment was made without cameras, hence without a renderer. "
+            "Images were requested, but this environment was made without cameras and has no renderer. "
             "Name the cameras in EnvSettings.cameras."
         )
+    check_no_environment_map(env.scene)
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
     images = {}
     for name in cameras:

@@ -2,7 +2,7 @@
 
 Only this process writes results. An episode that cannot be run becomes an error record and the next
 one is run; a mistake that every episode would repeat ends the run. Stopped at any moment, by any
-means, the same call goes on where it stopped.
+means, the same call resumes where it stopped.
 """
 
 import functools
@@ -28,7 +28,7 @@ from vla_eval.policies.registry import own_modules
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder
-from vla_eval.viz.recorder import Recorder
+from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.pool import Answered, WorkerMain, WorkerPool
 from vla_eval.workers.start import available_cores, simulator_modules
@@ -48,7 +48,7 @@ class EvaluationObserver(Protocol):
         """Called with each record once it is durable."""
 
     def on_tick(self) -> bool:
-        """Called several times a second; returns whether the run shall stop now."""
+        """Called several times a second; returns whether the run has to stop now."""
 
 
 class _Silence:
@@ -61,13 +61,13 @@ class _Silence:
         """Do nothing."""
 
     def on_tick(self) -> bool:
-        """Go on."""
+        """Do not stop."""
         return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSummary:
-    """What one call of `evaluate` has come to.
+    """The result of one call of `evaluate`.
 
     Attributes:
         out: the run folder.
@@ -104,11 +104,11 @@ def evaluate(
         out: the run folder; by default `default_run_folder(config)`.
         command: what the user typed, for the record.
         allow_environment_change: continue although package versions or the machine have changed.
-        observer: is told of progress.
+        observer: gets the progress.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
-            episodes in a row ended in an error; errors of the store. What was recorded stays.
+            episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
     observer, path = observer or _Silence(), out or default_run_folder(config)
     plan = make_plan(config)
@@ -121,7 +121,7 @@ def evaluate(
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)
         n_open = queue.n_episodes
-        n_workers = worker_count(config, plan, n_jobs=len(queue))
+        n_workers = worker_count(config, plan, n_jobs=queue.n_batches)
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
         bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
         was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers, _modules(config, plan))
@@ -159,7 +159,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
 
 
 def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
-    """Return what takes workers long to import; other packages' code is left out: it may not bear a fork."""
+    """Return the slow imports of workers, except other packages' code, which may not work after a fork."""
     adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
     return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
 
@@ -171,11 +171,11 @@ def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Se
     config = bookkeeper.config
     new_pool = WorkerPool[EpisodeBatch, Finished]
     main: WorkerMain = worker_main
-    if config.recording.is_on:
-        recorder = Recorder(
-            config=config.recording, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
+    if config.capture.is_on:
+        capture = EpisodeCapture(
+            config=config.capture, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
         )
-        main = functools.partial(worker_main, recorder=recorder)
+        main = functools.partial(worker_main, capture=capture)
     with new_pool(
         main,
         answers=(Finished,),
@@ -212,7 +212,7 @@ class _Bookkeeper:
         """Store the results, or the error in their place."""
         batch, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
-            # What has worked before and now does not is no mistake of the user's: a GPU was lost, say.
+            # A group that has worked before is no mistake of the user: a GPU was lost, for example.
             if answer.refused and batch.group.key not in self.proven:
                 raise as_exception(answer.error)
             if len(batch.jobs) > 1:

@@ -1,4 +1,4 @@
-"""A table of learned policies: which fine-tunings and evaluations it takes, and where each of them lies.
+"""A table of learned policies: which fine-tunings and evaluations it takes, and the folder of each.
 
 `configs/paper_vla_table.yaml` is one. A row is a policy at its own numbers of action steps; it is fine-tuned
 for each task and run seed by itself, and each such checkpoint is evaluated on the same seeds. Nothing is run
@@ -24,7 +24,7 @@ from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import check_run_name, load_recipe, recipe_fields
 from vla_eval.config.finetuning import FinetuneConfig, merge_fields
-from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.policy import load_policy
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.storage.durable import replace_file
@@ -44,7 +44,7 @@ SUSTAINED_TFLOPS = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCost:
-    """What tells the operations of a training step.
+    """What determines the operations of a training step.
 
     Attributes:
         parameters: weights that each sample goes through.
@@ -57,7 +57,6 @@ class StepCost:
     trained: Trained
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for name in ("parameters", "tokens"):
             if getattr(self, name) < 1:
                 raise RecipeError(f"cost: {name} is {getattr(self, name)}, expected ≥ 1.")
@@ -86,7 +85,6 @@ class TableRow:
     cost: StepCost | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_run_name(self.name)
         steps = self.n_action_steps
         if not steps or len(set(steps)) != len(steps) or min(steps) < 1:
@@ -131,7 +129,6 @@ class ModelTable:
     allow_unreplayed: bool = False
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
         check_run_name(self.name)
         check_bounds(self, {"steps": (1, MAX_TRAINING_STEPS), "episodes": (1, MAX_EPISODES)})
         check_seeds(self.seed_start, self.episodes)
@@ -145,7 +142,7 @@ class ModelTable:
             if not values or len(set(values)) != len(values):
                 raise RecipeError(f"{name} is {list(values)}, expected at least one, none of them twice.")
         if set(self.controls) & {row.name for row in self.rows}:
-            raise RecipeError("rows and controls share a name; records tell them apart by it.")
+            raise RecipeError("rows and controls share a name; records distinguish them by it.")
         for task in self.tasks:
             task_spec(task)
         for row in self.rows:
@@ -159,7 +156,7 @@ class ModelTable:
 def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[str] = ()) -> ModelTable:
     """Return the part of a table that has these tasks and rows, in the table's order.
 
-    What it takes lies where it lies for the whole table.
+    The folders are those of the whole table.
 
     Args:
         table: the whole.
@@ -246,9 +243,9 @@ def evaluations(
 ) -> Iterator[tuple[Path, EvalConfig]]:
     """Yield run folder and configuration of every evaluation: task by task, the controls first.
 
-    Each row has run folders of its own, so that a table to which rows or tasks are added keeps what it has.
-    The recipes that name the checkpoints are written to `out`: a row keeps its name, wherever its weights
-    lie.
+    Each row has run folders of its own, so that a table keeps its results when rows or tasks are added.
+    The recipes that name the checkpoints are written to `out`: a row keeps its name, wherever its
+    weights are.
 
     Args:
         table: what to evaluate.
@@ -305,7 +302,7 @@ def _write_recipe(out: Path, row: TableRow, task: str, run_seed: int, adapter: s
         "adapter": adapter,
         "args": {"checkpoint": str(_training_folder(out, row, task, run_seed))},
         "default_n_action_steps": row.n_action_steps[0],
-        "max_workers": load_recipe("policies", row.policy, PolicyRecipe).value.max_workers,
+        "max_workers": load_policy(row.policy).value.max_workers,
     }
     path = folder / f"{row.name}.yaml"
     folder.mkdir(parents=True, exist_ok=True)
@@ -316,21 +313,24 @@ def _write_recipe(out: Path, row: TableRow, task: str, run_seed: int, adapter: s
 def gpu_hours(row: TableRow, *, steps: int | None) -> float | None:
     """Return a rough estimate of one fine-tuning's GPU hours, from operations alone; None without a cost.
 
-    Operations of a step over `SUSTAINED_TFLOPS`; loading and decoding are not counted. Good for telling a
-    day from a month.
+    Operations of a step over `SUSTAINED_TFLOPS`; loading and decoding are not counted. Good enough to
+    distinguish a day from a month.
     """
-    recipe = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
+    recipe = load_policy(row.policy).value.finetune
     if recipe is None:
         raise RecipeError(f"policies/{row.policy}.yaml has no section `finetune`: there is nothing to train.")
     if row.cost is None:
         return None
+    own = row.finetune or {}
+    n_steps = int(own.get("steps", steps or recipe.steps))
+    n_samples = int(own.get("batch_size", recipe.batch_size))
     of_a_sample = FLOPS_PER_WEIGHT_AND_TOKEN[row.cost.trained] * row.cost.parameters * row.cost.tokens
-    operations = of_a_sample * recipe.batch_size * (steps or recipe.steps)
+    operations = of_a_sample * n_samples * n_steps
     return operations / (SUSTAINED_TFLOPS * 1e12) / 3600
 
 
 def describe_effort(table: ModelTable, *, n_finished: int) -> str:
-    """Return what is ahead, for a person."""
+    """Describe the remaining work, for a person."""
     every = finetunings(table, Path())
     told = (
         f"{table.name}: {len(every)} fine-tunings ({len(table.rows)} rows, {len(table.tasks)} tasks, "

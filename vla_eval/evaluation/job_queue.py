@@ -1,10 +1,10 @@
-"""Which episodes a worker is given next. Knows nothing of processes or results."""
+"""Choose the episodes that a worker gets next. Knows nothing of processes or results."""
 
 from collections import deque
 from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass
 
-from vla_eval.evaluation.plan import EpisodeJob, Group, GroupKey
+from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.records import EpisodeKey
 
 
@@ -15,7 +15,7 @@ class EpisodeBatch:
     jobs: tuple[EpisodeJob, ...]
 
     @property
-    def group(self) -> Group:
+    def group(self) -> EpisodeGroup:
         """What the episodes share."""
         return self.jobs[0].group
 
@@ -26,12 +26,12 @@ class EpisodeBatch:
 
 
 class JobQueue:
-    """Hands out episodes so that mistakes show early and few processes have to be started.
+    """Hands out episodes so that mistakes appear early and few processes start.
 
-    The first batch of each group that has no result yet comes before all others: what is wrong with
-    the last policy of the list shows in the first minutes, not at the end of the night. After that a
-    worker stays with the group that its process has loaded: another one costs a process. The order moves
-    no result, nor does it matter which episodes are in a batch: an episode's slot is the plan's.
+    The first batch of each group that has no result yet comes before all others: an error of the last
+    policy of the list appears in the first minutes. After that a worker stays with the group that its
+    process has loaded, because another one costs a process. Neither the order nor the batches change a
+    result: an episode's slot is the plan's.
     """
 
     def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
@@ -46,7 +46,12 @@ class JobQueue:
             else:
                 self._rest.setdefault(batch.group.key, deque()).append(batch)
 
-    def __len__(self) -> int:
+    def has_next(self) -> bool:
+        """Whether there is a batch that has not been handed out."""
+        return bool(self._heads) or any(self._rest.values())
+
+    @property
+    def n_batches(self) -> int:
         """How many batches have not been handed out."""
         return len(self._heads) + sum(len(batches) for batches in self._rest.values())
 
@@ -59,8 +64,8 @@ class JobQueue:
         """Return the next batch for a worker, or None if there is no more.
 
         Args:
-            loaded: the group whose environment and policy the worker has at hand.
-            taken: groups that other workers have at hand; avoided while there are others.
+            loaded: the group whose environment and policy the worker has loaded.
+            taken: groups that other workers have loaded; avoided while there are others.
         """
         if self._heads:  # of several of one group, as `put_back_alone` leaves them, the worker keeps on
             index = next((i for i, batch in enumerate(self._heads) if batch.setup_key == loaded), 0)
@@ -75,12 +80,12 @@ class JobQueue:
         return self._rest[chosen].popleft()
 
     def put_back_alone(self, batch: EpisodeBatch) -> None:
-        """Queue the episodes of a batch that failed again, one by one, to find the one to blame."""
+        """Queue the episodes of a batch that failed again, one by one, to find the one that fails."""
         self._heads.extendleft(EpisodeBatch(jobs=(job,)) for job in reversed(batch.jobs))
 
 
 def _batches(jobs: Iterable[EpisodeJob]) -> Iterable[EpisodeBatch]:
-    """Yield the jobs in their order; a batch ends where the group does, or where a slot is wanted twice."""
+    """Yield the jobs in their order; a batch ends with its group, or where a slot is needed twice."""
     batch: list[EpisodeJob] = []
     for job in jobs:
         if batch and (job.group.key != batch[0].group.key or job.slot in {other.slot for other in batch}):

@@ -1,7 +1,7 @@
 """From a configuration to the list of episodes: task x policy x n_action_steps x run x seed.
 
-Everything that can be wrong with a configuration and can be seen without starting a simulator is
-found here, before the first episode. Knows nothing of processes or files of results.
+Every mistake in a configuration that can be found without starting a simulator is found here, before the
+first episode. Knows nothing of processes or files of results.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from vla_eval.tasks.spec import TaskSpec
 
 
 class GroupKey(NamedTuple):
-    """What the episodes share that one environment object and one policy object can run."""
+    """The key of episodes that one environment object and one policy object can run."""
 
     task: str
     policy: str
@@ -36,7 +36,7 @@ class GroupKey(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Group:
+class EpisodeGroup:
     """Episodes that differ only in run and seed.
 
     Attributes:
@@ -62,12 +62,12 @@ class EpisodeJob:
 
     Attributes:
         group: what it shares with others.
-        run, seed: what tells it apart from them.
+        run, seed: which of them it is.
         slot: where in a worker it runs. Fixed by the plan, since a network that infers for several
             episodes in one pass gives a row the same bits only in the same place.
     """
 
-    group: Group
+    group: EpisodeGroup
     run: int
     seed: int
     slot: int = 0
@@ -80,7 +80,7 @@ class EpisodeJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """All that a run needs to know.
+    """The episodes of a run, and facts about them.
 
     Attributes:
         jobs: every episode, in a fixed order.
@@ -119,7 +119,7 @@ def make_plan(config: EvalConfig) -> Plan:
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
     prompts = load_prompts(config.prompt_set)
-    groups: list[Group] = []
+    groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
         check_arguments(task, config.env, TASKS.values())
@@ -167,9 +167,9 @@ def make_plan(config: EvalConfig) -> Plan:
 
 
 def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
-    """Return the part of a configuration that results depend on; compared when a run is continued."""
+    """Return the part of a configuration that results depend on; compared when a run is resumed."""
     data: dict[str, Any] = to_data(config)
-    if config.slots_per_worker == 1:  # runs of versions that knew nothing else can be continued
+    if config.slots_per_worker == 1:  # so that runs of versions without the field can be resumed
         del data["slots_per_worker"]
     return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
 
@@ -189,7 +189,7 @@ def fingerprint(config: EvalConfig) -> str:
 def _refuse_instruction(config: EvalConfig) -> None:
     if "instruction" in config.env:
         raise RecipeError(
-            "env.instruction: what a policy is told comes from prompt_set. Put the sentence into a file in "
+            "env.instruction: a policy's instruction comes from prompt_set. Put the sentence into a file in "
             "./prompts/ and name that file in prompt_set."
         )
 
@@ -207,14 +207,14 @@ def _refuse_too_many(config: EvalConfig, *, n_groups: int) -> None:
 def _refuse_doubles(kind: str, names: list[str]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise RecipeError(f"{kind}: '{name}' is named twice; records tell them apart by name alone.")
+            raise RecipeError(f"{kind}: '{name}' is named twice; records distinguish them by name alone.")
 
 
 def _groups(
     config: EvalConfig, task: TaskSpec, policy: Recipe[PolicyRecipe], instruction: str
-) -> Iterable[Group]:
+) -> Iterable[EpisodeGroup]:
     for n_action_steps in config.n_action_steps or (policy.value.default_n_action_steps,):
-        yield Group(
+        yield EpisodeGroup(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=policy.value.adapter,
             args=policy.value.args,
@@ -227,7 +227,7 @@ def _groups(
                 n_slots=config.slots_per_worker,
             ),
             rollout=RolloutSettings(
-                chunking=config.chunking.spec(n_action_steps),
+                chunking=config.chunking.at(n_action_steps),
                 eager_rendering=config.eager_rendering,
                 stop_at_success=config.stop_at_success,
             ),

@@ -1,8 +1,8 @@
-"""The inside of a worker process: keep an environment and a policy at hand, run one batch at a time.
+"""The inside of a worker process: keep an environment and a policy, run one batch at a time.
 
-It is told what to run over a pipe, says in shared memory what it is busy with, and writes no file but
-its log and, if asked, recordings of its episodes. After an error it is replaced by a new process: a
-native library or a GPU context may be left in a state that no rebuilding within the process mends.
+It gets its jobs over a pipe and says in shared memory what it is busy with. It writes no file but its log
+and, if asked, videos and rerun files of its episodes. After an error it is replaced by a new process: a
+native library or a GPU context may be left in a state that nothing within the process can repair.
 """
 
 import dataclasses
@@ -20,14 +20,14 @@ from vla_eval.core import EpisodeStart, Policy, SimEnv
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
 from vla_eval.evaluation.job_queue import EpisodeBatch
-from vla_eval.evaluation.plan import EpisodeJob, Group
+from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import policy_factory
 from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
-from vla_eval.viz.recorder import Recorder
+from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
 from vla_eval.workers.messages import DeviceFound, Failed, describe_error
@@ -37,14 +37,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finished:
-    """The episodes of a batch came to their ends; records and timings in the order of its jobs."""
+    """The episodes of a batch are finished; records and timings in the order of its jobs."""
 
     records: tuple[EpisodeRecord, ...]
     timings: tuple[EpisodeTiming, ...]
 
 
 class EnvFacts(NamedTuple):
-    """What a policy is told of an environment before it is made."""
+    """What a policy gets to know of an environment before it is made."""
 
     spec: EnvSpec
     n_candidates: int
@@ -54,10 +54,10 @@ class EpisodeRunner:
     """Runs episodes of one group, keeping environment and policy."""
 
     def __init__(
-        self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None], recorder: Recorder | None = None
+        self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None], capture: EpisodeCapture | None = None
     ) -> None:
         """Start with nothing made."""
-        self._recorder = recorder
+        self._capture = capture
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
@@ -99,15 +99,15 @@ class EpisodeRunner:
             )
             for job in batch.jobs
         ]
-        # Not by the batch: what of it has a result already is not in it. Of these all begin in slot 0.
+        # By the episode of slot 0, even if it has a result already and is not in the batch.
         seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
-        tapes = self._recorder.tapes(batch.jobs) if self._recorder else None
+        tapes = self._capture.tapes(batch.jobs) if self._capture else None
         observers = [tapes] if tapes else []
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
-        # The recipe's name, whatever the adapter calls itself: records are told apart by it.
+        # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
-        if self._recorder and tapes:
-            self._recorder.write(
+        if self._capture and tapes:
+            self._capture.write(
                 batch.jobs, tapes, named, control_hz=env.spec.control_hz, heartbeat=self._heartbeat
             )
         return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
@@ -117,8 +117,8 @@ class EpisodeRunner:
         if self._env is None or self._policy is None:
             facts = self._describe_env(job)
             self._heartbeat("setup")
-            if self._recorder is not None:
-                self._recorder.load()
+            if self._capture is not None:
+                self._capture.load()
             policy = make_policy(group, facts)
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
@@ -128,9 +128,9 @@ class EpisodeRunner:
             return env, policy
         return self._env, self._policy
 
-    def _settings_for(self, group: Group, policy: Policy, facts: EnvFacts) -> EnvSettings:
-        """Return what the policy needs; and what is recorded, of which the loop gives the policy nothing."""
-        if self._recorder is None:
+    def _settings_for(self, group: EpisodeGroup, policy: Policy, facts: EnvFacts) -> EnvSettings:
+        """Return what the policy needs, and what is captured, which the loop does not give to the policy."""
+        if self._capture is None:
             return dataclasses.replace(
                 group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged
             )
@@ -138,7 +138,7 @@ class EpisodeRunner:
             group.env,
             cameras=tuple(camera.name for camera in facts.spec.cameras),
             privileged=True,
-            human_camera_stride=self._recorder.config.frame_stride,
+            human_camera_stride=self._capture.config.frame_stride,
         )
 
     def _describe_env(self, job: EpisodeJob) -> EnvFacts:
@@ -162,7 +162,7 @@ class EpisodeRunner:
         return self._env
 
 
-def make_policy(group: Group, facts: EnvFacts) -> Policy:
+def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
     """Make the policy of a group.
 
     Raises:
@@ -191,9 +191,9 @@ def worker_main(
     connection: Connection,
     shared: SharedStage,
     log: Path,
-    recorder: Recorder | None = None,
+    capture: EpisodeCapture | None = None,
 ) -> None:
     """Run episodes for the parent until it has no more; the entry point of the worker process."""
     detach(log)
     tell = functools.partial(send_message, connection)
-    serve(connection, EpisodeRunner(Heartbeat(shared), tell, recorder))
+    serve(connection, EpisodeRunner(Heartbeat(shared), tell, capture))

@@ -1,4 +1,4 @@
-"""What LeRobot's own commands take from here: importing this package registers it with lerobot.
+"""The plug-in for LeRobot's own commands: importing this package registers it with lerobot.
 
 The environment `mikasa`, and the policies `memory` and `memoryless`.
 

@@ -1,7 +1,7 @@
 """Our tasks as environments of LeRobot: the names its policies expect, an episode per seed.
 
-Knows nothing of policies. `lerobot-eval` renders every step and knows neither errors apart from
-failures nor seeds in its results: for figures, `mikasa-vla eval`.
+Knows nothing of policies. `lerobot-eval` renders every step, counts errors as failures and has
+no seeds in its results. For figures use `mikasa-vla eval`.
 """
 
 import functools
@@ -70,10 +70,10 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         self.task_description = instruction_for(row, prompt_set)
         self._max_episode_steps = int(settings.kwargs.get("horizon_steps", row.horizon_steps))
         self.render_mode = "rgb_array"
-        picture = gym.spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
+        image = gym.spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
         self.observation_space = gym.spaces.Dict(
             {
-                PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), picture)),
+                PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), image)),
                 AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES[state]),), np.float32),
             }
         )
@@ -85,7 +85,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         """Begin the episode of a seed; without one, of the next that follows from the last one given.
 
         Raises:
-            SpecMismatchError: no seed was ever given: nobody could run this episode again.
+            SpecMismatchError: no seed was ever given: the episode could not be reproduced.
         """
         if seed is None and self._np_random is None:
             raise SpecMismatchError(
@@ -115,7 +115,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         )
 
     def render(self) -> NDArray[np.uint8]:
-        """Return the base camera's last picture, (128, 128, 3)."""
+        """Return the base camera's last image, (128, 128, 3)."""
         if self._result is None:
             raise gym.error.ResetNeeded(f"{self.task}: call reset() before render().")
         return self._result.observation.images[next(iter(CAMERA_NAMES))].copy()
@@ -135,17 +135,17 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
 
 
 def _features(state: StateKind) -> dict[str, PolicyFeature]:
-    pictures = {f"{PIXELS}/{name}": IMAGE_SHAPE for name in CAMERA_NAMES.values()}
+    images = {f"{PIXELS}/{name}": IMAGE_SHAPE for name in CAMERA_NAMES.values()}
     return {
         ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
         AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES[state]),)),
-        **{name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name, shape in pictures.items()},
+        **{name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name, shape in images.items()},
     }
 
 
 def _features_map() -> dict[str, str]:
-    pictures = {f"{PIXELS}/{CAMERA_NAMES[camera]}": key for camera, key in CAMERA_KEYS.items()}
-    return {ACTION_KEY: ACTION_KEY, AGENT_POS: STATE_KEY, **pictures}
+    images = {f"{PIXELS}/{CAMERA_NAMES[camera]}": key for camera, key in CAMERA_KEYS.items()}
+    return {ACTION_KEY: ACTION_KEY, AGENT_POS: STATE_KEY, **images}
 
 
 @EnvConfig.register_subclass("mikasa")

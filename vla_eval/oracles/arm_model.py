@@ -1,7 +1,7 @@
-"""How the arm answers to `pd_ee_delta_pose`: enough of a model to plan some steps open loop.
+"""A model of the arm's response to `pd_ee_delta_pose`, good enough to plan some steps open loop.
 
 The controller's target is the *present* pose plus the action, followed by a damped spring, so that a
-constant action ends in a constant speed. Measured with mani_skill 3.0.1 on a Panda: a constant action
+constant action leads to a constant speed. Measured with mani_skill 3.0.1 on a Panda: a constant action
 of 1 moves the tool centre point by 16, 32, 37, 39, 39 … mm per control step.
 """
 
@@ -19,13 +19,13 @@ RESPONSE = 0.7  # share of the gap to the commanded speed closed in one control 
 STEP_SECONDS = 0.05
 FULL_SPEED_M_S = FULL_SPEED_M_PER_STEP / STEP_SECONDS
 FULL_TURN_RAD_PER_STEP = 0.039
-POSITION_GAIN_PER_M = 13.0  # action per metre of distance: half the way per step
+POSITION_GAIN_PER_M = 13.0  # action per metre of distance: half the distance per step
 TURN_GAIN_PER_RAD = 13.0
 GRIPPER_OPEN = 1.0
 GRIPPER_CLOSED = -1.0
 FINGER_LOW_M, FINGER_HIGH_M = -0.01, 0.04  # finger positions at commands -1 and 1
 GRIPPER_MAX_WIDTH_M = 0.08
-FINGER_RESPONSE = 0.5  # share of the way to the commanded width in one control step
+FINGER_RESPONSE = 0.5  # share of the distance to the commanded width in one control step
 GRIPPER_CRADLE = 0.0  # leaves a gap of 3 cm between the fingers
 N_ACTION_DIMS = 7
 
@@ -33,7 +33,7 @@ N_ACTION_DIMS = 7
 class ArmState(NamedTuple):
     """Tool centre point: position (m) and displacement per control step (m), (3,) each, world frame.
 
-    Besides its yaw (rad) and turn per control step (rad) about world z, and the gap between the fingers (m).
+    Also its yaw (rad) and turn per control step (rad) about world z, and the gap between the fingers (m).
     """
 
     position_m: Vector
@@ -67,7 +67,7 @@ def advance_gripper(arm: ArmState, turn: float, gripper: float, *, held_width_m:
         arm: before the step.
         turn: wanted turn in [-1, 1], positive counterclockwise seen from above (`turn_command`).
         gripper: gripper command in [-1, 1].
-        held_width_m: width of what lies between the fingers; they cannot come closer.
+        held_width_m: width of the object between the fingers; they cannot close further.
     """
     turn_rad = arm.turn_rad + RESPONSE * (FULL_TURN_RAD_PER_STEP * turn - arm.turn_rad)
     wanted_m = 2 * (FINGER_LOW_M + (gripper + 1) / 2 * (FINGER_HIGH_M - FINGER_LOW_M))
@@ -80,13 +80,13 @@ def advance_gripper(arm: ArmState, turn: float, gripper: float, *, held_width_m:
 
 
 def towards(goal_m: Vector, arm: ArmState) -> Vector:
-    """Return the (3,) translation that brings the arm to a point: half the way per step, or full speed."""
+    """Return the (3,) translation that moves the arm to a point: half the distance per step, at most 1."""
     translation: Vector = np.clip(POSITION_GAIN_PER_M * (goal_m - arm.position_m), -1, 1)
     return translation
 
 
 def turn_towards(yaw_rad: float, arm: ArmState) -> float:
-    """Return the turn in [-1, 1] that brings the wrist to a yaw; the way round is the caller's affair."""
+    """Return the turn in [-1, 1] that brings the wrist to a yaw; the caller chooses the direction."""
     return float(np.clip(TURN_GAIN_PER_RAD * (yaw_rad - arm.yaw_rad), -1, 1))
 
 
@@ -98,10 +98,10 @@ def wrapped_rad(angle_rad: float, period_rad: float = 2 * np.pi) -> float:
 def action_row(translation: Vector, gripper: float, turn: float = 0.0) -> NDArray[np.float32]:
     """Return the (7,) action with this translation, turn about world z and gripper command.
 
-    ManiSkill multiplies rotations with the lower bound, -0.1 rad: their sign is the other way round.
+    ManiSkill multiplies rotations with the lower bound, -0.1 rad, so their sign is inverted.
     """
     row = np.zeros(N_ACTION_DIMS, dtype=np.float32)
     row[:3] = np.clip(translation, -1, 1)
-    row[5] = 0.0 - np.clip(turn, -1, 1)  # not -0.0 where there is no turn: digests are of bytes
+    row[5] = 0.0 - np.clip(turn, -1, 1)  # not -0.0 if there is no turn: digests are computed from bytes
     row[-1] = gripper
     return row

@@ -1,4 +1,4 @@
-"""Expert for TakeItBack: grasp the cube, draw it onto the disc, draw it back."""
+"""Expert for TakeItBack: grasp the cube, drag it onto the disc, drag it back."""
 
 from dataclasses import dataclass, replace
 
@@ -21,18 +21,18 @@ from vla_eval.task_state import PrivilegedState
 HOVER_M = 0.08
 GRASP_M = 0.02
 CARRY_M = 0.03  # off the table: no friction
-BEHIND_M = 0.010  # so far behind its middle the cube is held: the disc is at the edge of the arm's reach
+BEHIND_M = 0.010  # grasp this far behind the cube's centre: the disc is at the edge of the arm's reach
 
 OVER_M = 0.012
 AT_GRASP_M = 0.008
 CUBE_WIDTH_M = 0.04
 HELD_WIDTH_M = 0.043
 ON_DISC_M = 0.07  # within 8 cm counts
-# The arm freezes where the inverse kinematics finds no pose for the target, up to 10 cm ahead: near the
-# edge of its reach. An arm that stands still is asked for less and less, until it moves again.
+# The arm freezes if the inverse kinematics finds no pose for the target, up to 10 cm ahead, near the
+# edge of its reach. If the arm stands still, the action is reduced step by step until it moves again.
 STALLED_M_S = 0.03
 CAUTION = 0.6
-AIM_M = 0.055  # so near to the disc's middle the cube is brought
+AIM_M = 0.055  # the cube is moved this close to the disc's centre
 BACK_M = 0.02
 IMAGINED_X_M = (-0.05, 0.05)
 IMAGINED_BANDS_Y_M = (-0.1, 0.0, 0.1)
@@ -41,7 +41,7 @@ IMAGINED_BAND_WIDTH_M = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Play:
-    """The model's world: arm, cube, where the cube shall go, and what the law has to remember."""
+    """State of the model: arm, cube, the cube's target, and the controller's internal state."""
 
     arm: ArmState
     cube_m: Vector
@@ -58,17 +58,17 @@ class _Play:
 
 
 class CarryExpert:
-    """One episode's expert; with an imagined home it brings the cube back to that place."""
+    """One episode's expert; with an imagined home it moves the cube back to that position."""
 
     def __init__(self, *, imagined_home_m: Vector | None) -> None:
-        """Take the place to bring the cube back to, if it is not the one seen at the start."""
+        """Store the position to which the cube goes back, if it is not the one observed at the start."""
         self._imagined_home_m = imagined_home_m
         self._was_there = False
         self._closing = False
         self._caution = 1.0
 
     def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
-        """Return (n_actions, 7), planned from this state and from what happened before."""
+        """Return (n_actions, 7), planned from this state and earlier ones."""
         home_m = state.bodies["first_place"].position_m[:2]
         play = _Play(
             arm=gripper_state(state),
@@ -82,13 +82,13 @@ class CarryExpert:
         stalled = play.held and float(np.linalg.norm(state.tcp_velocity_m_s)) < STALLED_M_S
         self._caution = self._caution * CAUTION if stalled else 1.0
         play = replace(play, caution=self._caution)
-        # Only what was seen counts: a model that believes the cube is there would turn round too early.
+        # Use only observed states: by the model alone, the arm would turn back too early.
         self._was_there |= float(np.linalg.norm(play.cube_m - play.goal_m)) < ON_DISC_M
         play = replace(play, was_there=self._was_there)
         rows = []
         for index in range(n_actions):
             play = _decide(play)
-            if index == 0:  # later steps are the model's, not what happened
+            if index == 0:  # later steps are predictions of the model
                 self._closing = play.closing
             translation, gripper = _command(play)
             rows.append(action_row(translation, gripper))
@@ -127,7 +127,7 @@ def _command(play: _Play) -> tuple[Vector, float]:
 
 
 def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
-    """Return the model's world one control step later: what is held moves with the hand."""
+    """Return the model's state one control step later: a held object moves with the hand."""
     arm = advance_gripper(advance(play.arm, translation), 0.0, gripper, held_width_m=CUBE_WIDTH_M)
     moved = (arm.position_m - play.arm.position_m)[:2] if play.held else np.zeros(2)
     return replace(play, arm=arm, cube_m=play.cube_m + moved)
@@ -137,7 +137,7 @@ class CubeCarries:
     """Makes the expert of an episode."""
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> CarryExpert:
-        """Draw the imagined first place now, before anything is seen."""
+        """Draw the imagined first position now, before the first observation."""
         x, band = rng.uniform(*IMAGINED_X_M), IMAGINED_BANDS_Y_M[int(rng.integers(3))]
         home_m = np.array([x, band + rng.uniform(0, IMAGINED_BAND_WIDTH_M)])
         return CarryExpert(imagined_home_m=home_m if imagined else None)

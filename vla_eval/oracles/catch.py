@@ -1,7 +1,7 @@
-"""Expert for InterceptGrab: fly over the ball at its own speed, come down around it, close, stop.
+"""Expert for InterceptGrab: fly over the ball at its own speed, descend around it, close, stop.
 
-The fingers stand in a row along y, the ball rolls along y: a hand at rest would be in its way, a hand
-that moves with the ball is not, for one finger goes before it and one behind.
+The fingers are aligned along y, and the ball rolls along y. A hand at rest would block it. A hand that
+moves with the ball does not: one finger is in front of the ball and one behind.
 """
 
 from dataclasses import dataclass, replace
@@ -36,12 +36,12 @@ BALL_DIAMETER_M = 0.04
 HELD_WIDTH_M = 0.043
 LANE_X_M = (-0.35, -0.05)
 BASE_X_M = -0.615
-MIN_REACH_M = 0.32  # nearer to the base the inverse kinematics finds no pose at the ball's height
+MIN_REACH_M = 0.32  # closer to the base the inverse kinematics finds no pose at the ball's height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Play:
-    """The model's world: arm, ball in the plane of the table, and what the law has to remember."""
+    """State of the model: arm, ball in the plane of the table, and the controller's internal state."""
 
     arm: ArmState
     ball_m: Vector
@@ -56,7 +56,7 @@ class CatchExpert:
     def __init__(
         self, *, meet_y_m: float, nominal_speed_m_s: float, imagined_ball: tuple[Vector, Vector] | None
     ) -> None:
-        """Take where to wait and what to expect, and the imagined ball if the real one is not to be seen."""
+        """Store where to wait and what to expect, and the imagined ball if the real one must not be used."""
         self._meet_y_m = meet_y_m
         self._nominal_speed_m_s = nominal_speed_m_s
         self._imagined_ball = imagined_ball
@@ -97,7 +97,7 @@ class CatchExpert:
 
 
 def _decide(play: _Play) -> _Play:
-    """Go on to the next stage where it is time."""
+    """Switch to the next stage if its condition holds."""
     arm, stage = play.arm, play.stage
     offset = play.ball_m - arm.position_m[:2]
     if stage == "wait" and offset[1] > -START_LEAD_S * play.ball_velocity_m_s[1]:
@@ -112,7 +112,7 @@ def _decide(play: _Play) -> _Play:
 
 
 def _command(play: _Play) -> Vector:
-    """Return the (3,) translation that the law asks for in this stage."""
+    """Return the (3,) translation that the controller commands in this stage."""
     arm = play.arm
     if play.stage == "wait":
         return towards(np.array([*_waiting_place_m(play), HOVER_M]), arm)
@@ -136,7 +136,7 @@ def _waiting_place_m(play: _Play) -> Vector:
 
 
 def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
-    """Return the model's world one control step later: the ball rolls, or moves with the hand."""
+    """Return the model's state one control step later: the ball rolls, or moves with the hand."""
     arm = advance_gripper(advance(play.arm, translation), 0.0, gripper, held_width_m=BALL_DIAMETER_M)
     velocity = arm.step_m[:2] / STEP_SECONDS if play.stage == "stop" else play.ball_velocity_m_s
     return replace(play, arm=arm, ball_m=play.ball_m + velocity * STEP_SECONDS, ball_velocity_m_s=velocity)
@@ -155,7 +155,7 @@ class Catches:
     meet_y_m: float
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> CatchExpert:
-        """Draw the imagined ball now, before anything is seen."""
+        """Draw the imagined ball now, before the first observation."""
         start = np.array([rng.uniform(*LANE_X_M), rng.uniform(*IMAGINED_Y_M)])
         speed = np.array([rng.uniform(*IMAGINED_VELOCITY_X_M_S), rng.uniform(*self.velocity_range_m_s)])
         return CatchExpert(

@@ -1,13 +1,12 @@
 """Expert for Intercept: wait beside the ball's lane, let the ball into the fingers, push it to the goal.
 
-The gripper is left 3 cm open: both fingers stand in a row along y and hold the 4 cm ball like a cradle
-while it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
+The gripper stays 3 cm open. Both fingers are aligned along y and hold the 4 cm ball like a cradle while
+it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
 
-The ball's speed decides where the arm meets it, and how fast it pushes: one row of `CradleTactics` per mode.
+The ball's speed decides where the arm meets it and how fast it pushes: one row of `CradleTactics` per mode.
 
-The law is applied to a model of arm and ball that is advanced step by step, so that it gives one action
-(closed loop) or many (open loop) in the same way; and, for the blind control, to a ball that exists in
-the model only.
+The controller acts on a model of arm and ball that is advanced step by step. So it plans one action
+(closed loop) or many (open loop) in the same way. For the blind control, the ball exists only in the model.
 """
 
 from dataclasses import dataclass, replace
@@ -38,25 +37,25 @@ PUSH_SPEED_RANGE_M_S = (0.2, 0.6)
 TRACK_GAIN_PER_S = 6.0
 SIDE_SPEED_CHANGE_M_S = 0.04  # per control step; a faster change lets the ball slip past a finger
 FOLLOW_LEAD_S = 0.10
-UNSEEN_STEPS = 6  # so long the ball is outside the base camera's view: a nominal one is assumed
+UNSEEN_STEPS = 6  # the ball is outside the base camera's view for so many steps: a nominal ball is assumed
 GOAL_OFFSET_X_M = 0.2
-ROLLING_SHARE = 5 / 7  # of the initial speed that is left once a solid ball rolls without slipping
+ROLLING_SHARE = 5 / 7  # share of the initial speed that remains once a solid ball rolls without slipping
 IMAGINED_Y_M = (-0.9, -0.65)
 IMAGINED_VELOCITY_X_M_S = (0.0, 0.05)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CradleTactics:
-    """What depends on how fast the ball is; called, it makes the expert of an episode.
+    """Parameters that depend on the ball's speed; a call returns the expert of an episode.
 
     Attributes:
         imagined_velocity_y_m_s: range of the initial speed along y, from which the blind arm draws its ball.
         nominal_velocity_m_s: the rolling ball's (x, y) velocity that is assumed while it is out of view.
-        push_speed_m_s: speed along x at which the gap is closed, and by which the meeting place is chosen.
-        meet_y_min_m: farther back than this the arm does not wait.
-        min_reach_m: nor nearer to the base than this, where the inverse kinematics finds few poses so low.
-        aligned_m: the gap is closed once ball and cradle are so near along y. An arm that is hardly faster
-            comes nearer so slowly that both have passed the goal by then.
+        push_speed_m_s: speed along x at which the gap is closed, and from which the meeting point follows.
+        meet_y_min_m: the arm does not wait farther back than this.
+        min_reach_m: nor closer to the base than this, where the inverse kinematics finds few low poses.
+        aligned_m: the gap is closed once ball and cradle are this close along y. An arm that is hardly
+            faster approaches so slowly that both would have passed the goal by then.
     """
 
     imagined_velocity_y_m_s: tuple[float, float]
@@ -67,7 +66,7 @@ class CradleTactics:
     aligned_m: float = 0.006
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> "CradleExpert":
-        """Make an expert; `imagined` makes it play a ball of its own invention, not the real one."""
+        """Make an expert; with `imagined` it acts on a ball that it draws at random, not on the real one."""
         return CradleExpert(self, rng=rng, imagined=imagined)
 
 
@@ -80,11 +79,11 @@ FAST = CradleTactics(imagined_velocity_y_m_s=(0.75, 1.0), nominal_velocity_m_s=(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Play:
-    """The model's world: arm, ball in the plane of the table, and what the law has to remember.
+    """State of the model: arm, ball in the plane of the table, and the controller's internal state.
 
     Attributes:
         stage: `wait` beside the lane, `follow` the ball, `close` the gap, `push`.
-        side_speed_m_s: the speed along y that is being commanded while pushing.
+        side_speed_m_s: the commanded speed along y while pushing.
     """
 
     tactics: CradleTactics
@@ -102,10 +101,10 @@ class _Play:
 
 
 class CradleExpert:
-    """One episode's expert; `imagined` makes it play a ball of its own invention, not the real one."""
+    """One episode's expert; with `imagined` it acts on a ball drawn at random, not on the real one."""
 
     def __init__(self, tactics: CradleTactics, *, rng: np.random.Generator, imagined: bool) -> None:
-        """Draw the imagined ball now, before anything is seen."""
+        """Draw the imagined ball now, before the first observation."""
         self._tactics = tactics
         self._imagined = imagined
         self._stage = "wait"
@@ -152,7 +151,7 @@ class CradleExpert:
         )
 
     def _imagined_ball(self, goal_m: Vector) -> tuple[Vector, Vector]:
-        """Return position and velocity of the imagined ball: the drawn one, or where the model has it."""
+        """Return position and velocity of the imagined ball: as drawn, or as predicted by the model."""
         if self._imagined_play is None:
             start = np.array([goal_m[0] - GOAL_OFFSET_X_M, self._drawn_y_m])
             return start, self._drawn_velocity_m_s * ROLLING_SHARE
@@ -160,7 +159,7 @@ class CradleExpert:
 
 
 def _decide(play: _Play) -> _Play:
-    """Go on to the next stage where it is time."""
+    """Switch to the next stage if its condition holds."""
     tcp = play.arm.position_m
     behind_m = float(play.ball_m[1] - tcp[1])
     stage = play.stage
@@ -174,7 +173,7 @@ def _decide(play: _Play) -> _Play:
 
 
 def _command(play: _Play) -> Vector:
-    """Return the (3,) velocity in m/s that the law asks for in this stage."""
+    """Return the (3,) velocity in m/s that the controller commands in this stage."""
     tcp = play.arm.position_m
     height = POSITION_GAIN_PER_M * (HEIGHT_M - tcp[2]) * FULL_SPEED_M_S
     if play.stage == "wait":
@@ -207,7 +206,7 @@ def _waiting_place_m(play: _Play) -> Vector:
 
 
 def _push_speeds_m_s(play: _Play) -> tuple[float, float]:
-    """Return forward and sideways speed that bring the ball to the goal at the same time."""
+    """Return the forward and sideways speeds with which the ball reaches the goal along both axes at once."""
     to_goal_x, to_goal_y = (float(d) for d in play.goal_m - play.ball_m)
     side = play.side_speed_m_s
     wanted = to_goal_x * side / to_goal_y if abs(to_goal_y) > 1e-6 else PUSH_SPEED_RANGE_M_S[1]
@@ -224,7 +223,7 @@ def _next_side_speed_m_s(play: _Play) -> float:
 
 
 def _advance(play: _Play, translation: Vector) -> _Play:
-    """Return the model's world one control step later: the ball rolls, or moves with the cradle."""
+    """Return the model's state one control step later: the ball rolls, or moves with the cradle."""
     arm = advance(play.arm, translation)
     velocity = play.ball_velocity_m_s
     side_speed = play.side_speed_m_s

@@ -1,4 +1,4 @@
-"""Expert for choices by touch: go over the chosen candidate, then down, and rest just above it."""
+"""Expert for choices by touch: move over the chosen candidate, then down, and rest just above it."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state, towards
 from vla_eval.task_state import PrivilegedState
 
-TOUCH_MARGIN = 1.2  # near enough is 1.2 times the height at which the arm comes to rest
+TOUCH_MARGIN = 1.2  # close enough is 1.2 times the height at which the arm comes to rest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,9 +17,9 @@ class HoverExpert:
 
     Attributes:
         rest_above_m: height over the candidate's centre where the tool centre point comes to rest.
-        over_radius_m: within this horizontal distance the arm goes down.
+        over_radius_m: the arm descends within this horizontal distance.
         travel_above_m: until then it keeps at least this height over the candidate's centre.
-        descend_to_m: and goes down to this height over the table on the way.
+        descend_to_m: on the way it descends to this height over the table.
     """
 
     rest_above_m: float
@@ -28,7 +28,7 @@ class HoverExpert:
     descend_to_m: float
 
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
-        """Return (n_actions, 7) that bring the arm towards a candidate, planned from `state` alone."""
+        """Return (n_actions, 7) that move the arm towards a candidate, planned from `state` alone."""
         centre = state.candidate_positions_m[candidate]
         arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         rows = []
@@ -39,7 +39,7 @@ class HoverExpert:
         return np.stack(rows)
 
     def is_done(self, state: PrivilegedState, candidate: int) -> bool:
-        """Whether the arm has come near enough to a candidate to touch it, if it rests there."""
+        """Whether the arm is close enough to a candidate to touch it, if it rests there."""
         distance_m = np.linalg.norm(state.tcp_position_m - state.candidate_positions_m[candidate])
         return bool(distance_m <= TOUCH_MARGIN * self.rest_above_m)
 

@@ -1,7 +1,7 @@
 """Expert for ShellGamePick: grasp the chosen mug by its handle and lift it.
 
-A mug is wider than the gripper opens, and it stands upside down: only the handle can be grasped. The
-fingers go to either side of it, so the wrist must be turned first.
+A mug is wider than the gripper opens and stands upside down, so only the handle can be grasped. The
+fingers go to both sides of it, so the wrist is turned first.
 """
 
 import math
@@ -33,7 +33,7 @@ ALIGNED_RAD = 0.10
 HANDLE_WIDTH_M = 0.008
 HELD_WIDTH_M = 0.014
 HOLDING_RADIUS_M = 0.11  # a closed hand within this of the mug's centre holds it, however the mug hangs
-OVERSHOOT_M = 0.03  # over the height that is asked for
+OVERSHOOT_M = 0.03  # over the required height
 
 
 class PickExpert:

@@ -1,8 +1,8 @@
-"""Expert for Rotate: grasp the peg by its middle, turn it on the spot.
+"""Expert for Rotate: grasp the peg at its centre and rotate it in place.
 
-The fingers are put across the peg, so that two grasps are possible, half a turn apart; the one with the
-shorter way in all is taken. The wrist turns on the way down. Turning is what takes time: 0.039 rad per
-control step at most.
+The fingers grasp across the peg, so two grasps are possible, half a turn apart. The one with the shorter
+total rotation is used. The wrist already turns during the descent. Turning is the slow part: at most
+0.039 rad per control step.
 """
 
 import math
@@ -26,13 +26,13 @@ from vla_eval.oracles.arm_model import (
 )
 from vla_eval.task_state import PrivilegedState
 
-# Joint 7 stands at π/4 and goes to ±2.9 rad: the wrist can turn farther to the left than to the right.
+# Joint 7 starts at π/4 and its range is ±2.9 rad: the wrist can turn farther to the left than to the right.
 WRIST_RANGE_RAD = (-1.95, 3.4)
 HOVER_M = 0.10
 GRASP_M = 0.022
-OVER_M = 0.015  # the arm goes down within this horizontal distance of the peg's middle,
-DESCEND_RAD = 0.35  # once the fingers are so far aligned: 8 cm between them leave room around 5 cm,
-CLOSE_RAD = 0.12  # and closes once they are so far aligned
+OVER_M = 0.015  # the arm descends within this horizontal distance of the peg's centre,
+DESCEND_RAD = 0.35  # once the fingers are aligned to this angle: 8 cm between them leave room around 5 cm,
+CLOSE_RAD = 0.12  # and closes once they are aligned to this angle
 AT_GRASP_M = 0.008
 DESCENT = (
     0.5  # of full speed: faster, the arm swerves by 1 cm per step, which an open-loop plan cannot correct
@@ -44,10 +44,10 @@ AT_ANGLE_RAD = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Play:
-    """The model's world: arm, peg, and where the peg shall go.
+    """State of the model: arm, peg, and the peg's target.
 
-    `may_descend` is what was seen, not what the model expects: the arm comes down only if it truly stands
-    over the peg when the plan is made. Going there and down in one plan, it would now and then land on it.
+    `may_descend` is observed, not predicted: the arm descends only if it is really over the peg when the
+    plan is made. If it moved there and down in one plan, it would sometimes hit the peg.
     """
 
     arm: ArmState
@@ -61,17 +61,17 @@ class _Play:
 
 
 class TurnExpert:
-    """One episode's expert; `imagined` makes it turn the peg by an angle of its own invention."""
+    """One episode's expert; with `imagined` it turns the peg by an angle drawn at random."""
 
     def __init__(self, *, imagined_angle_rad: float | None) -> None:
-        """Take the angle to turn by, if it is not the one asked for."""
+        """Store the angle to turn by, if it is not the target angle."""
         self._imagined_angle_rad = imagined_angle_rad
         self._goal_yaw_rad: float | None = None
         self._grasp_offset_rad: float | None = None
         self._closing = False
 
     def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
-        """Return (n_actions, 7), planned from this state and from the grasp that was chosen at first."""
+        """Return (n_actions, 7), planned from this state and the grasp chosen at the start."""
         play = self._present(state)
         rows = []
         for index in range(n_actions):
@@ -93,7 +93,7 @@ class TurnExpert:
         if self._grasp_offset_rad is None:
             grasp_yaw_rad = _grasp_yaw_rad(arm.yaw_rad, peg.yaw_rad, left_rad)
             self._grasp_offset_rad = grasp_yaw_rad - peg.yaw_rad
-        # Unwrapped around the wrist's own yaw: the way round was decided with the grasp.
+        # Unwrapped around the wrist's own yaw: the direction was chosen with the grasp.
         wanted_rad = peg.yaw_rad + self._grasp_offset_rad
         play = _Play(
             arm=arm,
@@ -108,7 +108,7 @@ class TurnExpert:
 
 
 def _grasp_yaw_rad(wrist_rad: float, peg_rad: float, left_rad: float) -> float:
-    """Return the wrist's yaw at the grasp that gives the shortest way within the wrist's range."""
+    """Return the wrist's yaw of the grasp with the shortest rotation within the wrist's range."""
     nearest = wrist_rad + wrapped_rad(peg_rad - wrist_rad, math.pi)
     least, most = WRIST_RANGE_RAD
 
@@ -120,7 +120,7 @@ def _grasp_yaw_rad(wrist_rad: float, peg_rad: float, left_rad: float) -> float:
 
 
 def _decide(play: _Play) -> _Play:
-    """Close the fingers, for good, where they stand around the peg."""
+    """Close the fingers, permanently, if they are around the peg."""
     around = _over_m(play) < OVER_M and abs(play.arm.position_m[2] - GRASP_M) < AT_GRASP_M
     aligned = abs(play.grasp_yaw_rad - play.arm.yaw_rad) < CLOSE_RAD
     return replace(play, closing=play.closing or (around and aligned))
@@ -131,7 +131,7 @@ def _over_m(play: _Play) -> float:
 
 
 def _is_over(play: _Play) -> bool:
-    """Whether the fingers would go to either side of the peg, were they to go down."""
+    """Whether the fingers would be on both sides of the peg if they moved down."""
     return _over_m(play) < OVER_M and abs(play.grasp_yaw_rad - play.arm.yaw_rad) < DESCEND_RAD
 
 
@@ -146,7 +146,7 @@ def _command(play: _Play) -> tuple[Vector, float, float]:
             translation[2] = max(translation[2], -DESCENT)
         return translation, turn_towards(play.grasp_yaw_rad, arm), GRIPPER_OPEN
     held = arm.width_m < HELD_WIDTH_M
-    # The middle goes back to where it was, should the grasp have moved it.
+    # Move the centre back to its first position, in case the grasp has moved it.
     shift = (play.goal_m - play.peg_m)[:2] if held else np.zeros(2)
     goal = np.array([*(arm.position_m[:2] + shift), GRASP_M])
     turns = held and abs(play.left_rad) > AT_ANGLE_RAD
@@ -155,7 +155,7 @@ def _command(play: _Play) -> tuple[Vector, float, float]:
 
 
 def _advance(play: _Play, translation: Vector, turn: float, gripper: float) -> _Play:
-    """Return the model's world one control step later: what is held turns and moves with the hand."""
+    """Return the model's state one control step later: a held object turns and moves with the hand."""
     held = play.closing and play.arm.width_m < HELD_WIDTH_M
     arm = advance_gripper(advance(play.arm, translation), turn, gripper, held_width_m=PEG_WIDTH_M)
     if not held:
@@ -177,14 +177,14 @@ class PegTurns:
     """Makes the expert of an episode.
 
     Attributes:
-        angle_range_rad: what the blind arm's angle is drawn from, and `signed` whether it has a sign.
+        angle_range_rad: range from which the blind arm's angle is drawn; `signed`: whether it has a sign.
     """
 
     angle_range_rad: tuple[float, float]
     signed: bool
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> TurnExpert:
-        """Draw the imagined angle now, before anything is seen."""
+        """Draw the imagined angle now, before the first observation."""
         angle_rad = rng.uniform(*self.angle_range_rad)
         sign = -1.0 if self.signed and rng.integers(2) else 1.0
         return TurnExpert(imagined_angle_rad=sign * angle_rad if imagined else None)

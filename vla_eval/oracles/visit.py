@@ -1,8 +1,8 @@
-"""Expert for several cubes: fly low from one to the next, stop over it until it is touched, go on.
+"""Expert for several cubes: move low from one to the next and stop over each until it is touched.
 
-The arm stays one height over the tops of the cubes, so that going from one to the next is one short
-move. At one action per inference it reads from the world what has been touched; at more it predicts it by
-the model of the arm, and goes back to a cube that was not touched after all.
+The arm stays at one height over the tops of the cubes, so moving from one to the next is one short
+motion. With one action per inference it reads from the state which cubes were touched. With more it
+predicts touches with the model of the arm, and returns to a cube that was not touched.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from vla_eval.oracles.arm_model import GRIPPER_OPEN, ArmState, Vector, action_row, advance, arm_state
 from vla_eval.task_state import PrivilegedState
 
-# Action per metre of distance: a third of the way per step. More is a little faster at one action per
-# inference, but the arm swings, and its model then predicts touches badly.
+# Action per metre of distance: a third of the distance per step. A higher gain is a little faster with one
+# action per inference, but the arm oscillates, and the model then predicts touches badly.
 GAIN_PER_M = 9.0
 
 
@@ -24,8 +24,8 @@ class LowFlight:
     """Touches one cube after another.
 
     Attributes:
-        above_top_m: height over a cube's top at which the tool centre point flies and rests.
-        near_m: by the model, a cube is touched within this distance of the resting point …
+        above_top_m: height over a cube's top at which the tool centre point moves and rests.
+        near_m: the model predicts a touch within this distance of the resting point …
         slow_m_per_step: … at no more than this speed.
     """
 
@@ -39,10 +39,10 @@ class LowFlight:
         """Return (n_actions, 7) that touch the wanted candidates.
 
         Args:
-            state: the world as it is.
+            state: the present state.
             wanted: indices of the candidates that have not been touched yet; empty: rest.
             n_actions: how many actions to plan.
-            in_order: touch them in the order given; otherwise always the nearest that is left.
+            in_order: touch them in the given order; otherwise always the nearest remaining one.
         """
         goals = {index: self._resting_point(state.candidate_positions_m[index]) for index in wanted}
         arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)

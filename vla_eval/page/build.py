@@ -1,4 +1,4 @@
-"""Build the report page: one HTML file that needs nothing else. It computes no number.
+"""Build the report page: one self-contained HTML file. It computes no number.
 
 The markup is in `templates/`. Whatever a template is given is escaped, unless it is `Markup`: the drawings of
 `svg.py` and the JSON report.
@@ -64,7 +64,7 @@ def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None 
 
     Args:
         runs: as for `build_page`.
-        folder: it is made if it is not there.
+        folder: created if it does not exist.
         baseline: as for `build_page`.
 
     Raises:
@@ -95,9 +95,9 @@ def _templates() -> Environment:
 
 
 def with_code(text: str) -> Markup:
-    """Return text in which names stand between backticks, as in Markdown, with these set as code."""
+    """Return text with the names in backticks, as in Markdown, set as code."""
     parts = text.split("`")
-    if len(parts) % 2 == 0:  # one of them stands alone: it is no mark
+    if len(parts) % 2 == 0:  # an unpaired backtick is not markup
         return Markup.escape(text)
     code = Markup("<code>{}</code>")
     return Markup().join(code.format(part) if i % 2 else part for i, part in enumerate(parts))

@@ -1,7 +1,7 @@
 """Draw estimates with intervals, and curves, by matplotlib. Knows nothing of runs or policies.
 
-No chart tells series apart by color alone: each has a marker or a dash pattern of its own, and its name in
-words. matplotlib is imported by whoever imports this: only what builds a page does.
+No chart distinguishes series by color alone: each has its own marker or dash pattern, and its name in words.
+This module imports matplotlib, so only code that builds a page imports it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ class Series:
         color: number of the color and of the marker.
         points: in order of x.
         kind: `chance` and `ceiling` are lines of reference, without markers.
-        is_step: y stays as it is until the next x.
+        is_step: y is constant until the next x.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bar:
-    """One line of a forest plot: a rate in [0, 1], its interval, and what it has to be seen against."""
+    """One line of a forest plot: a rate in [0, 1], its interval, and its reference values."""
 
     label: str
     color: int
@@ -86,7 +86,7 @@ def forest(bars: Sequence[Bar], *, title: str, description: str) -> Chart:
     Args:
         bars: from the top; a rate of None is said in words.
         title: of the plot.
-        description: what it shows, for those who do not see it.
+        description: what it shows, for screen readers.
     """
     labels = [_printable(bar.label) for bar in bars]
     with own_style():
@@ -120,7 +120,7 @@ def curves(
     Args:
         series: at least one point in all.
         title: of the plot.
-        description: what it shows, for those who do not see it.
+        description: what it shows, for screen readers.
         x_title: what x is, with its unit.
         x_ticks: in increasing order; the first and the last are the ends of the axis.
     """
@@ -137,7 +137,7 @@ def curves(
 
 
 def sign(color: int, *, is_line: bool) -> Markup:
-    """Return a line, or a marker, as it stands for a series."""
+    """Return the line or marker of a series, for a legend."""
     if is_line:
         return _sign([0.04, 0.96], color=_color(color), linestyle=(0, _dashes(color)))
     shape, size = MARKERS[color % len(MARKERS)]
@@ -215,5 +215,5 @@ def _dashes(number: int) -> tuple[float, ...] | None:
 
 
 def _printable(text: str) -> str:
-    """Return text with a sign for each character that no XML can hold, such as a control character."""
+    """Return text in which characters that XML cannot hold, such as control characters, are replaced."""
     return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

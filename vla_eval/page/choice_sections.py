@@ -1,11 +1,11 @@
-"""What the page shows of choices: what was right, what was chosen, and what went wrong."""
+"""The page's section on choices: targets, first choices and causes of failure."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
 from vla_eval.page.tables import UNKNOWN, Column, PageTable
-from vla_eval.results.choices import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
 from vla_eval.tasks.item_names import item_names
 
 TITLES: dict[Cause, str] = {
@@ -36,7 +36,7 @@ class Explanation(NamedTuple):
 
 
 class MatrixCell(NamedTuple):
-    """How many episodes, how dark (0 to 1), and whether target and choice are the same."""
+    """The number of episodes, the opacity (0 to 1), and whether target and choice are the same."""
 
     n_episodes: int
     opacity: float
@@ -60,7 +60,7 @@ class Choices:
     Attributes:
         explanations: of the causes.
         table: episodes by cause.
-        missing: what the records do not say.
+        missing: notes on what the records lack.
         matrices: by the name of each row.
     """
 
@@ -108,13 +108,15 @@ def _missing(reports: list[ChoiceReport]) -> tuple[str, ...]:
     said = []
     if not all(report.reach_is_known for report in reports):
         said.append(
-            "Some records (of an earlier version) do not say how far the arm went: there, “could not move” "
-            "cannot be distinguished from “never chose”."
+            "Some records (of an earlier version) do not say how far the arm moved. For them, “could not "
+            "move” cannot be distinguished from “never chose”."
         )
     if any(not report.confusion["place"] and report.confusion["item"] for report in reports):
-        said.append("Some records do not say where the candidates lay: there, no habit of place can be seen.")
+        said.append(
+            "Some records do not say where the candidates were. For them, no habit of place can be found."
+        )
     if any(not report.confusion["item"] for report in reports):
-        said.append("Where several candidates are right at once there is no single target, and no matrix.")
+        said.append("If several candidates are right, there is no single target and no matrix.")
     return tuple(said)
 
 

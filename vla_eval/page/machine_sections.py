@@ -1,4 +1,4 @@
-"""What the page shows of time, errors, recordings and how to reproduce a run."""
+"""The page's sections on time, errors, videos and how to reproduce a run."""
 
 import base64
 import json
@@ -10,27 +10,27 @@ from typing import NamedTuple
 from vla_eval.page.material import Material, errors_of
 from vla_eval.page.tables import UNKNOWN, PageTable, page_table
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.recording_files import thumbnail_file, video_file
+from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.timings import measure_latency
 from vla_eval.tasks.item_names import item_names
 
 MAX_SHOWN_VIDEOS = 12
-MAX_VIDEO_BYTES = 16_000_000  # all of them together: a page is to be opened, and sent by mail
+MAX_VIDEO_BYTES = 16_000_000  # in total: a page has to open fast and fit into a mail
 MAX_MESSAGE = 400  # characters of an error's message
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LatencyTable:
-    """How long inferences took; `n_unknown` rows have no timing. No table if none has."""
+    """Times of inferences; `n_unknown` rows have no timing. No table if none has."""
 
     table: PageTable | None
     n_unknown: int
 
 
 def latency(material: Material) -> LatencyTable:
-    """Return how long inferences took, by run, task, policy and K."""
+    """Return times of inferences by run, task, policy and K."""
     rows, n_unknown = [], 0
     for run in material.runs:
         results = [record for record in run.records if record.outcome != "error"]
@@ -72,7 +72,7 @@ def errors_table(material: Material) -> PageTable | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Video:
-    """A recorded episode: video and thumbnail as `data:` URIs, and what is seen in them."""
+    """A captured episode: video and thumbnail as `data:` URIs, and what is seen in them."""
 
     name: str
     src: str
@@ -81,51 +81,51 @@ class Video:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Videos:
-    """The videos that have room in the page, of `n_recorded` in `folders`."""
+    """The videos that fit into the page, of `n_captured` in `folders`."""
 
     shown: tuple[Video, ...]
-    n_recorded: int
+    n_captured: int
     folders: str
 
 
-class _Recorded(NamedTuple):
+class _Captured(NamedTuple):
     run: StoredRun
     record: EpisodeRecord
     video: Path
 
 
 def videos(material: Material) -> Videos:
-    """Pick videos: one of each row and outcome in turn, until there is no more room."""
-    recorded = [
-        _Recorded(run, record, video_file(run.path, record))
+    """Select videos: one of each row and outcome in turn, until the page is full."""
+    captured = [
+        _Captured(run, record, video_file(run.path, record))
         for run in material.runs
         for record in run.records
         if video_file(run.path, record).is_file()
     ]
     shown: list[Video] = []
     n_bytes = 0
-    for one in _in_turn(recorded):
+    for one in _in_turn(captured):
         size = one.video.stat().st_size
         if len(shown) < MAX_SHOWN_VIDEOS and n_bytes + size <= MAX_VIDEO_BYTES:
             shown.append(_video(one))
             n_bytes += size
-    folders = ", ".join(dict.fromkeys(str(one.video.parent) for one in recorded))
-    return Videos(shown=tuple(shown), n_recorded=len(recorded), folders=folders)
+    folders = ", ".join(dict.fromkeys(str(one.video.parent) for one in captured))
+    return Videos(shown=tuple(shown), n_captured=len(captured), folders=folders)
 
 
-def _in_turn(recorded: list[_Recorded]) -> list[_Recorded]:
+def _in_turn(captured: list[_Captured]) -> list[_Captured]:
     """Return the first of each row and outcome, then the second of each, and so on."""
     seen: Counter[tuple[object, ...]] = Counter()
     ranks = []
-    for one in recorded:
+    for one in captured:
         kind = (*one.record.key[:3], one.record.outcome)
         ranks.append(seen[kind])
         seen[kind] += 1
-    order = sorted(range(len(recorded)), key=lambda i: ranks[i])
-    return [recorded[i] for i in order]
+    order = sorted(range(len(captured)), key=lambda i: ranks[i])
+    return [captured[i] for i in order]
 
 
-def _video(one: _Recorded) -> Video:
+def _video(one: _Captured) -> Video:
     record = one.record
     name = (
         f"{record.task} · {record.policy} · K={record.n_action_steps} · seed {record.seed}: {record.outcome}"

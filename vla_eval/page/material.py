@@ -1,4 +1,4 @@
-"""Gather, once, what the sections of the report page speak of. Computes nothing that is not in results."""
+"""Gather, once, the data of the report page's sections. Computes nothing that is not in results."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,22 +6,22 @@ from dataclasses import dataclass
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.results.comparison import compare_with_baseline, count_pairs
 from vla_eval.results.estimates import PairCounts
-from vla_eval.results.grouping import Grouping, RowGroup, RowKey, group_runs
+from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey, group_runs
 from vla_eval.results.report import build_table
-from vla_eval.results.table import Row, Table
+from vla_eval.results.success_table import Row, Table
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.timings import read_timings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """What a page is made of.
+    """The data of a page.
 
     Attributes:
         runs: each run folder once.
         table: as `mikasa-vla report` prints it.
         grouping: the episodes of each of its rows.
-        pairs: the counts behind each comparison with the baseline.
+        pairs: the counts of each comparison with the baseline.
         timings: run folder -> episode -> seconds.
         colors: policy -> number of its colour and marker, the same in every plot.
     """
@@ -42,12 +42,12 @@ class Material:
         """Return the rows of a task."""
         return [row for row in self.table.rows if row.task == task]
 
-    def group_of(self, row: Row) -> RowGroup:
+    def group_of(self, row: Row) -> RowEpisodes:
         """Return the episodes of a row."""
         return self.grouping.groups[key_of(row)]
 
     def name_of(self, row: Row, *, with_task: bool = False) -> str:
-        """Return what a row is called within its task: policy, K, and its variant if there are several."""
+        """Return the name of a row within its task: policy, K, and its variant if there are several."""
         parts = [row.task] if with_task else []
         parts += [row.policy, f"K={row.n_action_steps}"]
         return " · ".join([*parts, row.variant] if row.variant else parts)
@@ -59,7 +59,7 @@ def key_of(row: Row) -> RowKey:
 
 
 def gather(runs: Sequence[StoredRun], *, baseline: str | None) -> Material:
-    """Read and compute all that the page shows.
+    """Read and compute everything that the page shows.
 
     Args:
         runs: what the run folders hold; a folder given twice counts once.

@@ -1,4 +1,4 @@
-"""What the page shows of success: the table, by task, by K, paired, and over time."""
+"""The page's sections on success: the table, by task, by K, paired, and over time."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -21,9 +21,9 @@ from vla_eval.page.charts import (
 )
 from vla_eval.page.material import Material, key_of
 from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
+from vla_eval.results.success_table import Row
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
-from vla_eval.results.table import Row
 from vla_eval.results.table_formats import table_cells
 
 N_STEP_TICKS = 5
@@ -46,7 +46,7 @@ class Plots:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """The table of `mikasa-vla compare`; where there is none, `refusal` says why."""
+    """The table of `mikasa-vla compare`; if there is none, `refusal` says why."""
 
     table: PageTable | None
     notes: tuple[str, ...] = ()
@@ -150,7 +150,7 @@ def paired_table(material: Material) -> PageTable | None:
 
 
 def steps_plots(material: Material) -> Plots:
-    """Draw how soon success comes: the share of episodes that have succeeded by each step."""
+    """Draw the time to success: the share of episodes that have succeeded by each step."""
     charts: list[Chart] = []
     colors: dict[str, int] = {}
     for task, size, variant in _settings(material):

@@ -1,8 +1,8 @@
-"""Turn a matplotlib figure into SVG that stands in a page. Knows nothing of what is drawn.
+"""Turn a matplotlib figure into SVG for use inside a page. Knows nothing of what is drawn.
 
-matplotlib draws for a file of its own: with fixed colors, a style sheet for all of the document, and ids
-that two figures of one page would share. Here colors become the page's variables, so that dark mode and
-print apply, and what a figure defines is written where it is used.
+matplotlib writes stand-alone files: with fixed colors, a style sheet for the whole document, and ids that
+two figures of one page would share. Here colors become the page's variables, so that dark mode and printing
+work, and definitions are inlined where they are used.
 """
 
 import io
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
-# Variables of page.css with their light values: a color of a figure stands for the variable.
+# Variables of page.css with their light values: a color of a figure is replaced by the variable.
 PALETTE: Mapping[str, str] = MappingProxyType(
     {
         "c0": "#0072b2",
@@ -42,7 +42,7 @@ FONT_SIZE_PX = 12
 _RC = {
     "svg.fonttype": "none",  # text stays text: a tenth of the size, and in the reader's font
     "svg.hashsalt": "vla_eval",  # the same figure gives the same bytes
-    "text.parse_math": False,  # a name with two dollars is no formula
+    "text.parse_math": False,  # a name with two dollar signs is not a formula
     "font.size": FONT_SIZE_PX,
     "figure.dpi": 72,  # a point is a pixel
     "text.color": PALETTE["ink"],
@@ -66,12 +66,12 @@ _NUMBER = re.compile(r"-?\d+\.\d+")
 
 
 def own_style() -> AbstractContextManager[None]:
-    """Return a context in which figures are made and drawn: ours, whatever matplotlibrc says."""
+    """Return a context with our style for making and drawing figures, regardless of matplotlibrc."""
     return matplotlib.style.context(_RC, after_reset=True)
 
 
 def text_width_px(text: str) -> float:
-    """Return how wide a label is in matplotlib's font, which is wider than those of most systems."""
+    """Return the width of a label in matplotlib's font, which is wider than those of most systems."""
     font = FontProperties(size=FONT_SIZE_PX)
     with _missing_glyphs_allowed():
         return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
@@ -82,7 +82,7 @@ def inline_svg(figure: Figure, *, label: str | None) -> Markup:
 
     Args:
         figure: its colors are of `PALETTE`; nothing in it reaches beyond its axes.
-        label: what it shows, for those who do not see it; None for a decoration.
+        label: what it shows, for screen readers; None for a decoration.
     """
     file = io.StringIO()
     with _missing_glyphs_allowed():
@@ -100,7 +100,7 @@ def inline_svg(figure: Figure, *, label: str | None) -> Markup:
 def _parts(
     node: ElementTree.Element, shapes: Mapping[str, ElementTree.Element]
 ) -> Iterator[ElementTree.Element]:
-    """Yield what is drawn within an element, without ids, definitions and empty layers."""
+    """Yield the drawn content of an element, without ids, definitions and empty layers."""
     for child in node:
         tag = child.tag.rpartition("}")[2]
         if tag == "g":
@@ -125,7 +125,7 @@ def _drawn(node: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 
 def _used(node: ElementTree.Element, shapes: Mapping[str, ElementTree.Element]) -> ElementTree.Element:
-    """Return a copy of the shape that is used, where it is used."""
+    """Return a copy of the referenced shape, at the place of the reference."""
     href = next(value for name, value in node.attrib.items() if name.endswith("href"))
     shape = _drawn(shapes[href.removeprefix("#")], "path")
     shape.set("transform", f"translate({_rounded(node.attrib['x'])} {_rounded(node.attrib['y'])})")
@@ -146,5 +146,5 @@ def _rounded(numbers: str) -> str:
 
 
 def _missing_glyphs_allowed() -> AbstractContextManager[None]:
-    """Return a context without matplotlib's warnings of glyphs: the browser has fonts of its own."""
+    """Return a context without matplotlib's warnings about glyphs: the browser has its own fonts."""
     return warnings.catch_warnings(action="ignore", category=UserWarning)

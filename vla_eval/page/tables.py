@@ -11,7 +11,7 @@ ColumnKind = Literal["text", "number", "code"]
 
 
 class Column(NamedTuple):
-    """A column: its title, and how its cells are set."""
+    """A column: its title, and the style of its cells."""
 
     title: str
     kind: ColumnKind = "text"
@@ -30,8 +30,8 @@ class PageTable:
     Attributes:
         columns: at least one.
         rows: the cells of each row, as many as there are columns.
-        caption: what the table is, for those who cannot see what surrounds it.
-        row_data: for each row what it is made of, as JSON; empty if nobody asks.
+        caption: what the table shows, for screen readers.
+        row_data: for each row its data as JSON; may be empty.
     """
 
     columns: tuple[Column, ...]
@@ -48,7 +48,7 @@ def page_table(
     code: Sequence[str] = (),
     caption: str | None = None,
 ) -> PageTable:
-    """Return a table whose columns of text come first, then numbers, then code, by their titles."""
+    """Return a table with columns of text first, then numbers, then code, by their titles."""
     return PageTable(
         columns=(
             *(Column(title) for title in text),

@@ -1,4 +1,4 @@
-"""The one reader of a checkpoint's JSON, which somebody else wrote. Standard library only.
+"""The one reader of a checkpoint's JSON, which others wrote. Standard library only.
 
 It returns plain data, as strict as `strict_json` makes it. Whoever reads a field says which type it has,
 with the functions below.

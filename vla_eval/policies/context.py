@@ -1,4 +1,4 @@
-"""What a policy adapter is told when it is made: the one signature all adapters share."""
+"""What a policy adapter gets when it is made: the one signature all adapters share."""
 
 from dataclasses import dataclass
 

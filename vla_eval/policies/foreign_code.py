@@ -49,7 +49,7 @@ def no_foreign_code(kind: str) -> Iterator[None]:
         for name in CALLS_IT:
             if name in sys.modules:  # one that is imported later takes over what stands in `loading`
                 stack.enter_context(patch.object(sys.modules[name], RUNS_CODE, _refuse))
-        stack.enter_context(patch.object(loading, "TIME_OUT_REMOTE_CODE", 0))  # nobody is asked, either
+        stack.enter_context(patch.object(loading, "TIME_OUT_REMOTE_CODE", 0))  # the user is not asked, either
         stack.enter_context(patch.object(kernels, "_kernels_available", False))  # compiled code of the Hub
         for name, function in CLASSES_BY_NAME.items():
             module: Any = importlib.import_module(f"transformers.models.auto.{name}")

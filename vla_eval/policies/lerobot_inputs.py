@@ -19,8 +19,7 @@ from vla_eval.policies.checkpoint import TrainingFacts
 from vla_eval.specs import EnvSpec
 
 ACTION_KEY = "action"
-RENAME_STEP = "rename_observations_processor"
-MAX_UNIT = 1.0 + 1e-3  # statistics of pictures in [0, 1]; those of 0 … 255 are far beyond
+MAX_UNIT = 1.0 + 1e-3  # statistics of images in [0, 1]; those of 0 … 255 are far beyond
 MAX_FOV_DIFFERENCE_RAD = 1e-4
 STATES = ("tcp_pose", "qpos", "qvel")  # what `proprioception` is computed from
 
@@ -54,7 +53,7 @@ class InputOptions:
 
     Attributes:
         cameras: camera of the environment -> field of the dataset.
-        state: which proprioception; None: told by the number of its dimensions.
+        state: which proprioception; None: the one with that number of dimensions.
         absent_cameras: fields of the policy that are left out on purpose; only for policies that mask them.
     """
 

@@ -78,7 +78,7 @@ def register_steps(cls: type) -> None:
 def tokenizer_overrides(
     folder: Path, config: Any, steps: Sequence[str], *, tokenizer: str | None
 ) -> dict[str, dict[str, Any]]:
-    """Return what the steps of a saved preprocessor that make tokens are to be told, by their names.
+    """Return what the steps of a saved preprocessor that make tokens need as settings, by their names.
 
     Args:
         folder: of the checkpoint.

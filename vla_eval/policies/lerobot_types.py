@@ -1,7 +1,7 @@
-"""What the loop has to know of a type of LeRobot policy, told by its configuration.
+"""What the loop has to know of a type of LeRobot policy, read from its configuration.
 
 Types of lerobot's own that are not understood from their configuration alone stand in the tables here; a
-policy of one's own says the same by attributes of its configuration.
+policy of your own says the same by attributes of its configuration.
 """
 
 from typing import Any  # lerobot is untyped
@@ -9,7 +9,7 @@ from typing import Any  # lerobot is untyped
 from vla_eval.errors import SpecMismatchError
 
 DETERMINISTIC = frozenset({"act"})
-"""Types that draw nothing at inference; a policy of one's own says so by `draws_nothing = True`."""
+"""Types that draw nothing at inference; a policy of your own says so by `draws_nothing = True`."""
 
 COLLECTS_FRAMES = "its `predict_action_chunk` reads the frames that its own `select_action` collected"
 CANNOT_BE_ASKED_FOR_CHUNKS = {
@@ -42,7 +42,7 @@ def chunk_size(config: Any) -> int:
 def noise_shape(config: Any) -> tuple[int, int] | None:
     """Return the shape of one episode's noise for policies that take it from outside; None for others.
 
-    A policy of one's own says it by `noise_shape` of its configuration.
+    A policy of your own says it by `noise_shape` of its configuration.
     """
     own = getattr(config, "noise_shape", None)
     if own is not None:

@@ -4,8 +4,8 @@ The switches act around a trained policy: its weights, prompt and normalisation 
 
 - `gripper_sign`: the predicted gripper g is executed as -sign(2 g - 1), so that +1 (open) closes.
 - `last_k_queue`: of a chunk longer than `n_action_steps` the **last** actions are executed.
-- `jpeg`: pictures go through JPEG at quality 95, which those of the training did not. PIL's encoder
-  stands for TensorFlow's; on a harsh picture the two differ by up to 19 of 255 levels.
+- `jpeg`: images go through JPEG at quality 95, which those of the training did not. PIL's encoder
+  stands for TensorFlow's; on a harsh image the two differ by up to 19 of 255 levels.
 
 Source: https://github.com/CognitiveAISystems/MIKASA-Robo, branch `openvla` at commit 528086e,
 experiments/robot/mikasa/run_mikasa_eval.py lines 253-263 and 299-331, experiments/robot/openvla_utils.py
@@ -78,7 +78,7 @@ def make_openvla(
     """Make an OpenVLA from a checkpoint of ours; `args` are those of the adapter `lerobot`.
 
     Args:
-        context: what every adapter is told.
+        context: what every adapter is given.
         paper_compat: which switches are on.
         args: of `make_lerobot`.
 
@@ -103,7 +103,7 @@ def _compressed(frame: Observation) -> Observation:
 
 
 def jpeg_round_trip(image: ImageArray) -> ImageArray:
-    """Return a picture (H, W, 3) uint8 as JPEG leaves it."""
+    """Return an image (H, W, 3) uint8 as JPEG leaves it."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=JPEG_QUALITY)
     with Image.open(io.BytesIO(buffer.getvalue())) as decoded:

@@ -25,7 +25,6 @@ PolicyFactory = Callable[..., Policy]
 """`make_x(context: PolicyContext, **args) -> Policy`; `args` come from the policy's recipe."""
 
 POLICY_GROUP = "vla_eval.policies"
-TASK_GROUP = "vla_eval.tasks"  # reserved: tasks of other packages
 
 POLICIES = {
     "random": "vla_eval.policies.scripted:make_random",
@@ -43,6 +42,7 @@ POLICIES = {
 
 _TARGET = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 _NO_ADAPTERS = frozenset({*sys.stdlib_module_names, *sys.builtin_module_names, "__main__"})
+_OWN_ADAPTERS = ("vla_eval.policies.", "vla_eval.testing.")  # the rest of this package holds none
 
 
 def policy_adapters() -> dict[str, str]:
@@ -117,9 +117,11 @@ def _target(adapter: str) -> tuple[str, str]:
             f"'my_pkg.policy:make'."
         )
     module_name, _, attribute = target.partition(":")
-    if module_name.partition(".")[0] in _NO_ADAPTERS:
+    root = module_name.partition(".")[0]
+    if root in _NO_ADAPTERS or (root == "vla_eval" and not module_name.startswith(_OWN_ADAPTERS)):
+        owner = "this package" if root == "vla_eval" else "Python itself"
         raise UnknownNameError(
-            f"policy adapter '{adapter}': {module_name} is a module of Python itself and holds no policies. "
+            f"policy adapter '{adapter}': {module_name} is a module of {owner} and holds no policies. "
             f"Name a module of yours, for example 'my_pkg.policy:make'."
         )
     return module_name, attribute

@@ -118,7 +118,7 @@ def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> Non
 
     Args:
         step: for messages.
-        config: those of its settings that nobody overrides.
+        config: those of its settings that are not overridden.
         folder: of the checkpoint.
 
     Raises:

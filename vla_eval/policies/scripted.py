@@ -1,10 +1,10 @@
 """Controls: policies without a model, against which a learned one is measured.
 
-- `random`: uniform in the action space. Says how often one succeeds by flailing, which is hardly ever.
+- `random`: uniform in the action space. The floor: how often random motion succeeds, which is hardly ever.
 - `hold`: moves nothing, keeps the gripper's width.
 - `oracle`: the privileged expert: the ceiling at this chunk length.
 - `cue_blind`: the same arm, not knowing the cue: what a perfect arm without memory gets (chance).
-- `tour`: the same arm begins with a random candidate and goes on to the nearest that is left, without
+- `tour`: the same arm begins with a random candidate and continues with the nearest that is left, without
   ever knowing which one is right: what can be had by searching.
 
 The last three see the true state of the world, but not the answer before the choice can be made, and
@@ -19,21 +19,21 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
-from vla_eval.policies.choices import CandidateExpert, ChoicePolicy, Mode, VisitExpert, VisitPolicy
+from vla_eval.policies.candidate_controls import CandidateExpert, ChoicePolicy, Mode, VisitExpert, VisitPolicy
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 from vla_eval.task_state import PrivilegedState
 
 
 class BallExpert(Protocol):
-    """Plays a rolling ball; one object per episode."""
+    """Meets a rolling ball; one object per episode."""
 
     def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7)."""
 
 
 class BallExpertFactory(Protocol):
-    """Makes a ball expert; with `imagined` it plays a ball drawn from `rng` instead of the real one."""
+    """Makes a ball expert; with `imagined` it meets a ball drawn from `rng` instead of the real one."""
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> BallExpert:
         """Make one for a new episode."""
@@ -61,12 +61,11 @@ class HoldPolicy(ScriptedPolicy):
 
 
 class BallPolicy(ScriptedPolicy):
-    """Plays the ball with the expert; blind, it plays a ball that it imagines."""
+    """Meets the ball with the expert; the blind one meets a ball that it imagines."""
 
     privileged = True
 
     def __init__(self, context: PolicyContext, make_expert: BallExpertFactory, *, imagined: bool) -> None:
-        """Take the expert of the task's family."""
         super().__init__(context)
         self._make_expert = make_expert
         self._imagined = imagined

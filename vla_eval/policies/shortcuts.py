@@ -1,4 +1,4 @@
-"""Controls that succeed without a memory of their own: they show by which road a task can be won.
+"""Controls that succeed without a memory of their own: they show which shortcuts a task leaves open.
 
 - `body_memory`: while the cue is there, it closes the gripper to a width that stands for the right
   candidate; afterwards it reads the width back from its proprioception, and holds it. It keeps nothing
@@ -8,9 +8,9 @@
 - `cue_touch`: goes to the place where the cue is shown as soon as the episode begins, and stays there. It
   wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
   answer: over the ball of a shell game, where it goes down on the mug that it finds nearest.
-- `one_frame`: plays a rolling ball with the oracle's law, but begins anew at each inference, and is told
-  where the ball is, not how fast it rolls. It supposes the mean speed of the task; beside the ball, which
-  it has followed to be there, the speed of its own arm. So any policy that reads the last frame and its
+- `one_frame`: meets a rolling ball with the oracle's controller, but keeps nothing between inferences, and
+  sees where the ball is, not how fast it rolls. It assumes the mean speed of the task; beside the ball,
+  which it followed to get there, the speed of its own arm. So any policy that reads the last frame and its
   joints' speeds could do the same.
 """
 
@@ -25,7 +25,7 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
-from vla_eval.policies.choices import CandidateExpert
+from vla_eval.policies.candidate_controls import CandidateExpert
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import BallExpertFactory
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
@@ -39,7 +39,6 @@ class BodyMemoryPolicy(ScriptedPolicy):
     privileged = True
 
     def __init__(self, context: PolicyContext, expert: CandidateExpert) -> None:
-        """Take the expert of the task's family."""
         super().__init__(context)
         self._expert = expert
         # The first candidate is the open gripper, as it is when an episode begins.
@@ -93,7 +92,7 @@ class CueTouchPolicy(ScriptedPolicy):
         self._marks_place = task_spec(context.env.task).cue_marks_place
 
     def act(self, window: ObservationWindow) -> ActionChunk:
-        """Go on to the place of the cue, or rest there."""
+        """Continue to the place of the cue, or rest there."""
         state = self.privileged_state(window)
         if not self._marks_place:
             there = replace(state, candidate_positions_m=np.array([CUE_PLACE_M]))
@@ -170,8 +169,8 @@ def make_one_frame(context: PolicyContext) -> OneFramePolicy:
     task = task_spec(context.env.task)
     if "velocity_range_m_s" not in task.kwargs:
         raise SpecMismatchError(
-            f"policy '{context.name}' plays a ball without being told its speed; in {context.env.task} "
-            "no ball rolls. Leave this task out for this policy."
+            f"policy '{context.name}' meets a ball without knowing its speed; in {context.env.task} no "
+            "ball rolls. Leave this task out for this policy."
         )
     expert = cast(BallExpertFactory, task_expert(context))
     return OneFramePolicy(context, expert, task.kwargs["velocity_range_m_s"])

@@ -1,6 +1,6 @@
 """Check a LeRobot checkpoint by using it: weights, statistics, and one chunk of finite actions.
 
-Knows nothing of tasks: whether the actions are any good is what an evaluation tells.
+Knows nothing of tasks: whether the actions are any good is for an evaluation to measure.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Verified:
 
 
 def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
-    """Load a checkpoint strictly and let it act once on random pictures.
+    """Load a checkpoint strictly and let it act once on random images.
 
     Raises:
         CheckpointError: weights, processors or statistics are not complete.

@@ -27,7 +27,7 @@ def put_weights(
         where: the file, for messages.
         cast: whether floating point types may differ, because the user chose another precision.
         may_be_new: beginnings of names; all tensors of one of them may be missing together and then stay
-            as the constructor made them: a head that fine-tuning begins anew.
+            as the constructor made them: a head that is new in fine-tuning.
 
     Raises:
         CheckpointError: keys are missing or unexpected, or shapes or types differ.

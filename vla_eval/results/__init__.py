@@ -1,1 +1,1 @@
-"""Records of episodes, the run folder they live in, and what can be said from them."""
+"""Statistics and tables from the records of run folders."""

@@ -1,20 +1,20 @@
-"""The footnote that says by which roads a table's tasks can be won without remembering."""
+"""The footnote that names the shortcuts by which a table's tasks can be won without remembering."""
 
 from collections.abc import Mapping, Sequence
 
-from vla_eval.results.shipped_audit import Protocol, Verdict, protocol_of, shipped_verdicts
+from vla_eval.results.shipped_audit import AuditProtocol, Verdict, protocol_of, shipped_verdicts
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
-RULES: Mapping[Protocol, str] = {"paper": "the paper's rule", "strict": "the strict rule"}
+RULES: Mapping[AuditProtocol, str] = {"paper": "the paper's rule", "strict": "the strict rule"}
 
 
 def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
     """Quote the shipped audit for the tasks of runs, one note per set of rules.
 
-    Tasks with arguments, of another version than the audited one, or faked, are not spoken of.
+    Tasks with arguments, in another version than the audited one, or on the fake simulator are skipped.
     """
-    found: dict[Protocol, dict[str, Verdict]] = {}
+    found: dict[AuditProtocol, dict[str, Verdict]] = {}
     for run in runs:
         config = run.description.config
         env = config.get("env") or {}
@@ -28,7 +28,7 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
     return [_note(protocol, found[protocol]) for protocol in RULES if protocol in found]
 
 
-def _note(protocol: Protocol, verdicts: Mapping[str, Verdict]) -> str:
+def _note(protocol: AuditProtocol, verdicts: Mapping[str, Verdict]) -> str:
     tasks_of: dict[tuple[str, ...], list[str]] = {}
     for task, verdict in verdicts.items():
         tasks_of.setdefault(verdict.words, []).append(task)
@@ -36,5 +36,5 @@ def _note(protocol: Protocol, verdicts: Mapping[str, Verdict]) -> str:
     n_episodes = min(verdict.n_episodes for verdict in verdicts.values())
     return (
         f"shortcut audit under {RULES[protocol]}, {n_episodes} episodes per control: {said} (docs/audit.md; "
-        "`mikasa-vla audit` plays it again)."
+        "`mikasa-vla audit` runs it again)."
     )

@@ -1,4 +1,4 @@
-"""Write names and notes so that nothing in them acts: no formula, no markup, no second line.
+"""Escape names and notes: no formula, no markup, no second line.
 
 Knows nothing of tables.
 """
@@ -8,13 +8,14 @@ import re
 from vla_eval.errors import one_line
 
 FORMULA_SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n")
-"""What a spreadsheet takes a cell for a formula by. Source: https://owasp.org/www-community/attacks/CSV_Injection"""
+"""First characters of a cell that a spreadsheet reads as a formula. Source: https://owasp.org/www-community/attacks/CSV_Injection"""
 
-_TAG = re.compile(r"<(?=[A-Za-z/!?])")  # how Markdown finds raw HTML; `p<0.001` is none
+_LINK = re.compile(r"\](?=[(\[:])")  # `[0.4, 0.6]` is not a link
+_TAG = re.compile(r"<(?=[A-Za-z/!?])")  # how Markdown finds raw HTML; `p<0.001` is not HTML
 
 
 def csv_cell(value: object) -> object:
-    """Return a value for a row of CSV: text that a spreadsheet would calculate is quoted with `'`."""
+    """Return a value for a row of CSV: text that a spreadsheet would evaluate is prefixed with `'`."""
     if not isinstance(value, str):
         return value
     is_formula = value.startswith(FORMULA_SIGNS) and not _is_number(value)
@@ -22,13 +23,35 @@ def csv_cell(value: object) -> object:
 
 
 def markdown_text(text: str) -> str:
-    """Return one line of Markdown in which no HTML begins."""
+    """Return one line of Markdown without HTML, for our own sentences around names."""
     return _TAG.sub("&lt;", one_line(text))
 
 
 def markdown_cell(text: str) -> str:
     """Return a cell of a Markdown table."""
-    return markdown_text(text).replace("\\", "\\\\").replace("|", "\\|")
+    escaped = markdown_text(text).replace("\\", "\\\\")
+    for sign in "|`*":
+        escaped = escaped.replace(sign, f"\\{sign}")
+    return _LINK.sub(r"\\]", escaped)
+
+
+def markdown_code(text: str) -> str:
+    """Return a code span of Markdown, for a cell too: a text of backticks cannot end it."""
+    line = one_line(text).replace("|", "\\|")
+    fence = "`" * (_longest_run(line) + 1)
+    space = " " if "`" in line else ""
+    return f"{fence}{space}{line}{space}{fence}"
+
+
+def markdown_block(text: str, language: str) -> str:
+    """Return a fenced block of Markdown that nothing in the text can end."""
+    fence = "`" * max(3, _longest_run(text) + 1)
+    end = "" if text.endswith("\n") else "\n"
+    return f"{fence}{language}\n{text}{end}{fence}"
+
+
+def _longest_run(text: str) -> int:
+    return max((len(run) for run in re.findall("`+", text)), default=0)
 
 
 def _is_number(text: str) -> bool:

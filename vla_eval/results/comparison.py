@@ -14,8 +14,8 @@ from vla_eval.results.estimates import (
     mcnemar_exact,
     wilson_interval,
 )
-from vla_eval.results.grouping import RowGroup, RowKey, Run
-from vla_eval.results.table import ChanceSource, IntervalKind
+from vla_eval.results.grouping import RowEpisodes, RowKey, Run
+from vla_eval.results.success_table import ChanceSource, IntervalKind
 from vla_eval.tasks.catalog import find_task
 
 CHANCE_POLICY = "cue_blind"
@@ -25,7 +25,7 @@ TOUR_POLICY = "tour"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """What one row's own episodes say; everything is None without a result."""
+    """Estimates from one row's own episodes; everything is None without a result."""
 
     n_runs: int
     n_success_once: int | None = None
@@ -54,18 +54,18 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chance:
-    """Success without memory, and where the figure is from; the interval if it was measured."""
+    """Success without memory, and its source; the interval if it was measured."""
 
     rate: float
     source: ChanceSource
     interval: Interval | None = None
 
 
-def measure(group: RowGroup) -> Measured:
+def measure(group: RowEpisodes) -> Measured:
     """Estimate all rates of a row.
 
-    Rates of several runs are means of the run means. Where these are all equal, a t interval would
-    have no width, as if nothing were left unknown: then the episodes of one run give the interval.
+    Rates of several runs are means of the run means. If these are all equal, a t interval would have zero
+    width, as if there were no uncertainty; then the episodes of one run give the interval.
     """
     runs = [run for run in group.runs if run.results]
     estimate = estimate_runs([_n_success(run.results.values()) / len(run.results) for run in runs])
@@ -96,7 +96,7 @@ def measure(group: RowGroup) -> Measured:
     )
 
 
-def compare_with_baseline(groups: Mapping[RowKey, RowGroup], baseline: str) -> dict[RowKey, Comparison]:
+def compare_with_baseline(groups: Mapping[RowKey, RowEpisodes], baseline: str) -> dict[RowKey, Comparison]:
     """Compare every other policy with the baseline, on the same task, variant, run and seed.
 
     Args:
@@ -120,12 +120,12 @@ def compare_with_baseline(groups: Mapping[RowKey, RowGroup], baseline: str) -> d
 
 
 def chance_of(
-    key: RowKey, groups: Mapping[RowKey, RowGroup], measured: Mapping[RowKey, Measured]
+    key: RowKey, groups: Mapping[RowKey, RowEpisodes], measured: Mapping[RowKey, Measured]
 ) -> Chance | None:
-    """Return what a policy without memory gets where this row was measured.
+    """Return the success of a policy without memory in the setting of this row.
 
-    The cue-blind arm on the same task, variant and `n_action_steps`, if it was run; else what the records
-    or the catalogue say (1/N for N candidates); None where there is no choice among candidates.
+    It is that of the cue-blind arm on the same task, variant and `n_action_steps`, if it was run; otherwise
+    the value of the records or the catalogue (1/N for N candidates); None if there are no candidates.
     """
     cue_blind = measured.get(key._replace(policy=CHANCE_POLICY))
     if cue_blind is not None and cue_blind.success_once is not None:
@@ -139,7 +139,7 @@ def chance_of(
     by_luck = {record.chance_success for record in records if record.chance_success is not None}
     if len(by_luck) == 1:
         return Chance(rate=by_luck.pop(), source="1/N")
-    # Records of earlier versions do not say; their tasks had one right candidate.
+    # Records of earlier versions do not have it; their tasks had one right candidate.
     n_candidates = {record.n_candidates for record in records if record.n_candidates}
     if len(n_candidates) == 1:
         return Chance(rate=1 / n_candidates.pop(), source="1/N")
@@ -155,8 +155,8 @@ def ceiling_of(key: RowKey, measured: Mapping[RowKey, Measured]) -> float | None
     return oracle.success_once if oracle is not None else None
 
 
-def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowGroup], baseline: str) -> RowGroup | None:
-    """Return the baseline's row to compare with: at the same `n_action_steps`, or at the only other."""
+def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: str) -> RowEpisodes | None:
+    """Return the baseline's row to compare with: at the same `n_action_steps`, or at the only other one."""
     if key.policy == baseline:
         return None
     same = groups.get(key._replace(policy=baseline))
@@ -170,7 +170,7 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowGroup], baseline: str) 
     return others[0] if len(others) == 1 else None
 
 
-def count_pairs(group: RowGroup, other: RowGroup) -> PairCounts:
+def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
     """Count the outcomes of two rows on the same run and seed."""
     counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
     others = {(run.index, run.copy): run.results for run in other.runs}
@@ -182,7 +182,7 @@ def count_pairs(group: RowGroup, other: RowGroup) -> PairCounts:
                 continue
             first, second = record.trajectory_sha256, partner[seed].trajectory_sha256
             if first is not None and second is not None:
-                # Two deterministic policies give the same pair in every run; it is one observation.
+                # Two deterministic policies give the same pair in every run; this is one observation.
                 if (seed, first, second) in seen:
                     continue
                 seen.add((seed, first, second))
@@ -206,7 +206,7 @@ def _mean_over_runs(runs: Sequence[Run], value: Callable[[EpisodeRecord], float 
 def _rate(records: Iterable[EpisodeRecord], value: Callable[[EpisodeRecord], float | None]) -> float | None:
     """Return the mean of a value; None if any record has none.
 
-    Leaving those out would bias it: with `stop_at_success`, success_at_end is known of failures only.
+    Excluding those would bias it: with `stop_at_success`, success_at_end is known for failures only.
     """
     values = [value(record) for record in records]
     known = [float(item) for item in values if item is not None]

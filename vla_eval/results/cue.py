@@ -1,9 +1,9 @@
-"""How many frames of the cue a policy was given: by the phases, and by when it looks. Knows no simulator."""
+"""How many frames of the cue a policy got, from the phases and its inferences. Knows no simulator."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from vla_eval.results.grouping import RowGroup
+from vla_eval.results.grouping import RowEpisodes
 from vla_eval.tasks.catalog import find_task
 from vla_eval.tasks.spec import total_cue_steps
 
@@ -11,28 +11,28 @@ DEFAULT_CUE_STEPS = 5  # `cue_steps` of `MemoryTableEnv` and of the fake simulat
 
 
 class CueFrames(NamedTuple):
-    """Frames of the cue that were given to the policy, the fewest and the most over the episodes."""
+    """Frames of the cue that the policy got, minimum and maximum over the episodes."""
 
     fewest: int
     most: int
 
     def __str__(self) -> str:
-        """Return `2`, or `2-3` where the cue's length is drawn per episode."""
+        """Return `2`, or `2-3` if the cue's length is drawn per episode."""
         return str(self.most) if self.fewest == self.most else f"{self.fewest}-{self.most}"
 
 
-def cue_frames(group: RowGroup, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
-    """Return how many frames that show the cue a row's policy was given per episode.
+def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
+    """Return how many frames of the cue a row's policy got per episode.
 
-    The observation at step s shows the cue if s < cue_steps. A policy that reads the last frame is given
-    those at steps 0, K, 2K, …; one that reads every frame is given them all, before it answers.
+    The observation at step s shows the cue if s < cue_steps. A policy that reads the last frame gets those
+    at steps 0, K, 2K, …; one that reads every frame gets all of them before it predicts.
 
     Args:
-        group: the row; its records tell whether the policy was given each frame.
+        group: the row; its records show whether the policy got every frame.
         env: the arguments of the task.
 
     Returns:
-        None for a task without a cue phase, and where nothing was rendered for the policy to be told.
+        None for a task without a cue phase, and if nothing was rendered for the policy.
     """
     spec = find_task(group.key.task)
     if spec is None or spec.candidates is None or not group.results:
@@ -46,9 +46,9 @@ def cue_frames(group: RowGroup, env: Mapping[str, Any]) -> CueFrames | None:  # 
     if _reads_every_frame(group):
         return CueFrames(fewest, most)
     k = group.key.n_action_steps
-    return CueFrames(-(-fewest // k), -(-most // k))  # rounded up: step 0 is always looked at
+    return CueFrames(-(-fewest // k), -(-most // k))  # rounded up: there is always an inference at step 0
 
 
-def _reads_every_frame(group: RowGroup) -> bool:
-    """Whether more observations were given to the policy than it was asked for chunks."""
+def _reads_every_frame(group: RowEpisodes) -> bool:
+    """Whether the policy got more observations than there were inferences."""
     return any((r.n_frames or 0) > (r.n_inferences or 0) for r in group.results)

@@ -1,6 +1,6 @@
-"""What can be said from counts: intervals, paired tests, corrections. Pure functions of numbers.
+"""Estimates from counts: intervals, paired tests, corrections. Pure functions of numbers.
 
-What is undefined is None, never 0. Knows nothing of episodes, tasks or files.
+An undefined value is None, never 0. Knows nothing of episodes, tasks or files.
 """
 
 import math
@@ -25,9 +25,9 @@ class PairCounts(NamedTuple):
 
     Attributes:
         both: both succeeded.
-        only_first: the first did, the second did not.
-        only_second: the second did, the first did not.
-        neither: none did.
+        only_first: only the first succeeded.
+        only_second: only the second succeeded.
+        neither: none succeeded.
     """
 
     both: int
@@ -37,7 +37,7 @@ class PairCounts(NamedTuple):
 
     @property
     def n_pairs(self) -> int:
-        """How many pairs there are."""
+        """The number of pairs."""
         return sum(self)
 
 
@@ -58,11 +58,11 @@ class RunsEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedTest:
-    """How two policies differ on the same episodes: first minus second.
+    """The difference of two policies on the same episodes: first minus second.
 
     Attributes:
         difference: difference of the success rates over the pairs.
-        n_pairs: how many pairs there are.
+        n_pairs: number of pairs.
         p_value: two-sided exact McNemar test.
     """
 
@@ -75,8 +75,8 @@ def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
     """Return the Wilson score interval of a proportion, at 95 %.
 
     Args:
-        n_success: how many succeeded, 0 to `n_episodes`.
-        n_episodes: how many there are; with 0 the interval is undefined.
+        n_success: number of successes, 0 to `n_episodes`.
+        n_episodes: number of episodes; with 0 the interval is undefined.
 
     Source: Wilson 1927, JASA 22(158):209-212; recommended for small n by Brown, Cai & DasGupta 2001,
     Statistical Science 16(2):101-133. Computed by scipy.stats.binomtest.
@@ -102,7 +102,7 @@ def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
     mean = math.fsum(run_means) / n_runs
     if n_runs == 1:
         return RunsEstimate(mean=mean, sem=None, interval=None)
-    if min(run_means) == max(run_means):  # exactly, where rounding would leave a spread of 1e-17
+    if min(run_means) == max(run_means):  # exact, because rounding would give a spread of 1e-17
         return RunsEstimate(mean=run_means[0], sem=0.0, interval=Interval(run_means[0], run_means[0]))
     sem = float(stats.sem(run_means))
     half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, n_runs - 1)) * sem
@@ -113,8 +113,8 @@ def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
 def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     """Compare two policies on the same episodes.
 
-    Only the pairs in which they differ say anything: if neither policy were better, each of these would
-    be a fair coin. Without any such pair p is 1.
+    Only the pairs in which they differ are informative: if neither policy were better, each of these would
+    be the toss of a fair coin. Without any such pair p is 1.
 
     Args:
         counts: the pairs; without a pair the test is undefined.
@@ -131,12 +131,12 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
 
 
 def p_above(n_success: int, n_episodes: int, rate: float) -> float:
-    """Return how likely so many successes, or more, are at a given success rate.
+    """Return the probability of at least this many successes at a given success rate.
 
     Args:
-        n_success: how many succeeded, 0 to `n_episodes`.
-        n_episodes: how many there are; without one, nothing speaks against any rate: 1.
-        rate: the success rate that is doubted, in [0, 1].
+        n_success: number of successes, 0 to `n_episodes`.
+        n_episodes: number of episodes; with 0 the probability is 1.
+        rate: the success rate under the null hypothesis, in [0, 1].
 
     Source: one-sided exact binomial test, computed by scipy.stats.binomtest.
     """
@@ -146,7 +146,7 @@ def p_above(n_success: int, n_episodes: int, rate: float) -> float:
 
 
 def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
-    """Return how likely the first is so much ahead of the second, or more, if both are equally good.
+    """Return the probability that the first is at least this far ahead if both are equally good.
 
     Args:
         first: successes and episodes.
@@ -159,36 +159,36 @@ def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
-    """Return p values corrected for how many there are, in the same order.
+    """Return p values corrected for multiple comparisons, in the same order.
 
     Args:
-        p_values: uncorrected p values of all comparisons that are looked at together.
+        p_values: uncorrected p values of all comparisons that are reported together.
 
-    Source: Holm 1979, Scandinavian Journal of Statistics 6(2):65-70: keeps the chance of any false
+    Source: Holm 1979, Scandinavian Journal of Statistics 6(2):65-70: keeps the probability of any false
     positive among them below the level, whatever their dependence. Computed by statsmodels.
     """
     if len(p_values) < 2:
         return tuple(p_values)
-    # Not at the top: it pulls in pandas, which a report with nothing to compare need not wait for.
+    # Not at the top: it imports pandas, which a report without comparisons does not need.
     from statsmodels.stats.multitest import multipletests
 
     return tuple(float(p) for p in multipletests(p_values, method="holm")[1])
 
 
 def chance_corrected(score: float | None, *, chance: float | None, ceiling: float | None) -> float | None:
-    """Return where a score lies between chance (0) and ceiling (1); below chance it is negative.
+    """Return a score relative to chance (0) and ceiling (1); below chance it is negative.
 
     Args:
         score: success rate.
         chance: success rate without memory.
-        ceiling: success rate of the expert that sees everything.
+        ceiling: success rate of the expert, which sees the full state.
 
     Returns:
-        `(score - chance) / (ceiling - chance)`, or None if anything is missing or there is no room
-        between chance and ceiling.
+        `(score - chance) / (ceiling - chance)`, or None if a value is missing or the ceiling is not above
+        chance.
 
     Source: the form of Cohen's kappa (1960, Educational and Psychological Measurement 20:37-46), with
-    the measured ceiling in the place of 1.
+    the measured ceiling instead of 1.
     """
     if score is None or chance is None or ceiling is None or ceiling <= chance:
         return None

@@ -1,6 +1,6 @@
 """Sort the episodes of several run folders into the rows of one table.
 
-Nothing that differs in its settings is put together, and no episode is counted twice. Knows nothing of
+Episodes with different settings are never combined, and no episode is counted twice. Knows nothing of
 statistics.
 """
 
@@ -16,18 +16,18 @@ from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 
 VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", "simulator", "sim_backend")
-"""Fields of a configuration that move success rates and are no part of an episode's key."""
+"""Fields of a configuration that affect success rates and are not part of an episode's key."""
 
 POLICY_NAMES = "policy_names"  # the policies' names in records, in the configuration of a run
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
-PROMPTS = "prompts/"  # recipes of which the names begin so hold the instructions
-WEIGHTS = "checkpoints/"  # recipes of which the names begin so are the weights of a policy
+PROMPTS = "prompts/"  # recipes whose names have this prefix hold the instructions
+WEIGHTS = "checkpoints/"  # recipes whose names have this prefix are the weights of a policy
 DIGITS = 8
 DEFAULT = "default"
 
 
 class RowKey(NamedTuple):
-    """What the episodes of a row share."""
+    """The key that all episodes of a row share."""
 
     task: str
     policy: str
@@ -40,9 +40,9 @@ class Run:
     """One independent run of a row.
 
     Attributes:
-        index: the run index that its records carry.
-        copy: 0, or 1, 2 … where further run folders hold the same episodes with other trajectories, or of
-            other weights.
+        index: the run index of its records.
+        copy: 0, or 1, 2 … if further run folders hold the same episodes with other trajectories or other
+            weights.
         records: seed -> record.
     """
 
@@ -52,12 +52,12 @@ class Run:
 
     @property
     def results(self) -> dict[int, EpisodeRecord]:
-        """Return seed -> record of all episodes that are no error."""
+        """Return seed -> record of all episodes that are not errors."""
         return {seed: record for seed, record in self.records.items() if record.outcome != "error"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RowGroup:
+class RowEpisodes:
     """The episodes of one row."""
 
     key: RowKey
@@ -65,12 +65,12 @@ class RowGroup:
 
     @property
     def results(self) -> list[EpisodeRecord]:
-        """Return all records that are no error."""
+        """Return all records that are not errors."""
         return [record for run in self.runs for record in run.results.values()]
 
     @property
     def n_errors(self) -> int:
-        """How many episodes have no result."""
+        """The number of episodes without a result."""
         return sum(len(run.records) - len(run.results) for run in self.runs)
 
 
@@ -80,11 +80,11 @@ class Grouping:
 
     Attributes:
         groups: by key.
-        n_doubles: run folder -> how many of its episodes had been in another folder already.
+        n_doubles: run folder -> number of its episodes that an earlier folder already had.
         further: run folders that hold the episodes of another folder with other trajectories or weights.
     """
 
-    groups: Mapping[RowKey, RowGroup]
+    groups: Mapping[RowKey, RowEpisodes]
     n_doubles: Mapping[str, int]
     further: tuple[str, ...]
 
@@ -118,7 +118,7 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
                 n_doubles[str(stored.path)] += len(records) - n_new
             if 0 < n_copies < len(copies):
                 further[str(stored.path)] = None
-    groups = [RowGroup(key=key, runs=_runs(by_index)) for key, by_index in found.items()]
+    groups = [RowEpisodes(key=key, runs=_runs(by_index)) for key, by_index in found.items()]
     return Grouping(
         groups={group.key: group for group in _in_order(groups, runs)},
         n_doubles=dict(n_doubles),
@@ -138,7 +138,7 @@ def _by_run(
 
 
 def _weights(stored: StoredRun, policy: str) -> frozenset[tuple[str, str]]:
-    """Return the digests of a policy's weights; none for a policy without."""
+    """Return the digests of a policy's weights; none for a policy without weights."""
     name = f"{WEIGHTS}{policy}"
     recipes = stored.description.recipes.items()
     return frozenset((key, digest) for key, digest in recipes if key == name or key.startswith(f"{name}/"))
@@ -153,11 +153,11 @@ def _runs(by_index: Mapping[int, Sequence[_Copy]]) -> tuple[Run, ...]:
 
 
 def _place(copies: list[_Copy], found: _Copy) -> int:
-    """Put one folder's episodes of one run where they belong; return how many were new.
+    """Add one folder's episodes of one run to the right run; return how many were new.
 
-    They belong to a run that is known already if its policy had the same weights and they do not contradict
-    it (the seeds of one run may be spread over folders, and one folder may be a copy of another); else they
-    are a further run.
+    They belong to a known run if its policy had the same weights and they do not contradict it (the seeds
+    of one run may be split over folders, and one folder may be a copy of another). Otherwise they are a
+    further run.
     """
     own = found.records
     alike = [copy.records for copy in copies if copy.weights == found.weights]
@@ -184,8 +184,8 @@ def _belongs(known: Mapping[int, EpisodeRecord], own: Mapping[int, EpisodeRecord
     same = [seed for seed in shared if _is_same(known[seed], own[seed])]
     if len(same) == len(shared):
         return True
-    # A copy of a folder that was continued has results where the other one has errors. Without any
-    # result in common it is another run, whose errors must not vanish behind this one's results.
+    # A copy of a folder that was resumed has results where the other one has errors. Without any common
+    # result it is another run, whose errors must not be hidden by this one's results.
     one_is_error = all(
         "error" in (known[seed].outcome, own[seed].outcome) for seed in shared if seed not in same
     )
@@ -193,17 +193,17 @@ def _belongs(known: Mapping[int, EpisodeRecord], own: Mapping[int, EpisodeRecord
 
 
 def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
-    """Whether two records with the same key are one episode seen twice."""
+    """Whether two records with the same key are the same episode."""
     if "error" in (one.outcome, other.outcome):
         return one == other
     return one.trajectory_sha256 is not None and one.trajectory_sha256 == other.trajectory_sha256
 
 
 def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
-    """Return for each run: task -> what sets its settings apart, None if nothing does.
+    """Return for each run: task -> the settings that differ, None if none do.
 
     Args:
-        runs: all runs of the table; only values that are not the same in all of them are named.
+        runs: all runs of the table; only values that differ between them are named.
     """
     settings = [_settings(run) for run in runs]
     names = sorted({name for values in settings for name in values})
@@ -226,7 +226,7 @@ def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
 def _settings(run: StoredRun) -> dict[str, str]:
     chosen = {name: run.description.config[name] for name in VARIANT_FIELDS if name in run.description.config}
     settings = {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
-    # A policy with other weights may be one more training run; another sentence is another question.
+    # Other weights of a policy may be another training run; another instruction is another variant.
     prompts = {name: digest for name, digest in run.description.recipes.items() if name.startswith(PROMPTS)}
     return settings | {name: digest[:DIGITS] for name, digest in prompts.items()}
 
@@ -239,7 +239,7 @@ def _task_version(run: StoredRun, task: str) -> object:
 def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     """Return the tasks or policies of a run's configuration, as its records name them."""
     config = run.description.config
-    # A checkpoint is given as a folder; what its records are called is known once it has been looked at.
+    # A checkpoint is given as a folder; its name in records is known once it has been read.
     names = config.get(POLICY_NAMES) if field == "policies" else None
     names = config.get(field) if names is None else names
     if isinstance(names, str) or not isinstance(names, Sequence):
@@ -247,7 +247,7 @@ def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     return tuple(bare_name(str(name)) for name in names)
 
 
-def _in_order(groups: Iterable[RowGroup], runs: Sequence[StoredRun]) -> list[RowGroup]:
+def _in_order(groups: Iterable[RowEpisodes], runs: Sequence[StoredRun]) -> list[RowEpisodes]:
     tasks = _ranks(
         *(config_names(run, "tasks") for run in runs), (r.task for run in runs for r in run.records)
     )

@@ -1,4 +1,4 @@
-"""The footnotes of a table: what its figures are, and what a reader could otherwise be misled by."""
+"""The footnotes of a table: how its values are computed, and where they could mislead a reader."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
 from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
-from vla_eval.results.table import Row
+from vla_eval.results.success_table import Row
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
@@ -17,8 +17,8 @@ RENDERER = "device.render_"
 VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
 
-class Group(NamedTuple):
-    """What a configuration asks for episodes of; without `n_action_steps`: the policy's default."""
+class PlannedRow(NamedTuple):
+    """A group of episodes in a configuration; without `n_action_steps`: the policy's default."""
 
     task: str
     policy: str
@@ -31,7 +31,7 @@ class Group(NamedTuple):
 
 
 def row_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Say what the rows' own figures are, and where they mislead."""
+    """Return the notes on the rows' own values, and where they mislead."""
     return [
         *_interval_notes(rows),
         *_chance_notes(rows),
@@ -55,8 +55,8 @@ def _interval_notes(rows: Sequence[Row]) -> list[str]:
     if without_spread:
         notes.append(
             f"SEM is exactly 0 for {_names(_shown(row) for row in without_spread)}: all runs have the same "
-            "rate. Scripted deterministic controls have no spread over runs, and more runs of them add "
-            "nothing. The interval there is Wilson's over the episodes of one run."
+            "rate. Scripted deterministic controls do not vary between runs, and more runs of them add "
+            "nothing. Their interval is Wilson's over the episodes of one run."
         )
     return notes
 
@@ -73,8 +73,8 @@ def comparison_notes(
     ]
     if any(row.n_runs > 1 and row.n_pairs for row in rows):
         notes.append(
-            "p takes pairs of several runs as independent: it speaks of these trained policies, not of "
-            "training them again; for that, look at the interval over the runs."
+            "p treats pairs of several runs as independent: it describes these trained policies, not "
+            "training them again; for that, use the interval over the runs."
         )
     other_k = [
         f"{_shown(row)} against K={row.baseline_n_action_steps}"
@@ -87,7 +87,7 @@ def comparison_notes(
 
 
 def _chance_notes(rows: Sequence[Row]) -> list[str]:
-    """Say where the chance figures are from."""
+    """Return the notes on the source of chance."""
     notes = []
     if any(row.chance_source == "cue_blind" for row in rows):
         notes.append("chance: `cue_blind` as measured on the same task at the same n_action_steps.")
@@ -101,14 +101,14 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
     )
     if missing:
         notes.append(
-            f"chance is unknown for {_names(missing)}: there it has to be measured; run `cue_blind` at the "
+            f"chance is unknown for {_names(missing)}: it has to be measured there; run `cue_blind` at the "
             "same n_action_steps."
         )
     return notes
 
 
 def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Warn where chance was measured on so few episodes that it says little, as in a run that goes on."""
+    """Warn if chance was measured on too few episodes to be precise, as in a run that is in progress."""
     vague = []
     for row in rows:
         chance = chances[_key(row)]
@@ -118,13 +118,13 @@ def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None])
     if not vague:
         return []
     return [
-        f"chance says little for {_names(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
+        f"chance is imprecise for {_names(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
         "interval in brackets). The corrected score is computed from it."
     ]
 
 
 def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Warn where success can be reached by searching instead of remembering."""
+    """Warn if success can be reached by searching instead of remembering."""
     notes = []
     for row in rows:
         chance = chances[_key(row)]
@@ -135,13 +135,13 @@ def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) ->
             notes.append(
                 f"{_place(row)}: `tour` reaches {row.success_once:.2f} where chance is {chance.rate:.2f}. "
                 "Success there can be reached by touching one candidate after another and is not by itself "
-                "evidence of memory; look at the first choice."
+                "evidence of memory; use the first choice."
             )
     return notes
 
 
 def _error_notes(rows: Sequence[Row]) -> list[str]:
-    """Say what an error is, if there are any."""
+    """Return the note on errors, if there are any."""
     n_errors = sum(row.n_errors for row in rows)
     if not n_errors:
         return []
@@ -152,7 +152,7 @@ def _error_notes(rows: Sequence[Row]) -> list[str]:
 
 
 def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
-    """Say what is particular about the run folders."""
+    """Return the notes on the run folders."""
     notes = [(str(run.path), note) for run in runs for note in _no_evidence(run)]
     doubles = "with the same trajectory as in another run folder; each is counted once."
     notes += [(path, f"{_number(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
@@ -169,7 +169,7 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
 
 
 def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
-    """Say once what holds for many folders; a few are named one by one."""
+    """Return one note for many folders; a few are named individually."""
     paths_of: dict[str, list[str]] = {}
     for path, note in notes:
         paths_of.setdefault(note, []).append(path)
@@ -183,13 +183,13 @@ def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _no_evidence(run: StoredRun) -> list[str]:
-    """Name what makes the figures of a run worthless, or impossible to make again."""
+    """Return the notes on what makes the results of a run meaningless or impossible to reproduce."""
     notes = []
     if run.description.config.get("simulator") == "fake":
         notes.append("made with the fake simulator, which has no physics; its rates mean nothing.")
     source = run.description.environment.get("vla_eval")
     if isinstance(source, Mapping) and source.get("changes") is not None:
-        notes.append("made with uncommitted changes to the package; the commit does not tell them.")
+        notes.append("made with uncommitted changes to the package, which the commit does not contain.")
     return notes
 
 
@@ -198,31 +198,31 @@ def _incomplete(run: StoredRun) -> list[str]:
     n_episodes, n_runs = config.get("episodes"), config.get("runs", 1)
     if not isinstance(n_episodes, int) or not isinstance(n_runs, int):
         return []
-    there: Counter[Group] = Counter(Group(r.task, r.policy, r.n_action_steps) for r in run.records)
+    there: Counter[PlannedRow] = Counter(PlannedRow(r.task, r.policy, r.n_action_steps) for r in run.records)
     expected = n_episodes * n_runs
     missing = {group: there[group] for group in _planned(run, there) if there[group] < expected}
     if not missing:
         return []
     parts = (f"{group}: {n} of {expected}" for group, n in missing.items())
     return [
-        f"{run.path} is incomplete (episodes there, of how many): {_names(parts)}. Run the same command "
-        "again to go on."
+        f"{run.path} is incomplete (episodes done, of how many): {_names(parts)}. Run the same command "
+        "again to resume."
     ]
 
 
-def _planned(run: StoredRun, there: Mapping[Group, int]) -> list[Group]:
-    """Return all groups that have episodes, and those that the configuration names and that have none."""
+def _planned(run: StoredRun, there: Mapping[PlannedRow, int]) -> list[PlannedRow]:
+    """Return all groups that have episodes, and those of the configuration that have none."""
     steps = run.description.config.get("n_action_steps")
     begun_pairs = {(group.task, group.policy) for group in there}
     begun_policies = {group.policy for group in there}
-    named: list[Group] = []
+    named: list[PlannedRow] = []
     for task, policy in product(config_names(run, "tasks"), config_names(run, "policies")):
         if (task, policy) not in begun_pairs and policy in begun_policies and _has_no_candidates(task):
-            continue  # a policy that needs candidates is left out there; nothing is missing
+            continue  # a policy that needs candidates is skipped there; nothing is missing
         if isinstance(steps, Sequence) and not isinstance(steps, str):
-            named += [Group(task, policy, k) for k in steps if isinstance(k, int)]
+            named += [PlannedRow(task, policy, k) for k in steps if isinstance(k, int)]
         elif (task, policy) not in begun_pairs:
-            named.append(Group(task, policy, None))
+            named.append(PlannedRow(task, policy, None))
     return list(dict.fromkeys((*named, *there)))
 
 
@@ -236,7 +236,7 @@ def _continued_elsewhere(run: StoredRun) -> list[str]:
     if not changed:
         return []
     return [
-        f"{run.path} was continued in another environment (--allow-environment-change); what changed: "
+        f"{run.path} was resumed in another environment (--allow-environment-change); what changed: "
         f"{_names(changed)}."
     ]
 
@@ -244,7 +244,7 @@ def _continued_elsewhere(run: StoredRun) -> list[str]:
 def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
     texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
     names = _unique(name for text in texts for name in text)
-    # A run without pictures has no renderer, and no other one either.
+    # A run without images has no renderer, so its renderer does not differ from another one.
     found = {
         name: [text.get(name) for text in texts if name in text or not name.startswith(RENDERER)]
         for name in names
@@ -260,13 +260,13 @@ def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
     for run in runs:
         for recipe, digest in run.description.recipes.items():
             digests[recipe].add(digest)
-    # Other prompts are another variant, and the table has a column for that.
+    # Other prompts are another variant, for which the table has a column.
     differing = [name for name, found in digests.items() if len(found) > 1 and not name.startswith(PROMPTS)]
     if not differing:
         return []
     return [
         f"the run folders were made with different contents of {_names(differing)}; rows of the same name "
-        "are put together all the same."
+        "are combined anyway."
     ]
 
 

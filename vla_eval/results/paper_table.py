@@ -1,4 +1,4 @@
-"""The figures of the paper's table of VLA models, to be printed beside one's own and never as them.
+"""The results of the paper's table of VLA models, to be printed beside measured ones, never among them.
 
 Source: "Memory, Benchmark & Robots" (ICLR 2026), appendix "VLA baselines", table "Performance of VLA
 models on selected memory-intensive tasks from the MIKASA-Robo benchmark". Its caption: success rates

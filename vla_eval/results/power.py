@@ -1,4 +1,4 @@
-"""How many episodes it takes to settle a difference between two policies. Pure functions of numbers."""
+"""How many episodes are needed to detect a difference between two policies. Pure functions of numbers."""
 
 import math
 
@@ -11,18 +11,18 @@ LEVEL = 0.05
 def episodes_to_settle(
     difference: float, discordance: float, *, level: float = LEVEL, power: float = POWER
 ) -> int:
-    """Return how many paired episodes a two-sided McNemar test needs to find a difference.
+    """Return how many paired episodes a two-sided McNemar test needs to detect a difference.
 
     Args:
         difference: of the two success rates, in (0, 1].
-        discordance: share of episodes in which the two policies differ; raised to `difference` where
-            it is smaller, since it cannot be.
-        level: of the test, after whatever correction for several comparisons, in (0, 1).
-        power: wanted probability of finding it, in (0, 1).
+        discordance: share of episodes in which the two policies differ; raised to `difference` if it is
+            smaller, which is impossible.
+        level: of the test, after any correction for several comparisons, in (0, 1).
+        power: probability of detecting it, in (0, 1).
 
     Source: Connor 1987, "Sample size for testing differences in proportions for the paired-sample
     design", Biometrics 43(1):207-211, equation 3: n = (z_{1-level/2} √ψ + z_{power} √(ψ - δ²))² / δ².
-    It is for the asymptotic test; the exact one needs a little more.
+    It is for the asymptotic test; the exact one needs slightly more.
     """
     psi = max(discordance, difference)
     z_level = float(stats.norm.ppf(1 - level / 2))
@@ -32,7 +32,7 @@ def episodes_to_settle(
 
 
 def discordance_of_independent(first: float, second: float) -> float:
-    """Return how often two policies differ if neither says anything of the other.
+    """Return how often two policies differ if their outcomes are independent.
 
     Args:
         first: success rate of one.

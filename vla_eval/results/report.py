@@ -1,6 +1,6 @@
 """Build the success table of one or more run folders; `render` writes it as text.
 
-Reads and returns: it changes nothing. `docs/statistics.md` explains each column.
+Reads and returns; changes nothing. `docs/statistics.md` explains each column.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ from vla_eval.results.comparison import (
     measure,
 )
 from vla_eval.results.estimates import chance_corrected
-from vla_eval.results.grouping import RowGroup, RowKey, group_runs
-from vla_eval.results.table import Row, Table
+from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs
+from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
 from vla_eval.storage.run_folder import StoredRun
 
@@ -33,17 +33,17 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
 
     Args:
         runs: what the run folders hold; a folder given twice counts once.
-        baseline: the policy that all others are compared with. By default `random`, and no comparison
-            if it was not run.
+        baseline: the policy with which all others are compared. By default `random`, or no comparison if
+            it was not run.
 
     Raises:
         ReportError: there is no episode yet.
-        UnknownNameError: the baseline was asked for, and is not in the runs.
+        UnknownNameError: the requested baseline is not in the runs.
     """
     runs = list({run.path.resolve(): run for run in runs}.values())
     if not any(run.records for run in runs):
         paths = ", ".join(str(run.path) for run in runs) or "no run folder"
-        raise ReportError(f"{paths}: there is no episode to report yet. Start one with `mikasa-vla eval`.")
+        raise ReportError(f"{paths}: there is no episode to report yet. Run one with `mikasa-vla eval`.")
     grouping = group_runs(runs)
     policies = dict.fromkeys(key.policy for key in grouping.groups)
     if baseline is not None and baseline not in policies:
@@ -72,7 +72,7 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
 
 
 def _row(
-    group: RowGroup,
+    group: RowEpisodes,
     measured: Mapping[RowKey, Measured],
     *,
     chance: Chance | None,

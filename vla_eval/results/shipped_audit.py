@@ -1,8 +1,8 @@
-"""What the shortcut audit said of the tasks as they ship: `shipped_audit.json`, made by a command.
+"""The result of the shortcut audit of the shipped tasks: `shipped_audit.json`, made by a command.
 
     mikasa-vla audit --format json > vla_eval/results/shipped_audit.json
 
-Knows neither statistics nor simulators, so that a report can quote it.
+Imports neither statistics nor simulators, so that a report can quote it.
 """
 
 import functools
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-Protocol = Literal["paper", "strict"]
+AuditProtocol = Literal["paper", "strict"]
 STRICT: Mapping[str, bool] = {
     "freeze_until_choice": True,
     "strict_choice": True,
     "phase_gate_success": True,
 }
-PROTOCOLS: Mapping[Protocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT}
+PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT}
 """Name of a set of rules -> arguments of the tasks."""
 
 FILE = Path(__file__).with_suffix(".json")
@@ -26,11 +26,11 @@ FILE = Path(__file__).with_suffix(".json")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What an audit said of a task.
+    """The audit's verdict on a task.
 
     Attributes:
         version: of the task, when it was audited.
-        words: the roads to success that need no memory; or that none was found.
+        words: the shortcuts, which need no memory; or that none was found.
         n_episodes: of each control.
     """
 
@@ -40,8 +40,8 @@ class Verdict:
 
 
 @functools.cache
-def shipped_verdicts() -> Mapping[tuple[str, Protocol], Verdict]:
-    """Return (task, protocol) -> what the shipped audit said."""
+def shipped_verdicts() -> Mapping[tuple[str, AuditProtocol], Verdict]:
+    """Return (task, protocol) -> the verdict of the shipped audit."""
     rows = json.loads(FILE.read_text(encoding="utf-8"))
     return {
         (row["task"], row["protocol"]): Verdict(
@@ -53,9 +53,9 @@ def shipped_verdicts() -> Mapping[tuple[str, Protocol], Verdict]:
     }
 
 
-def protocol_of(env: Mapping[str, Any]) -> Protocol | None:  # Any: arguments of tasks
-    """Return the rules that a run's task arguments stand for; None for others than the audited ones."""
+def protocol_of(env: Mapping[str, Any]) -> AuditProtocol | None:  # Any: arguments of tasks
+    """Return the rules that a run's task arguments select; None if they were not audited."""
     if not env:
         return "paper"
-    # The gate of the phases is closed by default, so that leaving it out is strict, too.
+    # Success is gated by phase by default, so omitting the argument is strict, too.
     return "strict" if {"phase_gate_success": True, **env} == STRICT else None

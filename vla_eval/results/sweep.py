@@ -1,6 +1,6 @@
-"""Compare what was evaluated on the same episodes: chunk lengths of a policy, or policies at a length.
+"""Compare results on the same episodes: chunk lengths of a policy, or policies at one chunk length.
 
-Reads and returns: it changes nothing. `docs/chunk_sizes.md` explains each column.
+Reads and returns; changes nothing. `docs/chunk_sizes.md` explains each column.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,11 @@ from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results.comparison import Chance, Measured, ceiling_of, chance_of, count_pairs, measure
 from vla_eval.results.cue import CueFrames, cue_frames
 from vla_eval.results.estimates import PairCounts, PairedTest, holm, mcnemar_exact
-from vla_eval.results.grouping import RowGroup, RowKey, group_runs, variant_labels
+from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
 from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
 from vla_eval.storage.run_folder import StoredRun
 
 By = Literal["n_action_steps", "policy"]
-BY: tuple[By, ...] = ("n_action_steps", "policy")
 DEFAULT_DIFFERENCE = 0.1
 
 
@@ -29,12 +28,12 @@ class SweepRow:
         n_episodes: with a result.
         measured: rates and interval.
         chance, ceiling: without memory, and with the answer, at the same n_action_steps.
-        cue: frames of the cue that were given to the policy.
-        reference: what it is compared with; None for the reference itself.
+        cue: frames of the cue that the policy got.
+        reference: the row with which it is compared; None for the reference itself.
         test: paired exact McNemar, this row minus the reference.
         corrected_p: Holm over all comparisons of the table.
-        n_to_settle: episodes that would settle the difference asked for, at the level corrected for the
-            number of comparisons (Bonferroni, which is what Holm asks of its smallest p).
+        n_to_settle: episodes that would detect the given difference, at the level corrected for the number
+            of comparisons (Bonferroni, which Holm's method requires for its smallest p).
     """
 
     key: RowKey
@@ -51,7 +50,7 @@ class SweepRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """Rows, grouped so that each reference stands with those that are compared with it."""
+    """Rows, grouped so that each reference is beside the rows that are compared with it."""
 
     by: By
     rows: tuple[SweepRow, ...]
@@ -71,10 +70,10 @@ def compare_runs(
 
     Args:
         runs: what the run folders hold.
-        by: what the compared rows differ in.
+        by: the one setting in which the compared rows differ.
         reference: the value to compare with: a number of action steps, or a policy. By default the
             smallest number, or the first policy.
-        difference: the difference of success rates whose settling is planned.
+        difference: the difference of success rates for which the number of episodes is planned.
 
     Raises:
         ReportError: there are no episodes, nothing to compare, or an impossible difference.
@@ -122,8 +121,8 @@ def compare_runs(
     return Sweep(by=by, rows=tuple(rows), n_comparisons=len(tests), difference=difference, level=level)
 
 
-def _references(groups: Mapping[RowKey, RowGroup], by: By, wanted: str | None) -> dict[RowKey, RowKey]:
-    """Return row -> the row it is compared with: equal in all but one thing."""
+def _references(groups: Mapping[RowKey, RowEpisodes], by: By, wanted: str | None) -> dict[RowKey, RowKey]:
+    """Return row -> the row with which it is compared: equal in all settings but one."""
     values = list(dict.fromkeys(str(getattr(key, by)) for key in groups))
     if wanted is not None and wanted not in values:
         raise unknown_name(by, wanted, values, where="--reference")

@@ -33,23 +33,21 @@ def render_sweep(sweep: Sweep, fmt: SweepFormat) -> str:
 def sweep_cells(sweep: Sweep) -> tuple[list[str], list[list[str]]]:
     """Return the titles of the columns, and each row's cells."""
     cells = [_cells(row, sweep) for row in sweep.rows]
-    # A column in which nothing stands says nothing: the variant, where there is one only.
+    # Omit an empty column: the variant, if there is only one.
     kept = [i for i, _ in enumerate(TITLES) if any(row[i] != "" for row in cells)]
     return [TITLES[i] for i in kept], [[row[i] for i in kept] for row in cells]
 
 
 def sweep_notes(sweep: Sweep) -> list[str]:
-    """Return what a reader must know about the columns."""
+    """Return the notes on the columns."""
     return [
         f"p: exact McNemar test on the same task, run and seed, two-sided; Holm's correction over all "
         f"{sweep.n_comparisons} comparisons of this table.",
-        f"episodes to settle: pairs that find a difference of {sweep.difference:g} with probability 0.8 at "
-        f"level {sweep.level:.3g} (0.05 over the number of comparisons), by the share of episodes in which "
-        "the two "
-        f"differed here.",
-        "cue frames: how many frames that show the cue the policy was given in an episode. A policy that "
-        "reads "
-        "the last frame only may still know nothing of them when it chooses; scripted controls look at none.",
+        f"episodes to settle: pairs that detect a difference of {sweep.difference:g} with power 0.8 at level "
+        f"{sweep.level:.3g} (0.05 divided by the number of comparisons), for the share of episodes in which "
+        "the two differed here.",
+        "cue frames: number of frames of the cue that the policy got in an episode. A policy that reads only "
+        "the last frame may have forgotten them when it chooses; scripted controls read no images.",
     ]
 
 

@@ -13,7 +13,7 @@ from vla_eval.results import paper_table
 from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
-from vla_eval.results.table import Row, Table
+from vla_eval.results.success_table import Row, Table
 
 Format = Literal["markdown", "csv", "json", "latex"]
 FORMATS: tuple[str, ...] = get_args(Format)
@@ -25,7 +25,7 @@ PAPER_TITLE = f"The paper's figures, not measured here ({paper_table.PROTOCOL})"
 
 
 class Column(NamedTuple):
-    """One column of the printed table; `--columns` calls it by its name. An extra one has to be asked for."""
+    """One column of the printed table; `--columns` uses its name. An extra one is shown on request."""
 
     name: str
     title: str
@@ -39,17 +39,17 @@ def render(table: Table, fmt: Format, *, paper: bool = False, columns: Sequence[
 
     Args:
         table: what `build_table` returned.
-        fmt: `markdown` and `latex` are to be read, `csv` and `json` hold every column in full precision.
-        paper: add the paper's figures for the same tasks, marked as such and apart from one's own.
-        columns: names of those to be shown in the formats that are to be read, in this order; none: all but
-            the extra ones.
+        fmt: `markdown` and `latex` are for reading, `csv` and `json` have every column in full precision.
+        paper: add the paper's results for the same tasks, marked and separate from the measured ones.
+        columns: names of the columns in the formats for reading, in this order; none: all but the extra
+            ones.
 
     Returns:
         The text, without a newline at its end.
 
     Raises:
         UnknownNameError: there is no such column.
-        ReportError: columns are chosen for a format that holds all.
+        ReportError: columns are selected for a format that has all of them.
     """
     figures = _paper_figures(table) if paper else None
     if fmt == "markdown":
@@ -57,12 +57,12 @@ def render(table: Table, fmt: Format, *, paper: bool = False, columns: Sequence[
     if fmt == "latex":
         return _latex(table, _chosen(table, columns), figures)
     if columns:
-        raise ReportError(f"--columns: {fmt} holds every column. Leave it out, or use markdown or latex.")
+        raise ReportError(f"--columns: {fmt} has every column. Remove --columns, or use markdown or latex.")
     return (_csv if fmt == "csv" else _json)(table, figures)
 
 
 def table_cells(table: Table) -> tuple[list[Column], list[list[str]]]:
-    """Return the columns that are to be read, and each row's cells."""
+    """Return the columns for reading, and each row's cells."""
     columns = _chosen(table, ())
     return columns, [[column.cell(row) for column in columns] for row in table.rows]
 
@@ -203,7 +203,7 @@ def _markdown_table(titles: list[str], rows: list[list[str]], is_number: list[bo
 
 def _csv(table: Table, figures: Sequence[PaperFigure] | None) -> str:
     names = [field.name for field in fields(Row)]
-    source = ["source"] if figures is not None else []  # a column, so that the two are never taken for one
+    source = ["source"] if figures is not None else []  # a column, so that the two are never confused
     text = io.StringIO()
     writer = csv.DictWriter(text, [*source, *names], restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -290,7 +290,7 @@ def _latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]
 
 def _latex_row(cells: list[str]) -> str:
     row = " & ".join(re.sub("^-(?=[0-9])", "$-$", _escaped(cell)) for cell in cells)
-    # The rule or the row above would take a bracket or a star for its own argument.
+    # The rule or row above would read a bracket or a star as its own argument.
     return f"{'{}' if row.startswith(('[', '*')) else ''}{row} \\\\"
 
 

@@ -1,4 +1,4 @@
-"""What an evaluation was run with: commit, package versions, processor, drivers.
+"""What an evaluation was run with: commit, package versions, CPU, drivers.
 
 Two calls on an unchanged machine give the same answer, which is how a continued run notices that the
 machine or the code has changed. Nothing here names a host, a user or a folder. Standard library only.
@@ -76,7 +76,7 @@ def package_version(name: str) -> str | None:
 
 
 def cpu_model() -> str | None:
-    """Return the processor's name as Linux gives it; pictures drawn on a CPU may depend on it."""
+    """Return the CPU's name as Linux gives it; images rendered on a CPU may depend on it."""
     match = re.search(r"^model name\s*:\s*(.+)$", _read(CPUINFO_FILE), re.MULTILINE)
     return match[1].strip() if match else None
 

@@ -8,7 +8,6 @@
 Knows nothing of tasks, policies or statistics.
 """
 
-import errno
 import json
 import logging
 from collections.abc import Collection, Mapping
@@ -20,7 +19,7 @@ from typing import Self
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.storage.durable import FolderLock, LineFile, storage_full, sync_folder
+from vla_eval.storage.durable import LineFile, sync_folder
 from vla_eval.storage.episodes_file import (
     cut_tail,
     parse_records,
@@ -40,14 +39,13 @@ from vla_eval.storage.run_file import (
     environment_changed,
     find_changes,
 )
-from vla_eval.storage.unstarted import FolderStart
+from vla_eval.storage.starting import StartedFolder, starting
 
 __all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "read_run"]
 
 logger = logging.getLogger(__name__)
 
 _OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", EPISODES_FILE, TIMINGS_FILE, LOCK_FILE)
-DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,10 +82,10 @@ class RunFolder:
         """Use `open`: this is called with the folder locked."""
         self.path = path
         self._allow_environment_change = allow_environment_change
-        self._lock: FolderLock | None = None
-        self._start: FolderStart | None = None
+        self._started: StartedFolder | None = None
         self._run_file = self._load(description)
-        records = repair_records(path / EPISODES_FILE, self._run_file.planned(path, groups))
+        self._planned = self._run_file.planned(path, groups)
+        records = repair_records(path / EPISODES_FILE, self._planned)
         self._finished = {key for key, record in records.items() if record.outcome != "error"}
         self._has_lines = bool(records)
         cut_tail(path / TIMINGS_FILE)
@@ -121,26 +119,11 @@ class RunFolder:
                 not planned, or it is somebody else's.
             StorageFullError: the disk is full.
         """
-        try:
-            start = FolderStart(path, own=_OWN_FILES)
-            make_folder(path)
-            lock = FolderLock(path / LOCK_FILE)
-            try:
-                folder = cls(
-                    path, description, allow_environment_change=allow_environment_change, groups=groups
-                )
-            except BaseException:
-                start.undo()
-                lock.release()
-                raise
-        except OSError as exc:
-            if exc.errno in DISK_TROUBLE:
-                raise storage_full(path, exc) from exc
-            raise RunFolderError(
-                f"{path}: cannot be used as a run folder ({exc.strerror or exc}). Use another --out."
-            ) from exc
-        folder._lock = lock
-        folder._start = start
+        with starting(
+            path, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="a run folder", make=make_folder
+        ) as started:
+            folder = cls(path, description, allow_environment_change=allow_environment_change, groups=groups)
+        folder._started = started
         return folder
 
     def __enter__(self) -> Self:
@@ -150,8 +133,8 @@ class RunFolder:
         self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the folder; a new one is removed if an error came before its first episode."""
-        if isinstance(exc, Exception) and self._start is not None and not self._has_lines:
-            self._start.undo()
+        if isinstance(exc, Exception) and self._started is not None and not self._has_lines:
+            self._started.start.undo()
         self.close()
 
     def finished_keys(self) -> frozenset[EpisodeKey]:
@@ -166,8 +149,8 @@ class RunFolder:
             timing: how long it took; not made durable, and lost rather than an error if it cannot be kept.
 
         Raises:
-            RunFolderError: the episode has a result already, its values contradict each other, or the folder
-                is closed.
+            RunFolderError: the episode has a result already or is not planned, its values contradict each
+                other, or the folder is closed.
             StorageFullError: it could not be stored; the folder is as it was before.
         """
         if self._episodes is None:
@@ -176,6 +159,12 @@ class RunFolder:
             raise RunFolderError(
                 f"{self.path}: {shown_key(record.key)} has a result already; a second one would be counted "
                 f"twice. Skip the keys in finished_keys()."
+            )
+        objection = self._planned.objection(record)
+        if objection is not None:  # or the folder could not be read again
+            raise RunFolderError(
+                f"{self.path}: expected an episode that this run plans, got {shown_key(record.key)}: "
+                f"{objection}. Nothing was stored."
             )
         record.check(where=f"{self.path}: {shown_key(record.key)}")  # or nobody could read the folder again
         self._has_lines = True  # also if the line could not be written as a whole
@@ -209,9 +198,9 @@ class RunFolder:
             self._episodes.close()
             self._timings.close()
             self._episodes = None
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        if self._started is not None:
+            self._started.lock.release()
+            self._started = None
 
     def _load(self, description: RunDescription) -> RunFile:
         """Return what run.json must hold from now on."""

@@ -1,8 +1,8 @@
-"""The arms with which a task can be played, a row each.
+"""The arms that a task supports, a row each.
 
-The Panda is the paper's and the default. `fetch_at_table` shows what another one takes: an agent of
-ManiSkill with a tool centre point `tcp`, a camera `hand_camera`, two fingers as its last two joints and a
-controller `pd_ee_delta_pose` of seven numbers; and its row here.
+The Panda is the paper's and the default. `fetch_at_table` shows what another arm needs: a ManiSkill agent
+with a tool centre point `tcp`, a camera `hand_camera`, two fingers as its last two joints and a controller
+`pd_ee_delta_pose` of seven numbers; and its row here.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,17 @@ FINGERS = ("finger1", "finger2")
 CAMERA_SIZE_PX = 128
 CAMERA_FOV_RAD = np.pi / 2
 FETCH_UID = "fetch_at_table"
-HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint so damped does not move by itself
+HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
-    """What a task has to know of an arm.
+    """What a task needs to know about an arm.
 
     Attributes:
         joints: names of the entries of `qpos`; the last two are the fingers.
         arm_joints: indices of those that move the hand.
-        rest_qpos: where an episode begins, but for noise; rad, and m where a joint is prismatic.
+        rest_qpos: joint positions at the start of an episode, without noise; rad, and m for prismatic joints.
         base_m: position of the root, world frame.
     """
 
@@ -50,7 +50,7 @@ PANDA = Arm(
     rest_qpos=(0.0, 0.0, 0.0, -2 * np.pi / 3, 0.0, 2 * np.pi / 3, np.pi / 4, 0.04, 0.04),
     base_m=(-0.615, 0.0, 0.0),
 )
-# As near to the table as it can stand (from -1.00 m on they touch); the tool centre point is then at
+# As close to the table as possible (from -1.00 m on they touch). The tool centre point is then at
 # (-0.12, 0, 0.30), and the hand points 30 degrees down: pointing straight down it would not reach the cubes.
 FETCH = Arm(
     joints=(
@@ -65,7 +65,7 @@ FETCH = Arm(
 
 
 class _Still(PassiveController):  # type: ignore[misc]  # ManiSkill is untyped
-    """Joints without a command; ManiSkill's own makes a box of float64, of which Gymnasium warns."""
+    """Joints without a command; ManiSkill's own class uses a float64 box, for which Gymnasium warns."""
 
     def _initialize_action_space(self) -> None:
         none = np.empty(0, dtype=np.float32)
@@ -79,7 +79,7 @@ class _StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill 
 
 @register_agent()
 class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
-    """ManiSkill's Fetch, standing still before the table: its arm and gripper alone are commanded."""
+    """ManiSkill's Fetch, standing still in front of the table: only its arm and gripper are commanded."""
 
     uid = FETCH_UID
 
@@ -101,7 +101,7 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations
-        """Fetch's own, but for base, torso and head, which are held by damping and take no command."""
+        """Fetch's own, except base, torso and head, which are held by damping and take no command."""
         still = _StillConfig(
             self.base_joint_names + self.body_joint_names, damping=HOLDING, force_limit=HOLDING
         )
@@ -111,9 +111,9 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
         }
 
     def is_static(self, threshold: float = 0.2) -> torch.Tensor:
-        """Return (B,) bool: no joint of the arm is faster.
+        """Return (B,) bool: no joint of the arm is faster than the threshold.
 
-        Fetch's own rule looks at signed velocities, so that any speed backwards passes.
+        Fetch's own rule compares signed velocities, so any negative velocity passes.
         """
         speeds = self.robot.get_qvel()[:, list(FETCH.arm_joints)].abs()
         static: torch.Tensor = (speeds <= threshold).all(dim=1)

@@ -1,4 +1,4 @@
-"""A ball that rolls across the table: its start, its speed, and what is known of it."""
+"""A ball that rolls across the table: its start, its speed, its state."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ SIDE_VELOCITY_M_S = (0.0, 0.05)
 
 
 class RollingBallEnv(OnePhaseEnv):
-    """A red ball rolls along y past the robot; see the families for what is to be done with it.
+    """A red ball rolls along y past the robot; the families define the goal.
 
     Args:
         velocity_range_m_s: (least, most) of the initial speed along y; a solid ball keeps 5/7 of it once
@@ -29,7 +29,7 @@ class RollingBallEnv(OnePhaseEnv):
     """
 
     BALL_DROP_M: float
-    """So much higher than where it rests the ball's centre is at the start."""
+    """Height of the ball's centre at the start, above its resting height."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class RollingBallEnv(OnePhaseEnv):
         self._initial_velocity[env] = torch.tensor(velocity_m_s)
 
     def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
-        """Draw where the ball has to go, if it has to go anywhere, after its start has been drawn."""
+        """Draw the ball's goal, if it has one, after its start has been drawn."""
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         self.move(self.ball, mask, Pose.create_from_pq(self._start))

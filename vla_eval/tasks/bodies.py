@@ -1,4 +1,4 @@
-"""What a task tells privileged readers of a body: where it is, how fast, how it is turned."""
+"""The state of a body for privileged readers: position, velocity, yaw."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ class Body(NamedTuple):
 def moving_body(
     position_m: torch.Tensor, velocity_m_s: torch.Tensor, yaw_rad: torch.Tensor | None = None
 ) -> Body:
-    """Return a body; one for which no turn matters has yaw 0."""
+    """Return a body; its yaw is 0 if its orientation does not matter."""
     return Body(position_m, velocity_m_s, torch.zeros_like(position_m[:, 0]) if yaw_rad is None else yaw_rad)
 
 

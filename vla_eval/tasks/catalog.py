@@ -126,7 +126,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 FAMILIES = make_families(TASKS)
-"""Family id -> its row: tasks of which arguments say which one it is, `RememberColor` with `n_items=4`."""
+"""Family id -> its row: tasks that are specified by arguments, such as `RememberColor` with `n_items=4`."""
 
 
 def find_task(task_id: str) -> TaskSpec | None:

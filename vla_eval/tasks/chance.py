@@ -1,4 +1,4 @@
-"""What a perfect arm that ignores the cue gets by luck. Pure arithmetic."""
+"""The success rate of a perfect arm that ignores the cue. Pure arithmetic."""
 
 import math
 
@@ -9,6 +9,6 @@ def chance_of_several(n_items: int, n_shown: int, *, in_order: bool) -> float:
     Args:
         n_items: how many items there are.
         n_shown: how many were shown; the arm knows that number.
-        in_order: whether they must also come in the order shown.
+        in_order: whether their order must also be the one shown.
     """
     return 1 / (math.perm(n_items, n_shown) if in_order else math.comb(n_items, n_shown))

@@ -1,7 +1,7 @@
 """Tasks that end in a choice: one of N candidates is right, and it was shown before.
 
-Knows where candidates may lie, which one is touched first, and when the choice is a success; what the
-candidates are and how the cue is shown is the family's affair.
+Knows where candidates may lie, which one is touched first, and when the choice is a success. The family
+defines what the candidates are and how the cue is shown.
 """
 
 from typing import Any
@@ -18,16 +18,16 @@ NO_CHOICE = -1
 
 
 class ChoiceEnv(MemoryTableEnv):
-    """A memory task with candidates; see the families for what is shown.
+    """A memory task with candidates; the families define what is shown.
 
     A candidate counts as touched when, in the response phase, it is the nearest one to the tool centre
     point, within `goal_threshold_m` of it, and the arm is at rest.
 
     Args:
-        goal_threshold_m: how near the tool centre point must come.
+        goal_threshold_m: maximum distance of the tool centre point.
         strict_choice: the first wrong candidate that is touched ends the episode as a failure.
-        show_cue: False: the cue's time passes and nothing is shown. All else is as with the same seed, so
-            that a policy which is as good without the cue as with it does not need it.
+        show_cue: False: the cue phase passes without showing anything. Everything else is the same for
+            the same seed. So a policy that is as good without the cue as with it does not need it.
     """
 
     REACH_SCALE_PER_M: float
@@ -70,7 +70,7 @@ class ChoiceEnv(MemoryTableEnv):
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
         if self.gpu_sim_enabled:
             return torch.stack([actor.pose.p for actor in self.candidates], dim=1)
-        # The same numbers without two tensors for each candidate: this is asked for several times a step.
+        # The same numbers without two tensors per candidate: this is called several times per step.
         positions = [[body.pose.p for body in actor._objs] for actor in self.candidates]
         return torch.as_tensor(np.array(positions, dtype=np.float32).swapaxes(0, 1))
 
@@ -97,7 +97,7 @@ class ChoiceEnv(MemoryTableEnv):
         return (int(self._target[env]),)
 
     def right_first_choices(self, env: int) -> tuple[int, ...]:
-        """Return the candidates that it is right to touch first."""
+        """Return the candidates that are right as a first touch."""
         right = self.right_candidates(env)
         return right[:1] if self.in_order else right
 
@@ -136,7 +136,7 @@ class ChoiceEnv(MemoryTableEnv):
         self._latch_touch(touches, nearest)
 
     def _latch_touch(self, touches: torch.Tensor, candidate: torch.Tensor) -> None:
-        """Take down, where `touches` (B,) holds, that these candidates, (B,) indices, are touched."""
+        """Record, where `touches` (B,) holds, that these candidates, (B,) indices, are touched."""
         self._first_choice = torch.where(
             touches & (self._first_choice == NO_CHOICE), candidate, self._first_choice
         )
@@ -148,7 +148,7 @@ class ChoiceEnv(MemoryTableEnv):
         self._touched_wrongly[rows, candidate] |= wrong
 
     def is_placed(self) -> torch.Tensor:
-        """Return (B,) bool: the success rule holds, but for the arm being at rest."""
+        """Return (B,) bool: the success rule holds, except that the arm may still move."""
         return self.target_distance_m() <= self.goal_threshold_m
 
     def evaluate(self) -> dict[str, torch.Tensor]:
@@ -185,7 +185,7 @@ class ChoiceEnv(MemoryTableEnv):
     RESTING_WEIGHT = 1.0
 
     def reveal(self, mask: torch.Tensor, orientation_wxyz: torch.Tensor) -> None:
-        """Put all candidates to their slots where the mask holds; orientation is (4,)."""
+        """Move all candidates to their slots where the mask holds; orientation is (4,)."""
         if not bool(mask.any()):
             return
         for index, actor in enumerate(self.candidates):

@@ -1,4 +1,4 @@
-"""Families of tasks: ids without a number, for which the arguments say which task it is.
+"""Families of tasks: ids without a number; the arguments specify the task.
 
 `RememberColor` with `n_items=4` is a task that has no row in the catalogue. A family is made from one
 of its rows; knows nothing of simulators.
@@ -14,7 +14,7 @@ from vla_eval.errors import RecipeError, TaskArgumentError
 from vla_eval.tasks.spec import TaskSpec
 
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
-"""Arguments of tasks with candidates alone."""
+"""Arguments that only tasks with candidates have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,9 +24,9 @@ class Family:
     Attributes:
         id: its name.
         row: id of the row of the catalogue that it is made from.
-        open_arguments: what has to be chosen; everything else is as in the row.
-        min_response_steps: see `TaskSpec`. So many that with the arguments of any row of the family the
-            horizon is that row's.
+        open_arguments: required arguments; everything else is as in the row.
+        min_response_steps: see `TaskSpec`. Chosen such that with the arguments of any row of the family
+            the horizon is that row's.
     """
 
     id: str
@@ -92,7 +92,7 @@ def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
 
 
 def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
-    """Raise what can be said of a task's arguments without a simulator: by their names, and of durations.
+    """Check the names of a task's arguments, and durations, without a simulator.
 
     Args:
         spec: a row of the catalogue, or a family.
@@ -100,8 +100,8 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
         rows: the catalogue, for the message.
 
     Raises:
-        TaskArgumentError: an argument without which it is not known which task is meant; or one for tasks
-            with candidates, and this one has none; or a duration that is no number of control steps.
+        TaskArgumentError: a required argument of a family is missing; or an argument needs candidates,
+            and this task has none; or a duration is not a number of control steps.
     """
     missing = [name for name in spec.open_arguments if name not in given]
     if missing:

@@ -17,7 +17,7 @@ from vla_eval.tasks.one_phase import check_positive
 GOAL_OFFSET_X_M = 0.2
 GOAL_Y_M = (-0.2, 0.2)
 GOAL_Z_M = 0.001
-HIT_OFFSET_M = 0.07  # the reward's hit point lies so far behind the ball, seen from the goal
+HIT_OFFSET_M = 0.07  # distance of the reward's hit point behind the ball, seen from the goal
 HIT_REACHED_M = 0.04
 UPWARDS_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # ManiSkill's disc faces x; turn it up
 
@@ -30,16 +30,16 @@ class InterceptEnv(RollingBallEnv):
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: goal 3, ball pose 7, initial velocity 3, linear and angular velocity 3 + 3,
+    `state` (in addition: goal 3, ball pose 7, initial velocity 3, linear and angular velocity 3 + 3,
     tcp to ball 3, ball to goal 3).
 
-    Rewards: dense: 2 for nearing the hit point behind the ball; once there, 5 for the ball nearing the
-    goal; 30 where solved.
+    Rewards: dense: 2 for approaching the hit point behind the ball; once there, 5 for the ball approaching
+    the goal; 30 if solved.
 
     Starting state: x in [-0.35, -0.05], y in [-0.9, -0.65] m; velocity along y by `velocity_range_m_s`.
 
     Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases:
-    the whole episode is response, the ball is always to be seen.
+    the whole episode is response, and the ball is always visible.
 
     Arguments: `goal_radius_m`, and those of `RollingBallEnv` and `OnePhaseEnv`.
 
@@ -111,7 +111,7 @@ class InterceptEnv(RollingBallEnv):
         return {**super().moving_bodies(), "goal": resting_body(self.goal.pose.p)}
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Get behind the ball; from then on, bring the ball to the goal."""
+        """Move behind the ball, then push the ball to the goal."""
         reached = self._hit_point_reached
         to_goal = torch.linalg.norm(self._ball_to_goal_m()[:, :2], dim=1)
         return {

@@ -13,7 +13,7 @@ GRIP_HALF_PLANE_M = (
 )
 GRIP_HALF_HEIGHT_M = 0.03  # within this in z,
 GRIP_RADIUS_M = 0.04  # within this altogether,
-BALL_DIAMETER_WIDTH_M = 0.04  # and the fingers are at least so far apart.
+BALL_DIAMETER_WIDTH_M = 0.04  # and the fingers are at least this far apart.
 SNUG_M = 0.02
 NARROW_WIDTH_M = 0.06
 TOUCH_RADIUS_M = 0.025
@@ -27,11 +27,11 @@ class InterceptGrabEnv(RollingBallEnv):
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: ball pose 7, initial velocity 3, grasped 1, linear and angular velocity 3 + 3, tcp
+    `state` (in addition: ball pose 7, initial velocity 3, grasped 1, linear and angular velocity 3 + 3, tcp
     to ball 3, gripper width 1, velocity of the ball relative to the tcp 3).
 
-    Rewards: dense: 10 for nearing the ball; 10 and up to 135 more while it lies between the fingers; up
-    to 30 within 2.5 cm of it; 100 while it is grasped; 300 where solved.
+    Rewards: dense: 10 for approaching the ball; 10 and up to 135 more while it lies between the fingers; up
+    to 30 within 2.5 cm of it; 100 while it is grasped; 300 if solved.
 
     Starting state: as Intercept; the ball begins on the table.
 
@@ -87,7 +87,7 @@ class InterceptGrabEnv(RollingBallEnv):
         return held
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Get to the ball, have it between the fingers, close them, hold it."""
+        """Reach the ball, get it between the fingers, close them, hold it."""
         distance = torch.linalg.norm(self._tcp_to_ball_m(), dim=1)
         width = self.gripper_width_m()
         loose_m = ((width - BALL_DIAMETER_WIDTH_M).abs() - SNUG_M).clamp(min=0)

@@ -1,4 +1,4 @@
-"""Choices among items that lie on the table: building them, parking them, drawing their places.
+"""Choices among items that lie on the table: build them, park them, draw their positions.
 
 Knows nothing of what is shown as the cue, nor of which item is right.
 """
@@ -60,13 +60,13 @@ class ItemChoiceEnv(ChoiceEnv):
         self._park_all(mask)
 
     def _park_all(self, mask: torch.Tensor) -> None:
-        if not bool(mask.any()):  # most steps: one question for all items, not one for each
+        if not bool(mask.any()):  # most steps: one check for all items, not one per item
             return
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
 
     def _show_in_middle(self, mask: torch.Tensor, shown: torch.Tensor) -> None:
-        """Put the items of these indices, (B,), to the middle of the table where the mask holds."""
+        """Move the items of these indices, (B,), to the centre of the table where the mask holds."""
         if not bool(mask.any()):
             return
         for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
@@ -77,6 +77,6 @@ class ItemChoiceEnv(ChoiceEnv):
 
 
 def check_count(name: str, count: Any, most: int, what: str, *, least: int = 2) -> None:
-    """Raise `TaskArgumentError` unless a number of things is a whole number from `least` to `most`."""
+    """Raise `TaskArgumentError` unless a count is a whole number from `least` to `most`."""
     if not isinstance(count, int) or isinstance(count, bool) or not least <= count <= most:
         raise TaskArgumentError(f"{name}={count!r}: expected {least} to {most}, one per {what}.")

@@ -1,4 +1,4 @@
-"""What the items of a task are called, for people who read a report. Standard library only.
+"""Names of a task's items, for readers of a report. Standard library only.
 
 In the official order, which is that of the indices in records (`target`, `first_choice`).
 """
@@ -9,15 +9,15 @@ _NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES}
 
 
 def item_names(task: str, n_items: int) -> tuple[str, ...]:
-    """Return what the items of a task are called, by index.
+    """Return the names of a task's items, by index.
 
     Args:
         task: id of a row or of a family, such as `RememberColor3-v0` or `RememberColor`.
         n_items: how many there are.
 
     Returns:
-        One name per item; the index itself where an item has no name of its own (mugs), or where its name
-        depends on the task's arguments (RememberShapeAndColor).
+        One name per item; the index itself if the item has no name (mugs), or if its name depends on the
+        task's arguments (RememberShapeAndColor).
     """
     family = task.partition("-")[0].rstrip("0123456789")
     names = _NAMES.get(family, ())

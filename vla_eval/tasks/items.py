@@ -1,8 +1,8 @@
 """What may lie on the table in the Remember tasks: nine shapes from primitives, nine colours by name.
 
 All shapes are about 4 cm wide, lie or stand at rest on the table, and have their origin where a hand would
-aim: sizes as in the official code (S = 2 cm is its scale), resting heights so that nothing drops when it
-is revealed. Knows nothing of phases or of which item is right.
+aim. Sizes are those of the official code (S = 2 cm is its scale). Resting heights are such that nothing
+drops when it is revealed. Knows nothing of phases or of which item is right.
 """
 
 import math
@@ -22,7 +22,7 @@ Z_UP_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # SAPIEN's cylinders lie
 
 
 class NamedColor(NamedTuple):
-    """A colour that is called what it looks like."""
+    """A colour whose name describes how it looks."""
 
     name: str
     rgb: tuple[int, int, int]
@@ -73,7 +73,7 @@ def _ring(
 
 
 def _tube_part(angle_rad: float, *, half_length_m: float) -> Primitive:
-    """Return a piece of a tube of radius S/2 whose middle runs on a circle of radius S."""
+    """Return a piece of a tube of radius S/2 whose centre line is on a circle of radius S."""
     along = _about_z(angle_rad + math.pi / 2)
     place = (S * math.cos(angle_rad), S * math.sin(angle_rad), 0.0)
     return Primitive(kind="cylinder", size=(S / 2, half_length_m), position_m=place, orientation_wxyz=along)
@@ -94,7 +94,7 @@ def cube(half_size_m: float) -> Shape:
     """Return a cube of another size.
 
     Raises:
-        TaskArgumentError: smaller than the arm can aim at, or so large that neighbours would overlap.
+        TaskArgumentError: too small for the arm to aim at, or so large that neighbours would overlap.
     """
     least, most = CUBE_HALF_SIZE_RANGE_M
     if not least <= half_size_m <= most:

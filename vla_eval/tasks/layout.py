@@ -1,6 +1,6 @@
-"""Where items lie on the table: a row or an arc of places, each shifted a little per episode.
+"""Positions of items on the table: a row or an arc of places, each shifted a little per episode.
 
-Knows nothing of what lies there, of phases or of a simulator.
+Knows nothing of the items, of phases or of a simulator.
 """
 
 import math
@@ -12,7 +12,7 @@ JITTER_STD_M = 0.01
 MIN_DISTANCE_M = 0.06
 MAX_JITTER_TRIES = 50
 MIXED_MIN_DISTANCE_M = 0.061  # a cross is 6 cm wide
-# The official arc is squeezed in y by so much per place, for these numbers of items only.
+# The official arc is compressed in y by this much per place, only for these numbers of items.
 SQUEEZE_M = {5: 0.025, 9: 0.025}
 
 ARC_CENTRE_X_M = -0.25  # the places of the official arc lie around (-0.25, 0)
@@ -25,8 +25,8 @@ def slot_centres_m(n_items: int) -> Plane:
     """Return (N, 2) xy of the places on the table, world frame, before jitter.
 
     A row for three items, otherwise an arc around the robot. Source: official task code, constants as
-    measured in the task table of `docs/tasks.md`; numbers of items that it does not have follow the same
-    rule with the squeeze of five and nine.
+    measured in the task table of `docs/tasks.md`; other numbers of items follow the same rule with the
+    compression of five and nine.
     """
     if n_items == 3:
         return np.array([[0.0, 0.1], [0.0, 0.0], [0.0, -0.1]])
@@ -44,7 +44,7 @@ def slot_centres_m(n_items: int) -> Plane:
 
 
 def places_from_right(positions_m: Plane) -> tuple[int, ...]:
-    """Return the place of each thing: 0 is the rightmost as the robot sees it.
+    """Return the place of each object: 0 is the rightmost as the robot sees it.
 
     Counted by the angle about the centre of the arc: the outermost places of an arc of nine differ by 1 cm
     in y, which is the jitter, but by more than 20 degrees.
@@ -58,9 +58,9 @@ def places_from_right(positions_m: Plane) -> tuple[int, ...]:
 
 
 def jittered(centres_m: Plane, rng: np.random.Generator) -> Plane:
-    """Shift each place by N(0, 1 cm) in x and y, one after another, at least 6 cm from those before.
+    """Shift each place by N(0, 1 cm) in x and y, one after another, at least 6 cm from earlier ones.
 
-    A place for which `MAX_JITTER_TRIES` draws fail stays where it is, as in the official code.
+    A place for which `MAX_JITTER_TRIES` draws fail is not shifted, as in the official code.
     """
     placed: list[Plane] = []
     for centre in centres_m:
@@ -75,10 +75,10 @@ def jittered(centres_m: Plane, rng: np.random.Generator) -> Plane:
 
 
 def jittered_apart(centres_m: Plane, rng: np.random.Generator) -> Plane:
-    """Shift each place by N(0, 1 cm), at least 6.1 cm from all others, shifted already or still to come.
+    """Shift each place by N(0, 1 cm), at least 6.1 cm from all others, shifted or not yet shifted.
 
-    So no two items ever overlap. The official code shifts all at once and keeps the best of 20 draws; of
-    its 15 places some then lie 4.7 cm apart, and items 6 cm wide are thrown off when they are revealed
+    So no two items ever overlap. The official code shifts all at once and keeps the best of 20 draws. Some
+    of its 15 places are then 4.7 cm apart, and items 6 cm wide are pushed away when they are revealed
     (measured: by up to 10 cm).
     """
     places = centres_m.copy()

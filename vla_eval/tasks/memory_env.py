@@ -1,4 +1,4 @@
-"""What all memory tasks share: robot, cameras, table, phases, placing and parking of objects.
+"""The base of all memory tasks: robot, cameras, table, phases, placing and parking of objects.
 
 Differences from the official code that concern every task (reasons in `docs/tasks.md`):
 
@@ -33,7 +33,7 @@ PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 """Index of a phase in tensors -> its name."""
 
 QPOS_NOISE_RAD = 0.02
-FLOOR_Z_M = -0.9196429  # ManiSkill's table is as high as this
+FLOOR_Z_M = -0.9196429  # the height of ManiSkill's table
 PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
@@ -56,21 +56,21 @@ def step_range(name: str, value: StepRange) -> tuple[int, int]:
 
 
 class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
-    """A Panda with a wrist camera at a table, and the clock of cue, delay and response.
+    """A Panda with a wrist camera at a table, with the phases cue, delay and response.
 
     Args:
-        cue_steps: control steps during which the cue is shown; a pair is drawn from per episode.
-        delay_steps: control steps between the cue and the choice; likewise.
+        cue_steps: control steps during which the cue is shown; a pair is a range to draw from per episode.
+        delay_steps: control steps between the cue and the choice; also takes a pair.
         freeze_until_choice: hold arm and gripper width until the response phase, whatever the action.
         phase_gate_success: success counts only in the response phase (the official code has no gate).
         static_threshold_rad_s: the arm is at rest if no joint moves faster.
         instruction: the sentence for `info["language_instruction"]`; `gymnasium.make` gives the paper's.
-        reconfiguration_freq: rebuild the scene every so many resets. None: at every reset on the CPU
-            simulator (20 ms), never on the GPU simulator. In a scene that is used again PhysX keeps
-            contact caches, by which states differ from those of a fresh scene (measured: from 1e-7 to
-            15 rad/s after contact).
+        reconfiguration_freq: number of resets after which the scene is rebuilt. None: at every reset on
+            the CPU simulator (20 ms), never on the GPU simulator. In a reused scene PhysX keeps contact
+            caches, so states differ from those of a new scene (measured: from 1e-7 to 15 rad/s after
+            contact).
         robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh; or another
-            arm that the task knows (`SUPPORTED_ROBOTS`).
+            arm that the task supports (`SUPPORTED_ROBOTS`).
     """
 
     SUPPORTED_ROBOTS: tuple[str, ...] = tuple(WRIST_MESH_ROBOTS.values())
@@ -79,7 +79,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     FAMILY: int
     """Number of the task family in random streams. Part of every result: never renumber, only add."""
     PROMPT_DIMS: tuple[str, ...] = ()
-    """Names of the numbers that say what is asked for, if a sentence cannot; rad."""
+    """Names of the numbers that specify the goal, if a sentence cannot; rad."""
     HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
     HUMAN_CAMERA_TARGET: tuple[float, float, float] = (-0.3, 0.0, 0.0)
 
@@ -128,9 +128,9 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return CameraConfig("render_camera", pose, 512, 512, 1.0, 0.01, 100)
 
     def _reconfigure(self, options: dict[str, Any]) -> None:
-        # Shapes have materials even where nothing is rendered, and SAPIEN starts its renderer for a material
-        # and stops it with the last one: without this one, once for every shape. It must not stay, because
-        # there is one renderer in a process, and whoever renders chooses its device.
+        # Shapes have materials even if nothing is rendered. SAPIEN starts its renderer for the first material
+        # and stops it with the last one: without this one, once for every shape. It must not stay alive,
+        # because there is one renderer per process, and the first to render chooses its device.
         kept = None if can_render(self._render_device) else sapien.render.RenderMaterial()
         super()._reconfigure(options)
         del kept
@@ -151,7 +151,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         raise NotImplementedError
 
     def parking_pose(self, name: str, *, half_height_m: float) -> sapien.Pose:
-        """Return where the object of this name rests while hidden, world frame."""
+        """Return the position of a hidden object of this name, world frame."""
         index = self._park_index.setdefault(name, len(self._park_index))
         return sapien.Pose(p=[PARK_X_M + PARK_SPACING_M * index, 0, FLOOR_Z_M + half_height_m])
 
@@ -178,11 +178,11 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         self._on_phase_edges(torch.zeros_like(self._elapsed_steps), mask)
 
     def _sample_episode(self, env: int) -> None:
-        """Draw all that is random of one episode, from `episode_generator` alone."""
+        """Draw all random values of one episode, from `episode_generator` alone."""
         raise NotImplementedError
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
-        """Put everything where it is before the first phase, and empty the latches, where `mask` holds."""
+        """Place all objects as before the first phase, and reset the latches, where `mask` holds."""
         raise NotImplementedError
 
     def episode_generator(self, env: int, stream: Stream) -> np.random.Generator:
@@ -190,17 +190,17 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return generator(int(self._episode_seed[env]), stream, *self.stream_key())
 
     def stream_key(self) -> tuple[int, ...]:
-        """Return numbers that tell this task's draws from another's.
+        """Return numbers that separate this task's random draws from those of other tasks.
 
-        Without them the same seed would have the same answer in every task with as many candidates, and
-        the luck of a blind arm would be the same luck in all of them.
+        Without them the same seed would give the same answer in every task with as many candidates, and
+        the successes of a blind arm would be correlated between tasks.
         """
         return (self.FAMILY,)
 
     # ---------------------------------------------------------------- phases
 
     def total_cue_steps(self, cue_steps: int) -> int:
-        """Return how long the cue phase lasts; a task that shows several things in turn takes longer."""
+        """Return the length of the cue phase; it is longer if a task shows several objects in turn."""
         return cue_steps
 
     def longest_wait_steps(self) -> int:
@@ -212,7 +212,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return (step >= self._cue_end_step).long() + (step >= self._response_step).long()
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
-        """Hide and reveal objects where a phase begins at `step`; the only place that does.
+        """Hide and reveal objects where a phase begins at `step`; no other method does.
 
         Returns:
             Whether anything was moved.
@@ -220,7 +220,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         raise NotImplementedError
 
     def _update_latches(self, step: torch.Tensor) -> None:
-        """Take down what happened in this control step and will be asked for later."""
+        """Record what happened in this control step and is needed later."""
 
     def _after_control_step(self) -> None:
         if self.gpu_sim_enabled:
@@ -243,12 +243,12 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             self.scene._reset_mask = previous
 
     def move(self, actor: Actor, mask: torch.Tensor, poses: Pose | sapien.Pose) -> None:
-        """Put an actor, at rest, to a pose in the environments of the mask.
+        """Move an actor, at rest, to a pose in the environments of the mask.
 
         Args:
             actor: dynamic or kinematic.
             mask: (B,) bool.
-            poses: (B,) poses of which the rows of the mask are used, or one pose for all; world frame.
+            poses: (B,) poses, of which the rows of the mask are used, or one pose for all; world frame.
         """
         if not bool(mask.any()):
             return
@@ -310,17 +310,17 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return begun
 
     def gated(self, success: torch.Tensor) -> torch.Tensor:
-        """Return success where it may count: in the response phase, or always if the gate is open."""
+        """Return success where it counts: in the response phase, or always without the gate."""
         if not self.phase_gate_success:
             return success
         return success & self.response_begun()
 
     def moving_bodies(self) -> dict[str, Body]:
-        """Return name -> body of what an expert may see besides candidates."""
+        """Return name -> body of the objects that an expert may see in addition to candidates."""
         return {}
 
     def tcp_yaw_rad(self) -> torch.Tensor:
-        """Return (B,): how far the gripper is turned about world z; 0 with the fingers in a row along y."""
+        """Return (B,): the gripper's yaw about world z; 0 with the fingers aligned along y."""
         return yaw_rad(self.agent.tcp.pose.q)
 
     def prompt(self) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The mug of the shell game: built from primitives in code, or the YCB asset where it is installed.
+"""The mug of the shell game: built from primitives in code, or the YCB asset if it is installed.
 
 Dimensions are those of the real object of YCB, `025_mug`: 0.117 x 0.093 x 0.081 m with its handle,
 0.118 kg (YCB object set, table of object sizes). The mug is one hollow body: it can stand over a ball.
@@ -45,7 +45,7 @@ def _boxes() -> list[tuple[sapien.Pose, list[float]]]:
     return boxes
 
 
-# Without a gap: standing upside down, the mug must not show the ball through its bottom.
+# Without a gap: upside down, the mug must not show the ball through its bottom.
 BOTTOM_RADIUS_M = OUTER_RADIUS_M - WALL_M / 2
 BOTTOM_POSE = sapien.Pose([0, 0, -HEIGHT_M / 2 + WALL_M / 2], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
 

@@ -1,4 +1,4 @@
-"""Tasks without cue and delay: what must be remembered is seen at the start, and then changes."""
+"""Tasks without cue and delay: the information to remember is visible at the start, and then changes."""
 
 from typing import Any
 
@@ -9,17 +9,17 @@ from vla_eval.tasks.memory_env import MemoryTableEnv
 
 
 class OnePhaseEnv(MemoryTableEnv):
-    """A memory task of which the whole episode is response; nothing is hidden or revealed.
+    """A memory task whose whole episode is the response phase; nothing is hidden or revealed.
 
     Arguments: those of `MemoryTableEnv` without `cue_steps` and `delay_steps`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Refuse lengths of phases that there are not."""
+        """Refuse lengths of phases that do not exist."""
         for name in ("cue_steps", "delay_steps"):
             if name in kwargs:
                 raise TaskArgumentError(
-                    f"{name}: this task has no phases, its objects are always to be seen. Leave it out."
+                    f"{name}: this task has no phases, its objects are always visible. Remove this argument."
                 )
         super().__init__(*args, cue_steps=0, delay_steps=0, **kwargs)
 

@@ -1,7 +1,7 @@
 """The Remember tasks: an item is shown, hidden, and must be recognised among others.
 
-What tells the items apart is their colour, their shape, or both: one class each, which says what the
-items are; the phases are the same.
+The items differ in colour, in shape, or in both. There is one class for each case, which defines the items;
+the phases are the same.
 """
 
 from typing import Any
@@ -25,17 +25,17 @@ MIXED_COLORS = COLORS[:3]
 class RememberEnv(ItemChoiceEnv):
     """Find the item that was shown before.
 
-    Description: an item lies in the middle of the table (cue), then the table is empty (delay), then N
-    items, that one among them, lie at N places in random order (response).
+    Description: an item lies at the centre of the table (cue), then the table is empty (delay), then N
+    items, including that one, lie at N places in random order (response).
 
-    The families below say which items there are. Everything else is the same:
+    The families below define the items. Everything else is the same:
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: the oracle's numbers, and 3 per item, its position if it is the right one, else 0).
+    `state` (in addition: the oracle's numbers, and 3 per item, its position if it is the right one, else 0).
 
-    Rewards: dense: reach 1 + slow down 0.5 + stand still 0.5, or 3 where solved; see `docs/tasks.md`.
+    Rewards: dense: reach 1 + slow down 0.5 + stand still 0.5, or 3 if solved; see `docs/tasks.md`.
 
     Starting state: arm at rest with joint noise of 0.02 rad; item uniform; places permuted uniformly.
 
@@ -120,8 +120,8 @@ class RememberShapeEnv(RememberEnv):
 class RememberShapeAndColorEnv(RememberEnv):
     """RememberShapeAndColor: find the item that has shape and colour shown before; see `RememberEnv`.
 
-    Arguments: `n_shapes` 1 to 5, `n_colors` 1 to 3, `official_3x2` (two shapes in three colours, as the
-    official code has it under the name of three shapes in two colours), and those of the base classes.
+    Arguments: `n_shapes` 1 to 5, `n_colors` 1 to 3, `official_3x2` (two shapes in three colours, which the
+    official code calls three shapes in two colours), and those of the base classes.
     """
 
     FAMILY = 5

@@ -1,9 +1,9 @@
 """The arms: ManiSkill's Panda with a wrist camera, and the same with a lighter mesh of that camera.
 
 The camera's mesh (`d415.stl`) holds 425,160 of the scene's 581,280 triangles and most of the rendering
-time on a CPU. The light variant replaces it, for drawing only, by one whose vertices are snapped to a
-grid of `GRID_M`; physics, collision shapes and the wrist camera's view are the same, the base camera
-sees slightly other pixels on the camera's body. The file is made on first use in the user's cache.
+time on a CPU. The light variant replaces it, for rendering only, by one whose vertices are snapped to a
+grid of `GRID_M`. Physics, collision shapes and the wrist camera's view are the same; the base camera sees
+slightly different pixels on the camera's body. The file is created on first use in the user's cache.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ def snap_to_grid(triangles: FloatArray, grid_m: float) -> FloatArray:
     cells = cell_of_corner.reshape(-1, 3)
     distinct = (cells[:, 0] != cells[:, 1]) & (cells[:, 1] != cells[:, 2]) & (cells[:, 0] != cells[:, 2])
     cells = cells[distinct]
-    # Rotate each triangle so that its smallest cell comes first: keeps the winding, shows duplicates.
+    # Rotate each triangle so that its smallest cell comes first: keeps the winding, reveals duplicates.
     first = cells.argmin(axis=1)
     order = (first[:, None] + np.arange(3)) % 3
     cells = np.unique(np.take_along_axis(cells, order, axis=1), axis=0)
@@ -72,10 +72,10 @@ def write_binary_stl(path: Path, triangles: FloatArray) -> None:
 
 
 def light_urdf() -> Path:
-    """Return the URDF of the Panda with the light camera mesh, making it if it is not in the cache.
+    """Return the URDF of the Panda with the light camera mesh; create it if it is not in the cache.
 
-    The folder's name is a digest of what it was made from, and it appears by a rename: workers that
-    start together cannot see half a file.
+    The folder's name is a digest of its sources. It is created atomically by a rename, so workers that
+    start together cannot see a partial file.
     """
     source_mesh, source_urdf = _PANDA_DIR / _CAMERA_MESH, _PANDA_DIR / "panda_v3.urdf"
     digest = hashlib.sha256(f"{GRID_M} {_PANDA_DIR}".encode() + source_urdf.read_bytes())
@@ -104,13 +104,13 @@ def light_urdf() -> Path:
 
 @register_agent()
 class PandaWristCamLight(PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
-    """`panda_wristcam`, drawn with fewer triangles."""
+    """`panda_wristcam`, rendered with fewer triangles."""
 
     uid = "panda_wristcam_light"
 
     @property
     def urdf_path(self) -> str:
-        """Path of the URDF; made when the first such arm is loaded."""
+        """Path of the URDF; created when the first such arm is loaded."""
         return str(light_urdf())
 
 

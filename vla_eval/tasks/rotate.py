@@ -1,4 +1,4 @@
-"""Rotate: turn a peg by a given angle, counted from how it lay at the start."""
+"""Rotate: turn a peg by a given angle, relative to its initial orientation."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from vla_eval.seeding import Stream
 from vla_eval.tasks.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
 from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive, check_range
 
-PEG_RANGE_M = 0.1  # the peg's middle is within ± this in x and y
+PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
 LENIENT_REACH_M = 0.1
 STRICT_REACH_M = 0.04
@@ -22,29 +22,29 @@ OFFICIAL_SIGN_SPLIT = 0.5
 
 
 class RotateEnv(OnePhaseEnv):
-    """Rotate: turn the peg by the angle asked for; strictly, without moving its middle.
+    """Rotate: turn the peg by the target angle; in the strict variant, without moving its centre.
 
-    Description: a blue peg lies on the table, turned in any way. It must be turned about the vertical by
-    an angle that is told at each step; how it lay at first is to be remembered.
+    Description: a blue peg lies on the table in a random orientation. It must be turned about the vertical
+    by an angle that is part of each observation. The initial orientation has to be remembered.
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, `extra/task_cue`: the
-    angle asked for, rad, counterclockwise seen from above; two cameras) or `state` (besides qpos, qvel,
-    tcp pose: angle still to be turned 1, peg pose 7).
+    target angle, rad, counterclockwise seen from above; two cameras) or `state` (in addition to qpos, qvel,
+    tcp pose: remaining angle 1, peg pose 7).
 
-    Rewards: dense, lenient: 1 for nearing the peg's middle; near it up to 15 for the angle; 5 at the
-    angle, 2 at rest there; 25 where solved. Strict: 0.5; near it up to 10 for the place and 35 for the
-    angle; 10 and 5; 100 where solved.
+    Rewards: dense, lenient: 1 for approaching the peg's centre; near it up to 15 for the angle; 5 at the
+    angle, 2 at rest there; 25 if solved. Strict: 0.5; near it up to 10 for the position and 35 for
+    the angle; 10 and 5; 100 if solved.
 
-    Starting state: middle in ±10 cm, yaw uniform.
+    Starting state: centre in ±10 cm, yaw uniform.
 
     Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases.
 
-    Arguments: `angle_range_rad` (least, most) of what is asked for; `signed` (either direction);
+    Arguments: `angle_range_rad` (least, most) of the target angle; `signed` (either direction);
     `official_signs` (only the larger half of the angles positive, the smaller half negative, as in the
-    official code); `angle_threshold_rad`; `position_threshold_m` for the middle's x and y, None: it may go
-    anywhere; `tilt_threshold_rad` for how far the peg's top may lean from the vertical, None: not looked at;
+    official code); `angle_threshold_rad`; `position_threshold_m` for the centre's x and y, None: any
+    position; `tilt_threshold_rad` for the tilt of the peg's top from the vertical, None: not checked;
     `peg_half_length_m`, `peg_half_width_m`; and those of `OnePhaseEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates.
@@ -98,7 +98,7 @@ class RotateEnv(OnePhaseEnv):
         super().__init__(*args, **kwargs)
 
     def stream_key(self) -> tuple[int, ...]:
-        """Return the family's number, whether angles have signs, and whether the place matters."""
+        """Return the family's number, whether angles have signs, and whether the position matters."""
         return (self.FAMILY, int(self.signed), int(self.position_threshold_m is not None))
 
     def _load_items(self) -> None:
@@ -162,7 +162,7 @@ class RotateEnv(OnePhaseEnv):
         return upwards > math.cos(self.tilt_threshold_rad)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Read success: turned as asked for, in place, level, arm at rest; changes nothing."""
+        """Read success: turned by the target angle, in place, level, arm at rest; changes nothing."""
         remaining, static = self._remaining_rad(), self.is_static()
         at_angle = remaining.abs() < self.angle_threshold_rad
         shift = self._shift_m()
@@ -176,7 +176,7 @@ class RotateEnv(OnePhaseEnv):
         }
 
     def moving_bodies(self) -> dict[str, Body]:
-        """Return `peg`, and `goal`: its first place and the yaw asked for."""
+        """Return `peg`, and `goal`: its first position and the target yaw."""
         peg = self.peg.pose
         goal_yaw = wrapped_rad(self._first_yaw + self._target_angle)
         return {
@@ -185,11 +185,11 @@ class RotateEnv(OnePhaseEnv):
         }
 
     def oracle_info(self) -> torch.Tensor:
-        """Return (B,): the angle by which the peg must still be turned, rad."""
+        """Return (B,): the remaining angle, rad."""
         return self._remaining_rad()
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Reach the peg's middle, keep the peg in place where that matters, turn it, rest."""
+        """Reach the peg's centre, keep the peg in place if that matters, turn it, rest."""
         distance = torch.linalg.norm(self.peg.pose.p - self.tcp_position_m(), dim=1)
         error = info["y_angle_error"]
         at_angle = error < self.angle_threshold_rad

@@ -1,6 +1,6 @@
 """BunchOfColors, SeqOfColors, ChainOfColors: several cubes are shown, and all of them must be found again.
 
-What differs is how they are shown (together, or one after another) and whether the order counts.
+They differ in how the cubes are shown (together, or one after another) and whether the order counts.
 """
 
 import math
@@ -19,7 +19,7 @@ from vla_eval.tasks.spec import total_cue_steps
 
 TOUCH_ABOVE_TOP_M = 0.005  # the point to touch: official 2.5 cm over the centre of a cube of 4 cm
 TOUCH_RADIUS_M = 0.02
-# Where cubes that are shown together lie: an arc, squeezed in y by so much per place (official constants).
+# Cubes that are shown together lie on an arc, compressed in y by this much per place (official constants).
 BUNCH_RADIUS_M = 0.22
 BUNCH_SQUEEZE_M = 0.015
 MAX_STEPS = 10_000  # of anything: 500 s
@@ -28,10 +28,10 @@ MISTAKE_REWARD = -10.0
 
 
 def bunch_place_m(color: int, n_colors: int) -> tuple[float, float]:
-    """Return (x, y) where the cube of this colour lies while cubes are shown together, world frame.
+    """Return the (x, y) of the cube of this colour while cubes are shown together, world frame.
 
-    Source: official task code, constants as measured (`docs/tasks.md`); numbers of colours that it does
-    not have follow the same rule.
+    Source: official task code, constants as measured (`docs/tasks.md`); other numbers of colours follow
+    the same rule.
     """
     rank = color - n_colors // 2
     angle = math.pi * rank / n_colors
@@ -46,17 +46,17 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     A cube is touched when, in the response phase, the tool centre point is within `goal_threshold_m` of
     the point half a centimetre over the cube's top, with the arm at rest, for `dwell_steps` steps. All
-    that were shown must be touched, in the order shown if the family says so. The first touch of a wrong
-    cube, or out of turn, spoils the episode; touching a cube again changes nothing.
+    that were shown must be touched, in the order shown if the family requires it. After the first touch of a
+    wrong cube, or out of order, the episode can no longer succeed; touching a cube again changes nothing.
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: vector to the next cube 3, sequence L, and per cube: position 3, touched 1, right 1,
+    `state` (in addition: vector to the next cube 3, sequence L, and per cube: position 3, touched 1, right 1,
     next 1).
 
     Rewards: dense, from the response phase on: reach the next cube 1 + slow down 0.5 + 90 per share found
-    - 10 per mistake, or 100 where solved; see `docs/tasks.md`.
+    - 10 per mistake, or 100 if solved; see `docs/tasks.md`.
 
     Starting state: arm at rest with joint noise of 0.02 rad; colours shown and places drawn uniformly.
 
@@ -98,8 +98,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
             raise TaskArgumentError(f"gap_steps={gap_steps}: the cubes of this task are shown together.")
         if not phase_gate_success:
             raise TaskArgumentError(
-                "phase_gate_success=False: touches count in the response phase only in these tasks, in the "
-                "official code, too. Leave the argument out."
+                "phase_gate_success=False: in these tasks touches count only in the response phase, as in "
+                "the official code. Remove this argument."
             )
         self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
         self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
@@ -112,7 +112,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         return (self.FAMILY, self.n_items, self.n_shown)
 
     def total_cue_steps(self, cue_steps: int) -> int:
-        """Return how long the cue phase lasts if each cube is shown for `cue_steps`."""
+        """Return the length of the cue phase if each cube is shown for `cue_steps`."""
         return total_cue_steps(cue_steps, self.n_shown if self.ONE_BY_ONE else 1, self.gap_steps)
 
     def chance_success(self) -> float:
@@ -161,7 +161,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
             self.move(actor, mask & self._is_shown[:, index], place)
 
     def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """Show and hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
+        """Show or hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
         # `total_cue_steps` solved for the steps of one cube, which may be drawn per episode.
         turn_steps = (self._cue_end_step + self.gap_steps) // self.n_shown
         turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(max=self.n_shown - 1)
@@ -188,12 +188,12 @@ class SeveralColorsEnv(ItemChoiceEnv):
         return tuple(int(i) for i in self._sequence[env])
 
     def _n_found(self) -> torch.Tensor:
-        """Return (B,) how many cubes were touched rightly."""
+        """Return (B,) how many right cubes were touched."""
         n_found: torch.Tensor = ((self._touch_rank > 0) & ~self._touched_wrongly).sum(dim=1)
         return n_found
 
     def target_index(self) -> torch.Tensor:
-        """Return (B,) the cube to touch next; where the order is free, the first by colour (official)."""
+        """Return (B,) the cube to touch next; if any order is allowed, the first by colour (official)."""
         if self.in_order:
             return self._of_sequence(self._n_found().clamp(max=self.n_shown - 1))
         left = self._is_shown & (self._touch_rank == 0)

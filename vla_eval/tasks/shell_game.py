@@ -27,18 +27,18 @@ UPSIDE_DOWN_WXYZ = (0.0, 1 / _NORM, 0.5 / _NORM, 0.0)  # official (0, 1, 0.5, 0)
 
 
 class ShellGameEnv(ChoiceEnv):
-    """Find the mug that stands over the ball; the families say what is to be done with it.
+    """Find the mug that stands over the ball; the families define what to do with it.
 
     Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
     stands on each of them, one over the ball (response, without a delay).
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
-    Starting state: middle of the row uniform in ±10 cm; the ball's place uniform.
+    Starting state: centre of the row uniform in ±10 cm; the ball's place uniform.
 
     Episode end: 90 control steps; success and failure are reported but end nothing by themselves.
 
-    Arguments: `mug` (`primitive`, or `ycb` where installed), and those of `ChoiceEnv`, `MemoryTableEnv`.
+    Arguments: `mug` (`primitive`, or `ycb` if installed), and those of `ChoiceEnv`, `MemoryTableEnv`.
 
     Chance level: 1/3 for a perfect arm that ignores the cue.
     """
@@ -83,7 +83,7 @@ class ShellGameEnv(ChoiceEnv):
         return sapien.Pose(p=pose.p, q=list(UPSIDE_DOWN_WXYZ))
 
     def _mug_orientation_wxyz(self) -> torch.Tensor:
-        """Return how all mugs are turned when they appear, (4,) or (B, 4)."""
+        """Return the orientation of all mugs when they appear, (4,) or (B, 4)."""
         return torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device)
 
     def _sample_episode(self, env: int) -> None:
@@ -110,7 +110,7 @@ class ShellGameEnv(ChoiceEnv):
         begun = self._cue_end_step if self.show_cue else torch.zeros_like(self._cue_end_step)
         hidden = mask & (step >= begun) & (step < self._response_step)
         self.reveal(choice_begins, self._mug_orientation_wxyz())
-        # Between cue and choice the ball is out of sight; later it goes where its mug goes.
+        # Between cue and choice the ball is hidden; later it moves with its mug.
         self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
         covered = mask & (step >= self._response_step)
         self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
@@ -129,9 +129,9 @@ class ShellGameTouchEnv(ShellGameEnv):
     """ShellGameTouch: reach the mug that stands over the ball; see `ShellGameEnv`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: pose of the right mug 7, of the ball 7, oracle 1).
+    `state` (in addition: pose of the right mug 7, of the ball 7, oracle 1).
 
-    Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 where solved.
+    Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 if solved.
 
     Arguments: `goal_threshold_m`, and those of `ShellGameEnv`.
 

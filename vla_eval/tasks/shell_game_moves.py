@@ -1,7 +1,7 @@
 """ShellGamePush and ShellGamePick: the mug over the ball must be moved, forwards or up.
 
-A mug counts as chosen once it has been moved, in the response phase, by as much as success needs, but
-at most `CHOSEN_M`: a wrong one that is shoved aside counts, one that is brushed does not.
+A mug counts as chosen once it has been moved, in the response phase, by the distance that success needs,
+but at most `CHOSEN_M`: a wrong mug that is pushed aside counts, one that is only brushed does not.
 """
 
 import math
@@ -19,8 +19,8 @@ CHOSEN_M = 0.02
 GOAL_ABOVE_BALL_M = 0.025
 PUSH_REACH_M = 0.08
 PICK_REACH_M = 0.04
-# The official quaternions (0, 1, s, 0): s depends on the mug that hides the ball, and so the handles show
-# it. Here all mugs have the last one.
+# The official quaternions (0, 1, s, 0): s depends on the mug that hides the ball, so the handles reveal it.
+# Here all mugs have the last one.
 OFFICIAL_TURNS = (2.3, 2.7, 2.5)
 
 
@@ -30,7 +30,7 @@ def _upside_down_wxyz(turn: float) -> tuple[float, float, float, float]:
 
 
 class ShellGameMoveEnv(ShellGameEnv):
-    """Move the mug that stands over the ball to a goal of its own; see `ShellGameEnv`."""
+    """Move the mug that stands over the ball to its goal; see `ShellGameEnv`."""
 
     MODE: int
     """Number of the mode in random streams. Part of every result: never renumber, only add."""
@@ -38,15 +38,15 @@ class ShellGameMoveEnv(ShellGameEnv):
     RESTING_WEIGHT = 0.2
 
     def stream_key(self) -> tuple[int, ...]:
-        """Return the shell game's number and the mode's: the same seed has other places in each mode."""
+        """Return the shell game's number and the mode's: a seed gives different places in each mode."""
         return (self.FAMILY, self.MODE)
 
     def _goal_offset_m(self) -> tuple[float, float, float]:
-        """Return where the goal is, seen from the ball's centre; world frame."""
+        """Return the goal relative to the ball's centre; world frame."""
         raise NotImplementedError
 
     def goal_positions_m(self) -> torch.Tensor:
-        """Return (B, N, 3): where each mug would have to go, were the ball under it; world frame."""
+        """Return (B, N, 3): the goal of each mug if the ball were under it; world frame."""
         goals = self._slots.clone()
         goals[:, :, 2] = BALL_RADIUS_M
         return goals + torch.tensor(self._goal_offset_m(), device=self.device)
@@ -61,13 +61,13 @@ class ShellGameMoveEnv(ShellGameEnv):
         return placed
 
     def _chosen_m(self) -> float:
-        """Return by how much a mug must have been moved to count as chosen."""
+        """Return the distance by which a mug must have been moved to count as chosen."""
         return CHOSEN_M
 
     def _update_latches(self, step: torch.Tensor) -> None:
         moved_m = torch.linalg.norm(self.candidate_positions_m() - self._slots, dim=2)
         moved_m = torch.where((step > self._response_step)[:, None], moved_m, 0.0)
-        # The one moved most first: it was touched first if two pass the limit in the same step.
+        # Largest movement first: it was touched first if two pass the limit in the same step.
         for rank in range(N_MUGS):
             farthest, index = moved_m.sort(dim=1, descending=True)
             self._latch_touch(farthest[:, rank] >= self._chosen_m(), index[:, rank])
@@ -95,13 +95,14 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     """ShellGamePush: push the mug that stands over the ball forwards; see `ShellGameEnv`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: goal 3, pose of the right mug 7, of the ball 7, oracle 1).
+    `state` (in addition: goal 3, pose of the right mug 7, of the ball 7, oracle 1).
 
     Rewards: dense, from the response phase on: reach the mug 1, bring it to the goal 2 while the tool
-    centre point is within 8 cm of it, slow down 0.2 and stand still 0.2 there; 4 where solved.
+    centre point is within 8 cm of it, slow down 0.2 and stand still 0.2 there; 4 if solved.
 
-    Arguments: `push_distance_m`, how far ahead of the ball the goal is; `goal_threshold_m`, how near the
-    mug's centre must come to it (with the defaults a push of 2 cm is enough); and those of `ShellGameEnv`.
+    Arguments: `push_distance_m`, distance of the goal ahead of the ball; `goal_threshold_m`, maximum
+    distance of the mug's centre from it (with the defaults a push of 2 cm is enough); and those of
+    `ShellGameEnv`.
 
     Version history: 1, first version.
     """
@@ -113,7 +114,7 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     def __init__(
         self, *args: Any, push_distance_m: float = 0.1, goal_threshold_m: float = 0.08, **kwargs: Any
     ) -> None:
-        """Refuse a goal in which the mug already stands."""
+        """Refuse a goal that contains the mug's first position."""
         check_positive(push_distance_m=push_distance_m)
         if not 0 < goal_threshold_m < push_distance_m:
             raise TaskArgumentError(
@@ -142,15 +143,15 @@ class ShellGamePickEnv(ShellGameMoveEnv):
     """ShellGamePick: lift the mug that stands over the ball; see `ShellGameEnv`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: goal 3, pose of the right mug 7, of the ball 7, oracle 1, grasped 1).
+    `state` (in addition: goal 3, pose of the right mug 7, of the ball 7, oracle 1, grasped 1).
 
     Rewards: dense, from the response phase on: reach the mug 3; with the tool centre point within 4 cm of
-    its centre 2, bring it to the goal 30, slow down 5 and stand still 5 there; 75 where solved.
+    its centre 2, bring it to the goal 30, slow down 5 and stand still 5 there; 75 if solved.
 
-    Arguments: `lift_height_m`, by how much the mug's centre must have risen (the paper's 0.1 m);
-    `goal_threshold_m` (0.08: the official rule instead, the mug's centre within so many metres of a point
+    Arguments: `lift_height_m`, height by which the mug's centre must have risen (the paper's 0.1 m);
+    `goal_threshold_m` (0.08: the official rule instead, the mug's centre within this distance of a point
     `lift_height_m` + 2.5 cm over the ball, for which 2.4 cm are enough); `official_mug_yaws` (the handles
-    show which mug it is, as in the official code); and those of `ShellGameEnv`.
+    reveal which mug it is, as in the official code); and those of `ShellGameEnv`.
 
     Version history: 1, first version.
     """
@@ -167,7 +168,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         official_mug_yaws: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Refuse a goal in which the mug already is, and one that the arm cannot reach."""
+        """Refuse a goal that contains the mug's first position, and one that the arm cannot reach."""
         if not 0 < lift_height_m <= 0.4:
             raise TaskArgumentError(f"lift_height_m={lift_height_m}: expected > 0 and at most 0.4.")
         if goal_threshold_m is not None and not 0 < goal_threshold_m < lift_height_m:

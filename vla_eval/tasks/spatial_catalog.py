@@ -14,7 +14,7 @@ POSITIVE_RAD, EITHER_SIGN_RAD = (0.1, math.pi / 2), (0.1, math.pi / 4)
 
 
 def _spatial(task: str, horizon_steps: int = 90, **row: Any) -> TaskSpec:  # Any: the other fields of a row
-    """Return a row with what is the same in all of them: there is nothing to choose among."""
+    """Return a row with the fields that all of them share: there are no candidates."""
     return TaskSpec(
         id=f"{task}-v0",
         version=1,

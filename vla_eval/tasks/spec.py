@@ -1,4 +1,4 @@
-"""What is known of a task without starting it: one `TaskSpec` per task id."""
+"""What is known about a task without starting a simulator: one `TaskSpec` per task id."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,26 +14,26 @@ class TaskSpec:
 
     Attributes:
         id: task id without namespace, `RememberColor3-v0`; the gym id is `vla_eval/<id>`.
-        version: raised when a change moves a success rate; recorded with each run.
+        version: raised when a change affects a success rate; recorded with each run.
         entry_point: `module:Class` of the ManiSkill environment.
-        kwargs: arguments that make this row of its family; a user's arguments go on top.
-        horizon_steps: the episode ends after so many control steps of 20 Hz.
-        memory: which kind of memory the paper says it needs.
+        kwargs: arguments that make this row of its family; a user's arguments override them.
+        horizon_steps: number of control steps, at 20 Hz, after which the episode ends.
+        memory: the type of memory that it needs, according to the paper.
         instruction_key: the task's name in `prompts/*.yaml`.
-        description: one sentence: what must be done.
+        description: one sentence: the goal.
         success: one sentence: the success rule.
         oracle: `module:attribute` of the scripted expert.
         oracle_sees: what the expert may see, and when it acts, in words.
-        candidates: what the N things are among which the policy chooses; None if there is no choice.
-        chance_success: success rate of a perfect arm that ignores the cue; None where it has to be
-            measured (there is no choice among candidates), or depends on the arguments (families).
-        max_reward: the dense reward at success, which `normalized_dense` divides by.
-        idle_success: how often doing nothing succeeds, as measured; 0 for all tasks but a few.
+        candidates: the kind of the N objects among which the policy chooses; None if there is no choice.
+        chance_success: success rate of a perfect arm that ignores the cue; None if it has to be measured
+            (there is no choice among candidates), or depends on the arguments (families).
+        max_reward: the dense reward at success, by which `normalized_dense` divides.
+        idle_success: measured success rate of doing nothing; 0 for all tasks but a few.
         cue_marks_place: the cue is shown where the right candidate will be.
         shows_one_by_one: the cue is `n_shown` items one after another, each for `cue_steps`.
-        open_arguments: what has to be chosen to make a task of this row; empty except for a family.
-        min_response_steps: of a family: the horizon grows with cue and delay so that at least so many
-            steps are left for the response. None: the horizon is fixed by the id.
+        open_arguments: arguments required to make a task of this row; empty except for a family.
+        min_response_steps: of a family: the horizon grows with cue and delay so that at least this many
+            steps remain for the response. None: the horizon is fixed by the id.
     """
 
     id: str
@@ -62,17 +62,17 @@ class TaskSpec:
         return f"vla_eval/{self.id}"
 
     def default_horizon_steps(self, longest_wait_steps: int) -> int:
-        """Return how long an episode is, given how long cue and delay can be, where nobody says otherwise."""
+        """Return the default length of an episode, given the maximum length of cue and delay."""
         if self.min_response_steps is None:
             return self.horizon_steps
         return max(self.horizon_steps, longest_wait_steps + self.min_response_steps)
 
 
 def total_cue_steps(cue_steps: int, n_in_turn: int, gap_steps: int) -> int:
-    """Return how long a cue lasts.
+    """Return the length of a cue.
 
     Args:
-        cue_steps: how long each item is shown.
+        cue_steps: steps for which each item is shown.
         n_in_turn: how many items are shown one after another; 1 if all are shown at once.
         gap_steps: steps between two of them.
     """

@@ -1,4 +1,4 @@
-"""TakeItBack: bring the cube to the goal, then back to where it was, which nothing marks any more."""
+"""TakeItBack: move the cube to the goal, then back to its first position, which is not marked."""
 
 from typing import Any
 
@@ -21,8 +21,8 @@ GOAL_X_M = (0.2, 0.25)
 GOAL_Y_M = (-0.025, 0.025)
 DISC_Z_M = 0.001
 DISC_HALF_THICKNESS_M = 1e-5
-PUSH_BEHIND_M = 0.025  # the reward's push point lies so far behind the cube, seen from the goal,
-PULL_AHEAD_M = 0.03  # and its pull point so far ahead of it;
+PUSH_BEHIND_M = 0.025  # distance of the reward's push point behind the cube, seen from the goal,
+PULL_AHEAD_M = 0.03  # and of its pull point ahead of it;
 CONTACT_M = 0.01  # the tool centre point is there within this distance.
 GREEN_RGBA = (0.0, 1.0, 0.0, 1.0)
 RED_RGBA = (194 / 255, 19 / 255, 22 / 255, 1.0)
@@ -30,27 +30,27 @@ VIOLET_RGBA = (147 / 255, 0.0, 211 / 255, 1.0)
 
 
 class TakeItBackEnv(OnePhaseEnv):
-    """TakeItBack: move the cube into the goal region, then back to where it lay.
+    """TakeItBack: move the cube into the goal region, then back to its first position.
 
     Description: a green cube lies in front of the robot, behind it a red disc. Once the cube has been on
-    the disc, the disc turns violet and the cube must go back to its first place, which is not marked.
+    the disc, the disc turns violet and the cube must go back to its first position, which is not marked.
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (besides: goal 3, cube pose 7, first place 3, goal reached 1).
+    `state` (in addition: goal 3, cube pose 7, first place 3, goal reached 1).
 
-    Rewards: dense: until the goal is reached 2 for nearing the point behind the cube, and 5 for the cube
-    nearing the goal while the arm is there; then 10 and 15 likewise for the way back; 30 where solved.
+    Rewards: dense: until the goal is reached, 2 for approaching the point behind the cube, and 5 for the
+    cube approaching the goal while the arm is there; then 10 and 15 for the way back; 30 if solved.
 
     Starting state: cube at x in [-0.05, 0.05], y in one of three bands of 5 cm; goal at x in [0.2, 0.25],
     y in [-0.025, 0.025] m.
 
     Episode end: 180 control steps; success is reported but ends nothing by itself. There are no phases.
 
-    Arguments: `goal_radius_m` and `return_radius_m`, how near the cube's centre must come to the middle of
-    the disc and to its first place; `cube_half_size_m`; `latch_goal_color` (off: the disc is violet only
-    while the cube is on it, as in the official code on the GPU); and those of `OnePhaseEnv`.
+    Arguments: `goal_radius_m` and `return_radius_m`, maximum distance of the cube's centre from the centre
+    of the disc and from its first position; `cube_half_size_m`; `latch_goal_color` (off: the disc is violet
+    only while the cube is on it, as in the official code on the GPU); and those of `OnePhaseEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates.
 
@@ -144,7 +144,7 @@ class TakeItBackEnv(OnePhaseEnv):
         return self._cube_distance_m(self._goal_position) < self.goal_radius_m
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
-        # No phase begins, but the disc changes colour where the cube has come to it, or left it again.
+        # No phase begins, but the disc changes colour when the cube reaches it or leaves it.
         in_goal = self._in_goal()
         violet = in_goal | (self._goal_reached & self.latch_goal_color)
         changed = mask & (step > 0) & (violet != self._is_violet)

@@ -1,7 +1,7 @@
 """Conformance checks for environments, policies and tasks, for us and for third parties.
 
-Each check raises `ConformanceError` with a sentence that says which promise was broken; returning means
-that all of them were kept. They need no test framework:
+Each check raises `ConformanceError` with the requirement that is violated. If it returns, all requirements
+are met. The checks need no test framework:
 
     from vla_eval.testing import check_env, check_policy, check_task
 

@@ -1,4 +1,4 @@
-"""Does an environment keep the contract of `SimEnv`?"""
+"""Does an environment fulfil the contract of `SimEnv`?"""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -13,12 +13,12 @@ SLOT = 0
 
 
 def check_env(make: Callable[[], SimEnv], *, n_steps: int = 8, renders: bool = True) -> None:
-    """Raise `ConformanceError` unless environments that `make` returns keep their promises.
+    """Raise `ConformanceError` unless the environments that `make` returns fulfil the contract.
 
     Args:
         make: returns a new environment of the same settings at each call.
-        n_steps: how many control steps the episodes of the check have.
-        renders: whether the environment can give pictures; otherwise nothing about them is checked.
+        n_steps: number of control steps of the check's episodes.
+        renders: whether the environment can render images; otherwise images are not checked.
     """
     env = make()
     try:

@@ -1,4 +1,4 @@
-"""Does a policy keep the contract of `Policy`?"""
+"""Does a policy fulfil the contract of `Policy`?"""
 
 from collections.abc import Callable, Sequence
 
@@ -19,14 +19,14 @@ def check_policy(
     observe: Callable[[int, int], Observation] | None = None,
     instruction: str = "pick up the red cube",
 ) -> None:
-    """Raise `ConformanceError` unless policies that `make` returns keep their promises.
+    """Raise `ConformanceError` unless the policies that `make` returns fulfil the contract.
 
     Args:
         make: returns a new policy of the same weights at each call.
-        env: what the policy will be run in.
+        env: the environment in which the policy will be run.
         observe: (seed, step) -> an observation, for a policy that needs more than noise in the declared
             shapes (privileged ones do).
-        instruction: what the policy is told.
+        instruction: the instruction that the policy gets.
 
     Raises:
         SpecMismatchError: the policy needs what the environment does not provide.
@@ -62,7 +62,7 @@ def _episode(
     seeds: Sequence[int],
     instruction: str,
 ) -> list[list[ActionChunk]]:
-    """Return the chunks of one episode per seed, inferred side by side."""
+    """Return the chunks of one episode per seed, predicted side by side."""
     starts = [
         EpisodeStart(
             slot=slot, task="check", seed=seed, run=0, instruction=instruction, horizon_steps=HORIZON_STEPS

@@ -1,4 +1,4 @@
-"""Does a task of the catalogue keep what its row says?"""
+"""Does a task of the catalogue behave as its row says?"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,17 +26,17 @@ def check_task(
     n_episodes: int = 10,
     simulator: Simulator = "maniskill",
 ) -> None:
-    """Raise `ConformanceError` unless the task keeps its promises; nothing is rendered.
+    """Raise `ConformanceError` unless the task behaves as its row says; nothing is rendered.
 
-    The environment keeps its contract (`check_env`), doing nothing never succeeds (but where the row says
-    so), the oracle succeeds in at least nine of ten episodes and finds the right candidate first, and the
-    phases come in order.
+    The environment fulfils its contract (`check_env`). Doing nothing never succeeds, unless the row says so.
+    The oracle succeeds in at least nine of ten episodes and touches the right candidate first. The phases
+    come in order.
 
     Args:
         task: task id.
         kwargs: task arguments.
-        n_episodes: how many episodes each control plays.
-        simulator: where it runs.
+        n_episodes: number of episodes per control.
+        simulator: `maniskill` or `fake`.
     """
     settings = EnvSettings(task=task, kwargs=kwargs or {}, privileged=True, simulator=simulator)
     check_env(lambda: make_env(settings), renders=False)

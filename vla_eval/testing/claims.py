@@ -1,4 +1,4 @@
-"""One way of saying that a promise was broken."""
+"""Raise the error for a violated requirement."""
 
 import numpy as np
 
@@ -7,11 +7,11 @@ from vla_eval.errors import ConformanceError
 
 
 def claim(kept: bool, promise: str, found: str = "") -> None:
-    """Raise `ConformanceError` unless the promise was kept.
+    """Raise `ConformanceError` unless the requirement is met.
 
     Args:
-        kept: whether it was.
-        promise: the promise as a sentence.
+        kept: whether it is met.
+        promise: the requirement as a sentence.
         found: what was found instead.
     """
     if not kept:

@@ -1,7 +1,7 @@
-"""A made-up dataset in the form of ours: for tests, and to measure loaders without recordings.
+"""A synthetic dataset in our format: for tests, and to measure loaders without recorded data.
 
-Pictures drift, as a camera's do, so that the codec has ordinary work; all numbers are random. Nothing
-here was ever simulated, and no manifest says so: it is not a complete dataset.
+Images drift like those of a moving camera, so the codec has realistic work. All numbers are random. Nothing
+was simulated and there is no manifest, so it is not a complete dataset.
 """
 
 import dataclasses
@@ -32,14 +32,14 @@ INSTRUCTIONS = ("look, wait, choose", "follow the ball")
 def write_synthetic_dataset(
     root: Path, *, n_episodes: int, n_frames: int, state: StateKind = "eef", seed: int = 0
 ) -> Path:
-    """Write a `LeRobotDataset` of made-up episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
+    """Write a `LeRobotDataset` of synthetic episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
 
     Args:
-        root: the folder to make.
-        n_episodes: how many; two instructions take turns.
+        root: the folder to create.
+        n_episodes: number of episodes; two instructions alternate.
         n_frames: length of the shortest.
         state: which proprioception `observation.state` is.
-        seed: of all that is drawn.
+        seed: of all random values.
     """
     features = dataset_features(state)
     dataset = LeRobotDataset.create(
@@ -48,7 +48,7 @@ def write_synthetic_dataset(
         features=features,
         root=root,
         streaming_encoding=True,
-        encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames where its queue is full
+        encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames if its queue is full
         rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
         video_backend=video_decoder(),
     )
@@ -73,7 +73,7 @@ def write_synthetic_dataset(
 
 
 def _texture(rng: np.random.Generator) -> ImageArray:
-    """Return a picture of 8 × 8 px tiles with a little noise."""
+    """Return an image of 8 × 8 px tiles with a little noise."""
     height, width, channels = IMAGE_SHAPE
     tiles = rng.integers(40, 216, (height // 8, width // 8, channels)).repeat(8, 0).repeat(8, 1)
     return (tiles + rng.integers(-8, 9, IMAGE_SHAPE)).astype(np.uint8)

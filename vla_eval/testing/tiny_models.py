@@ -1,7 +1,7 @@
-"""The π0 family, SmolVLA and ACT with few random weights, for tests: the whole way without network or GPU.
+"""The π0 family, SmolVLA and ACT with few random weights, for tests of the pipeline without network or GPU.
 
-lerobot 0.6.1 builds these models in full size only, so some names of its modules are replaced while a
-model is being made, and nothing on disk is changed. What such a model does says nothing of π0's quality.
+lerobot 0.6.1 builds these models only in full size, so some names of its modules are patched while a model
+is being made. Nothing on disk is changed. The results of such a model say nothing about π0's quality.
 """
 
 import contextlib
@@ -34,12 +34,12 @@ TINY_POLICY: dict[str, Any] = {
     "image_resolution": [56, 56],
     "dtype": "float32",
 }
-"""Fields of the policy's configuration that go with the tiny model."""
+"""Fields of the policy's configuration for the tiny model."""
 
 
 @contextlib.contextmanager
 def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
-    """Make lerobot build the tiny model wherever it would build the full one, within the context."""
+    """Make lerobot build the tiny model instead of the full one, within the context."""
     modeling: Any = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
     sizes = {"depth": 2, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}  # 8 heads are hard-coded
     vlm = modeling.GemmaConfig(width=64, mlp_dim=128, **sizes)
@@ -54,7 +54,7 @@ def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
         vision = config.vision_config
         vision.hidden_size, vision.intermediate_size, vision.patch_size = 32, 64, 14
         vision.num_hidden_layers, vision.num_attention_heads = 2, 2
-        vision.image_size = TINY_POLICY["image_resolution"][0]  # π0-FAST leaves it as it is
+        vision.image_size = TINY_POLICY["image_resolution"][0]  # π0-FAST does not change it
         return full_vlm(config=config)
 
     def make_expert(config: Any) -> Any:
@@ -77,7 +77,7 @@ def tiny_resnet() -> Iterator[None]:
 
     def make_resnet(**_: Any) -> Any:
         layers = {"layer4": nn.Conv2d(3, 8, kernel_size=32, stride=32), "fc": nn.Linear(8, 1)}
-        return nn.ModuleDict(layers)  # an attribute of each name, which is all that is read
+        return nn.ModuleDict(layers)  # an attribute of each name is all that is read
 
     with patch.object(torchvision.models, "resnet18", make_resnet):
         yield
@@ -99,7 +99,7 @@ def write_tiny_fast_tokenizer(folder: Path) -> Path:
 
 
 def write_tiny_smolvlm(folder: Path) -> Path:
-    """Save configuration and processor of a tiny SmolVLM, which SmolVLA needs none of lerobot patched for."""
+    """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot."""
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
     from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
@@ -160,6 +160,6 @@ def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any
 
 
 def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Be a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
+    """Run a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
     with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
         worker_main(connection, shared, log)

@@ -1,7 +1,7 @@
-"""A table of learned policies with tiny random models, on a stand-in for the simulator, in minutes.
+"""A table of learned policies with tiny random models, on the fake simulator, in minutes.
 
-What the rows reach says nothing of the models they are named after; that a row is there says that recording,
-fine-tuning, loading and evaluating fit together.
+The results of the rows say nothing about the models after which they are named. A row shows that recording,
+fine-tuning, loading and evaluation work together.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ import yaml
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import merge_fields
-from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.policy import PolicyRecipe, load_policy
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, TableRow
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
@@ -28,7 +28,7 @@ TINY_RECIPES = {
 """Type of a policy -> recipe of its tiny form."""
 TINY_UNET: dict[str, Any] = {"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}
 SMALL = ("act", "diffusion", "mikasa_memory")
-"""Types whose own recipes are small enough; of a diffusion the U-Net is not."""
+"""Types whose own recipes are small enough; the U-Net of a diffusion policy is not."""
 TINY_PI0_ADAPTER = "vla_eval.testing.tiny_models:make_tiny_pi0"
 N_EPISODES = 2
 N_STEPS = 2
@@ -42,11 +42,11 @@ SHORT = {
 
 
 def tiny_table(table: ModelTable, out: Path) -> tuple[ModelTable, dict[str, str]]:
-    """Return the table with a tiny model in each row, and the adapters of rows that are not lerobot's own.
+    """Return the table with a tiny model in each row, and the adapters of rows that are not lerobot's.
 
     Args:
-        table: the real one; rows, tasks and controls stay.
-        out: folder of the table; gets the recipes of the tiny models.
+        table: the real one; rows, tasks and controls are kept.
+        out: folder of the table; the recipes of the tiny models are written there.
 
     Raises:
         RecipeError: a row is of a type that has no tiny form.
@@ -81,7 +81,7 @@ def tiny_dataset(table: ModelTable) -> DatasetRecipe:
 
 
 def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
-    real = load_recipe("policies", row.policy, PolicyRecipe).value.finetune
+    real = load_policy(row.policy).value.finetune
     kind = None if real is None else real.type
     longest = max(row.n_action_steps)
     chunk = {"chunk_size": longest, "n_action_steps": longest}
@@ -98,7 +98,7 @@ def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
     else:
         section = to_data(load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune)
     section |= SHORT
-    # A diffusion's chunk is what its horizon leaves of it: the recipe's own.
+    # The chunk of a diffusion policy follows from its horizon: keep the recipe's.
     section["policy"] = {**section["policy"], **(TINY_UNET if kind == "diffusion" else chunk)}
     return _recipe(row, section), LEROBOT_ADAPTER
 

@@ -1,1 +1,1 @@
-"""Fine-tuning: a recipe and a dataset become one `TrainingJob`, which `train` brings to its last step."""
+"""Fine-tuning: a recipe and a dataset become one `TrainingJob`, which `train` runs to its last step."""

@@ -1,4 +1,4 @@
-"""Checkpoints in lerobot's form: each appears whole or not at all, and is read with a message if damaged."""
+"""Checkpoints in lerobot's form: each is written atomically, and a damaged one gives an error message."""
 
 import os
 from pathlib import Path
@@ -63,7 +63,7 @@ def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: 
     except Exception as exc:  # lerobot, torch and safetensors raise what they like
         raise TrainingError(
             f"{folder}: the state of the training cannot be read ({exc!r:.300}). Remove this checkpoint's "
-            "folder to go on from the one before it, or use another --out."
+            "folder to resume from the one before it, or use another --out."
         ) from exc
 
 

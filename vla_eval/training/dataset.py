@@ -1,4 +1,4 @@
-"""What a fine-tuning takes from a dataset, after making sure that it is whole and was replayed."""
+"""What a fine-tuning reads from a dataset, which has to be complete and replayed."""
 
 import hashlib
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS
 
-RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # what our recordings' actions are for
+RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # of the actions in our demonstrations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,8 +56,8 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
     if report is None and not allow_unreplayed:
         way = "It was imported and cannot be replayed" if is_import else f"Run mikasa-vla replay {root}"
         raise DatasetError(
-            f"{root}: no replay has confirmed this dataset: nobody knows whether its actions lead to what "
-            f"its pictures show. {way}; or train on it all the same with --allow-unreplayed, which is noted "
+            f"{root}: no replay has confirmed this dataset: it is not known whether its actions lead to what "
+            f"its images show. {way}; or train on it all the same with --allow-unreplayed, which is noted "
             f"in the run."
         )
     if isinstance(facts, ImportFacts) and not facts.executable_by_pd_ee_delta_pose:

@@ -1,4 +1,4 @@
-"""What is trained, and how much memory that takes at least. Knows only torch modules."""
+"""Describe what is trained, and the least memory that it needs. Knows only torch modules."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class ModelDescription:
     training_bytes: int
 
     def lines(self) -> Iterable[str]:
-        """Yield what a person reads before the first step."""
+        """Yield lines for a person, before the first step."""
         share = self.n_trained / self.n_parameters if self.n_parameters else 0.0
         yield f"trained: {self.n_trained:,} of {self.n_parameters:,} parameters ({share:.1%})"
         for module in self.modules:

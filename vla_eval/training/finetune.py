@@ -1,4 +1,4 @@
-"""Fine-tune: recipe and dataset in, a run folder with checkpoints out; the same call goes on after a kill."""
+"""Fine-tune: recipe and dataset in, a run folder with checkpoints out. The same call resumes it."""
 
 import contextlib
 import os
@@ -9,9 +9,10 @@ from typing import Any
 
 from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.errors import VlaEvalError
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
-from vla_eval.storage.durable import FolderLock
 from vla_eval.storage.provenance import collect_environment
+from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.description import describe_model
 from vla_eval.training.held_out import HeldOut
@@ -19,29 +20,30 @@ from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
-from vla_eval.training.run_folder import METRICS_FILE, open_folder, read_metrics
+from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, RUN_FILE, open_folder, read_metrics
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 
 LOCK_FILE = "finetune.lock"
+OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
 Say = Callable[[str], None]
 """Takes a line for a person."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneSummary:
-    """What a call has come to: the run folder, and the checkpoint that an evaluation takes."""
+    """The result of a call: the run folder, and the checkpoint that an evaluation takes."""
 
     out: Path
     checkpoint: Path
 
 
 def finetune(config: FinetuneConfig, *, command: str = "", say: Say = lambda _line: None) -> FinetuneSummary:
-    """Fine-tune, or go on with it.
+    """Fine-tune, or resume a fine-tuning.
 
     Args:
         config: what to train on what.
         command: what the user typed, for the record.
-        say: is given lines for a person.
+        say: gets lines for a person.
 
     Raises:
         VlaEvalError: a mistake; what was saved stays.
@@ -50,10 +52,9 @@ def finetune(config: FinetuneConfig, *, command: str = "", say: Say = lambda _li
     if job.device == "cpu":
         keep_freed_memory()
     _describe(job, say)
-    job.out.mkdir(parents=True, exist_ok=True)
-    with _lock(job.out):
-        job = replace(job, resume_from=_open(job, command))
-        say(f"run: {job.out}" + (f", going on from step {job.first_step}" if job.resume_from else ""))
+    with _opened(job, command) as resume_from:
+        job = replace(job, resume_from=resume_from)
+        say(f"run: {job.out}" + (f", resuming from step {job.first_step}" if job.resume_from else ""))
         project = job.recipe.trackio_project if _is_first_process() else None
         with trackio_run(project, name=job.out.resolve().name, settings=to_data(job.recipe)) as track:
             held_out = _held_out(job, say, track)
@@ -77,7 +78,7 @@ def _describe(job: TrainingJob, say: Say) -> None:
 
 
 def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None) -> Listeners:
-    """Return who is told: a person, a tracker of metrics, and whoever evaluates checkpoints."""
+    """Return what gets the progress: a person, a tracker of metrics, the evaluation of checkpoints."""
     steps = job.recipe.steps
 
     def describe(model: Any) -> None:  # Any: a torch module of lerobot's
@@ -100,7 +101,7 @@ def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None)
 
 
 def _held_out(job: TrainingJob, say: Say, track: Log) -> HeldOut | None:
-    if job.evaluation is None or job.evaluated_task is None or not _is_first_process():
+    if job.held_out is None or job.held_out_task is None or not _is_first_process():
         return None
 
     def report(line: Mapping[str, float | str]) -> None:
@@ -109,8 +110,8 @@ def _held_out(job: TrainingJob, say: Say, track: Log) -> HeldOut | None:
         log_to_wandb(line)
 
     return HeldOut(
-        settings=job.evaluation,
-        task=job.evaluated_task,
+        settings=job.held_out,
+        task=job.held_out_task,
         out=job.out,
         last_step=job.recipe.steps,
         on_metrics=report,
@@ -124,7 +125,7 @@ def _is_first_process() -> bool:
 
 def _open(job: TrainingJob, command: str) -> Path | None:
     section = to_data(job.recipe)
-    del section["trackio_project"]  # may be changed while a run goes on
+    del section["trackio_project"]  # may be changed when a run is resumed
     base = job.recipe.base_checkpoint
     settings: dict[str, Any] = {  # Any: plain data
         "finetune": section,
@@ -143,12 +144,28 @@ def _open(job: TrainingJob, command: str) -> Path | None:
 
 
 @contextlib.contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    if not _is_first_process():  # the first one has it
-        yield
+def _opened(job: TrainingJob, command: str) -> Iterator[Path | None]:
+    """Open the run folder; a mistake found before the first step leaves none behind.
+
+    Yields:
+        The checkpoint to resume from; None at the beginning.
+    """
+
+    def make(folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+
+    if not _is_first_process():  # the first one has the lock
+        make(job.out)
+        yield _open(job, command)
         return
-    lock = FolderLock(out / LOCK_FILE)
+    with starting(
+        job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a fine-tuning", make=make
+    ) as started:
+        resume_from = _open(job, command)
     try:
-        yield
+        yield resume_from
+    except VlaEvalError:
+        started.start.undo()
+        raise
     finally:
-        lock.release()
+        started.lock.release()

@@ -1,8 +1,8 @@
-"""Evaluate the checkpoints of a training while it goes on, on seeds that serve nothing else.
+"""Evaluate checkpoints during training, on seeds that are used for nothing else.
 
 An evaluation is an ordinary one, in worker processes: it draws from none of the training's generators.
-It runs while the training waits, since both want the same processor; a training that was killed during
-one finishes it first and then goes on.
+It runs while the training waits, since both need the same device. A training that was killed during one
+finishes it first and then resumes.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from pathlib import Path
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
-from vla_eval.config.finetuning import FinetuneRecipe, HeldOutEvaluation
+from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import evaluate
@@ -41,10 +41,10 @@ class HeldOut:
         out: run folder of the training.
         last_step: its last step, whose checkpoint is evaluated in any case.
         on_metrics: takes one line of metrics.
-        say: is given lines for a person.
+        say: gets lines for a person.
     """
 
-    settings: HeldOutEvaluation
+    settings: HeldOutConfig
     task: str
     out: Path
     last_step: int
@@ -53,7 +53,7 @@ class HeldOut:
 
     @property
     def identity(self) -> str:
-        """What tells evaluations with other settings apart."""
+        """A digest of the settings: evaluations with other settings have another."""
         settings = to_data(self.settings)
         del settings["workers"]  # moves no result
         text = json.dumps([settings, self.task], sort_keys=True)
@@ -75,7 +75,7 @@ class HeldOut:
                 self.evaluate(checkpoint)
 
     def evaluate(self, checkpoint: Path) -> None:
-        """Evaluate a checkpoint (`…/000100`) and report its figure; a part that is there is not done again.
+        """Evaluate a checkpoint (`…/000100`) and report its figure; finished episodes are not run again.
 
         Raises:
             VlaEvalError: no episode could be run.
@@ -121,20 +121,20 @@ class HeldOut:
         )
 
 
-def check_held_out(settings: HeldOutEvaluation, recipe: FinetuneRecipe, dataset: TrainingDataset) -> str:
+def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: TrainingDataset) -> str:
     """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
 
     Raises:
-        RecipeError: the seeds serve something else, or steps, or the task, do not fit.
+        RecipeError: the seeds are used for something else, or steps, or the task, do not fit.
         UnknownNameError: there is no such task.
     """
     if settings.every_steps % recipe.save_every_steps:
         raise RecipeError(
-            f"evaluation.every_steps is {settings.every_steps}, expected a multiple of finetune."
+            f"held_out.every_steps is {settings.every_steps}, expected a multiple of finetune."
             f"save_every_steps ({recipe.save_every_steps}): what is evaluated is a checkpoint."
         )
     seeds = range(settings.seed_start, settings.seed_start + settings.episodes)
-    # A checkpoint that was chosen by the seeds of the tables would be praised for its luck.
+    # A checkpoint that was selected on the seeds of the tables would have a biased rate there.
     for used, what in (
         (EVALUATION_SEEDS, "tables are made from"),
         (_seeds_of(dataset), "were recorded from"),
@@ -142,14 +142,14 @@ def check_held_out(settings: HeldOutEvaluation, recipe: FinetuneRecipe, dataset:
         shared = sorted(set(seeds) & set(used))
         if shared:
             raise RecipeError(
-                f"evaluation.seed_start={settings.seed_start}, episodes={settings.episodes}: {len(shared)} "
+                f"held_out.seed_start={settings.seed_start}, episodes={settings.episodes}: {len(shared)} "
                 f"of these seeds ({shared[0]} … {shared[-1]}) are seeds that {what}. Held-out seeds serve "
                 f"nothing else: choose another seed_start, or leave it out."
             )
     task = settings.task or dataset.task
     if not task:
         raise RecipeError(
-            f"evaluation.task: {dataset.name} names no task; say which one to evaluate on (`mikasa-vla list "
+            f"held_out.task: {dataset.name} names no task; say which one to evaluate on (`mikasa-vla list "
             "tasks`)."
         )
     return task_spec(task).id

@@ -1,4 +1,4 @@
-"""What one fine-tuning is, resolved once: recipe, dataset, policy, base, folders, where it resumes.
+"""One fine-tuning, resolved once: recipe, dataset, policy, base, folders, where it resumes.
 
 Everything that can be refused is refused here, before the run has a folder. Knows nothing of the loop.
 """
@@ -12,9 +12,9 @@ from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from vla_eval.config.decoding import decode
-from vla_eval.config.files import Recipe, load_recipe, to_data
-from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutEvaluation, merge_fields
-from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.files import Recipe, to_data
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig, merge_fields
+from vla_eval.config.policy import load_policy
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS
@@ -22,7 +22,7 @@ from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_check
 from vla_eval.policies.lerobot import choose_device
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.held_out import check_held_out
-from vla_eval.training.lora import check_lora_is_told, peft_config
+from vla_eval.training.lora import check_lora_targets, peft_config
 from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
 from vla_eval.training.run_folder import TRAIN_FOLDER
 
@@ -41,9 +41,9 @@ class TrainingJob:
         device: `cpu`, `cuda` …
         out: the run folder.
         run_seed: of initial weights, order of samples and noise.
-        evaluation: of checkpoints meanwhile; None: there is none.
-        evaluated_task: on which task.
-        resume_from: folder of the checkpoint (`…/000100`) to go on from; None: from the beginning.
+        held_out: evaluation of checkpoints during training; None: there is none.
+        held_out_task: on which task.
+        resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
     """
 
     name: str
@@ -56,8 +56,8 @@ class TrainingJob:
     device: str
     out: Path
     run_seed: int
-    evaluation: HeldOutEvaluation | None
-    evaluated_task: str | None
+    held_out: HeldOutConfig | None
+    held_out_task: str | None
     resume_from: Path | None = None
 
     @property
@@ -72,7 +72,7 @@ class TrainingJob:
 
     @property
     def whole_episodes(self) -> bool:
-        """Whether a sample is an episode up to its end, see `MemoryDataset`."""
+        """Whether a sample is an episode up to its end, see `DecodedFramesDataset`."""
         return bool(getattr(self.policy, "whole_episodes", False))
 
     @property
@@ -102,10 +102,10 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
     dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
-    evaluation = config.evaluation
-    task = None if evaluation is None else check_held_out(evaluation, recipe, dataset)
+    held_out = config.held_out
+    task = None if held_out is None else check_held_out(held_out, recipe, dataset)
     device = choose_device(config.device)
-    check_lora_is_told(recipe)
+    check_lora_targets(recipe)
     policy = policy_config(recipe, dataset, device=device)
     image_transforms(recipe)
     job = TrainingJob(
@@ -119,8 +119,8 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         device=device,
         out=Path(config.out) if config.out is not None else default_out(config),
         run_seed=config.run_seed,
-        evaluation=evaluation,
-        evaluated_task=task,
+        held_out=held_out,
+        held_out_task=task,
     )
     if job.whole_episodes and not recipe.decode_ahead:
         raise RecipeError(
@@ -136,7 +136,7 @@ def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
     Raises:
         RecipeError: the policy has none, or a field is wrong.
     """
-    recipe = load_recipe("policies", config.policy, PolicyRecipe)
+    recipe = load_policy(config.policy)
     if recipe.value.finetune is None:
         raise RecipeError(
             f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "

@@ -1,8 +1,8 @@
-"""The training loop: gradient steps, checkpoints, metrics. Knows nothing of run folders or of who listens.
+"""The training loop: gradient steps, checkpoints, metrics. Knows nothing of run folders or listeners.
 
-It is written on accelerate and on what lerobot offers to others: its factories, its sampler, its form of a
-checkpoint, so that `lerobot-train --resume` goes on from ours. All noise of a step is drawn from (run seed,
-step, process): a run that was killed goes on exactly as it would have.
+It uses accelerate and the public parts of lerobot: its factories, its sampler, its form of a checkpoint, so
+that `lerobot-train --resume` continues from ours. All noise of a step is drawn from (run seed,
+step, process): a run that was killed and resumed gives the same weights.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import cycle, has_method, init_logging
 from tqdm import tqdm
 
-from vla_eval.data.memory_loader import MemoryDataset
+from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.errors import TrainingError
 from vla_eval.training.checkpoints import load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
@@ -51,7 +51,7 @@ LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listeners:
-    """Who is told of a training.
+    """Who gets the progress of a training.
 
     Attributes:
         on_model: called with the model before its optimizer is made.
@@ -65,7 +65,7 @@ class Listeners:
 
 
 def train(job: TrainingJob, listeners: Listeners) -> None:
-    """Train to the job's last step; one that has got there is left alone.
+    """Train to the job's last step; a finished job is left as it is.
 
     Raises:
         TrainingError: the loss is not finite, or the model does not fit the job.
@@ -103,7 +103,7 @@ def train(job: TrainingJob, listeners: Listeners) -> None:
 
 
 class _Training:
-    """What steps need and change, made or loaded in lerobot's order: it decides what is drawn when."""
+    """The state that steps change, made or loaded in lerobot's order, which fixes the random draws."""
 
     def __init__(self, job: TrainingJob, accelerator: Accelerator, on_model: Callable[[Any], None]) -> None:
         self.job, self.accelerator, self.config = job, accelerator, lerobot_config(job)
@@ -113,7 +113,7 @@ class _Training:
         with accelerator.main_process_first():  # the others find the decoded frames
             dataset = make_dataset(self.config)
             if job.recipe.decode_ahead:
-                dataset = MemoryDataset(dataset, whole_episodes=job.whole_episodes)
+                dataset = DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes)
         self.cameras = dataset.meta.camera_keys
         self.tracker = new_tracker(job, dataset, accelerator)
         set_seed(job.run_seed)
@@ -187,7 +187,7 @@ def seed_step(run_seed: int, step: int, process: int) -> None:
 
 
 def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
-    """Return the precision of the forward pass: `dtype`, else `use_amp`, else what accelerate was told."""
+    """Return the precision of the forward pass: `dtype`, else `use_amp`, else what accelerate was given."""
     if getattr(policy, "dtype", None) in ("bfloat16", "float16", "float32"):
         return None if policy.dtype == "float32" else getattr(torch, policy.dtype)
     if getattr(policy, "use_amp", False) and not hasattr(policy, "dtype"):

@@ -32,11 +32,11 @@ def peft_config(recipe: FinetuneRecipe) -> PeftConfig | None:
     )
 
 
-def check_lora_is_told(recipe: FinetuneRecipe) -> None:
+def check_lora_targets(recipe: FinetuneRecipe) -> None:
     """Refuse LoRA where neither the recipe nor the policy says which layers get an adapter.
 
     Raises:
-        RecipeError: nobody does.
+        RecipeError: neither does.
     """
     if recipe.lora is None or recipe.lora.target_modules is not None:
         return

@@ -11,7 +11,7 @@ from vla_eval.errors import TrainingError
 
 
 class Loss(NamedTuple):
-    """Of a whole batch: its value, and what the policy says of it, numbers averaged over samples."""
+    """The loss of a whole batch, and what the policy reports beside it, numbers averaged over samples."""
 
     value: Tensor
     parts: dict[str, Any]
@@ -43,7 +43,7 @@ def add_gradient(
     Raises:
         TrainingError: a field of the batch cannot be divided.
     """
-    whole, told = torch.zeros(()), _Told()
+    whole, reported = torch.zeros(()), _Reported()
     parts = [(1.0, batch)] if size is None else list(_parts(batch, size))
     for index, (share, part) in enumerate(parts, start=1):
         # Processes exchange gradients once, with the last part.
@@ -54,18 +54,18 @@ def add_gradient(
             loss = share * loss.to(torch.promote_types(loss.dtype, torch.float32))
             accelerator.backward(scale(loss))
         whole = whole.to(loss) + loss.detach()
-        told.add(output, share)
-    return Loss(whole, told.values)
+        reported.add(output, share)
+    return Loss(whole, reported.values)
 
 
-class _Told:
-    """What a policy tells of its loss, averaged over parts."""
+class _Reported:
+    """What a policy reports beside its loss, averaged over parts."""
 
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}
 
     def add(self, output: Mapping[str, Any] | None, share: float) -> None:
-        """Add what was told of a part with this share of the samples; what is no number is the last one's."""
+        """Add the values of a part with this share of the samples; what is no number is the last part's."""
         for name, value in (output or {}).items():
             if isinstance(value, float | int) and not isinstance(value, bool):
                 value = self.values.get(name, 0.0) + share * value

@@ -31,7 +31,7 @@ TOKENIZER_STEP = "TokenizerProcessorStep"
 
 
 class Processors(NamedTuple):
-    """What stands before the model, and what stands behind it."""
+    """The pipelines before and behind the model."""
 
     before: Any
     after: Any
@@ -41,7 +41,7 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
     """Return the policy with its weights on its device, wrapped by peft where LoRA is trained.
 
     Args:
-        job: see there. Its policy is told where its weights came from.
+        job: see there. Its policy notes where its weights came from.
         meta: lerobot's description of the dataset.
 
     Raises:
@@ -103,7 +103,7 @@ def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
 
 
 def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[str, dict[str, Any]]:
-    """Return what saved processors are to be told, by step: fields, statistics, device and tokenizers."""
+    """Return what saved processors are to be given, by step: fields, statistics, device and tokenizers."""
     norm_map = config.normalization_mapping
     every, predicted = {**config.input_features, **config.output_features}, config.output_features
     normalizer = {"features": every, "norm_map": norm_map}

@@ -75,7 +75,7 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
 
 
 def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
-    """Return lerobot's configuration of how pictures are changed at random in training.
+    """Return lerobot's configuration of how images are changed at random in training.
 
     Raises:
         RecipeError: a field or a transform that lerobot does not have.
@@ -123,7 +123,7 @@ def _lengths(dataset: TrainingDataset) -> list[int]:
 def masks_padding(config: Any) -> bool:
     """Whether the policy leaves actions beyond the episode's end out of its loss.
 
-    Told by its code: one that never reads `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
+    Its code shows it: one that never reads `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
     """
     name = type(config).__module__.replace("configuration_", "modeling_")
     code = inspect.getsource(importlib.import_module(name))
@@ -133,7 +133,7 @@ def masks_padding(config: Any) -> bool:
 
 
 def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
-    """Return how many frames are trained on.
+    """Return the number of frames that are trained on.
 
     Raises:
         SpecMismatchError: none, since chunks are longer than the episodes.

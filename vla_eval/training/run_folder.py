@@ -1,4 +1,4 @@
-"""The folder of a fine-tuning: what it was started with, its metrics, and where it can go on.
+"""The folder of a fine-tuning: what it was started with, its metrics, and where it resumes.
 
     finetune.json   recipe, dataset's digest, run seed, environment
     metrics.jsonl   one line per logged step
@@ -18,6 +18,7 @@ from typing import Any
 from vla_eval.errors import TrainingError
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.run_file import JsonValue, find_changes
+from vla_eval.strict_json import Source, read_file, read_json, read_version, shown
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"
@@ -42,10 +43,10 @@ def open_folder(
         ignore: files that may lie in a folder which is otherwise empty.
 
     Returns:
-        The checkpoint to go on from; None to start from the beginning.
+        The checkpoint to resume from; None to start from the beginning.
 
     Raises:
-        TrainingError: the folder is somebody else's, or of a run with other settings.
+        TrainingError: the folder holds other files, or a run with other settings.
     """
     file = path / RUN_FILE
     path.mkdir(parents=True, exist_ok=True)
@@ -55,16 +56,12 @@ def open_folder(
         return None
     if not file.is_file():
         raise TrainingError(f"{path}: holds other files and no {RUN_FILE}. Use another --out.")
-    try:
-        before: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))  # Any: JSON
-        changes = find_changes(before[COMPARED], settings, prefix="")
-    except (ValueError, KeyError, AttributeError) as exc:
-        raise TrainingError(f"{file}: not the description of a fine-tuning ({exc!r:.100}).") from exc
+    changes = find_changes(_settings(file), settings, prefix="")
     if changes:
         listed = "\n".join(f"  {change}" for change in changes)
         raise TrainingError(
             f"{path}: this fine-tuning was started with other settings:\n{listed}\nUse another --out, or "
-            f"restore the old settings to go on."
+            f"restore the old settings to resume."
         )
     return newest_checkpoint(path)
 
@@ -74,7 +71,7 @@ def newest_checkpoint(path: Path) -> Path | None:
     folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
     whole = whole_checkpoints(path)
     if not whole:
-        # Nothing to go on from: lerobot wants to make its folder itself.
+        # Nothing to resume from: lerobot wants to make its folder itself.
         shutil.rmtree(path / TRAIN_FOLDER, ignore_errors=True)
         (path / METRICS_FILE).unlink(missing_ok=True)
         return None
@@ -86,17 +83,31 @@ def newest_checkpoint(path: Path) -> Path | None:
 
 
 def whole_checkpoints(path: Path) -> list[Path]:
-    """Return the folders of the checkpoints that training can go on from, oldest first."""
+    """Return the folders of the checkpoints that training can resume from, oldest first."""
     folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
     return sorted(entry for entry in folder.glob("[0-9]*") if (entry / STATE_FOLDER).is_dir())
 
 
 def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the lines of metrics of a run folder; none if there is no file."""
+    """Yield the lines of metrics of a run folder; none if there is no file.
+
+    Raises:
+        TrainingError: a line is damaged.
+    """
     file = path / METRICS_FILE
     if file.is_file():
-        for line in file.read_text(encoding="utf-8").splitlines():
-            yield json.loads(line)
+        what = "a line of metrics"
+        for number, line in enumerate(_read(file, what).split(b"\n")[:-1], start=1):
+            try:
+                values = json.loads(line)  # not strict: a loss may be NaN
+                steps = values["step"]
+            except (ValueError, KeyError, TypeError, RecursionError) as exc:
+                raise _source(f"{file}:{number}", what).refuse(shown(line), exc) from exc
+            if type(steps) is not int:
+                raise _source(f"{file}:{number}", what).refuse(
+                    f"step {shown(steps)}", "expected a whole number"
+                )
+            yield values
 
 
 def point(link: Path, target: str) -> None:
@@ -109,15 +120,33 @@ def point(link: Path, target: str) -> None:
     os.replace(temporary, link)
 
 
+def _settings(file: Path) -> dict[str, Any]:  # Any: JSON
+    """Return what the run of this `finetune.json` was started with."""
+    what = "the description of a fine-tuning"
+    source = _source(str(file), what)
+    data = read_json(_read(file, what), source)
+    read_version(data, "format_version", FORMAT_VERSION, source)
+    settings = data.get(COMPARED)
+    if not isinstance(settings, dict):
+        raise source.refuse(f"{COMPARED} {shown(settings)}", "expected a mapping")
+    return settings
+
+
+def _read(file: Path, what: str) -> bytes:
+    return read_file(file, _source(str(file), what))
+
+
+def _source(where: str, what: str) -> Source:
+    remedy = "The file was changed by something else; restore it, or use another --out."
+    return Source(where=where, what=what, remedy=remedy, error=TrainingError)
+
+
 def _cut_metrics(path: Path, step: int) -> None:
-    """Drop the lines of steps that will be done again."""
+    """Drop the lines of steps that will be run again."""
     if not path.is_file():
         return
     kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (ValueError, KeyError, TypeError):
-            break  # the line that was being written
-    replace_file(path, "".join(f"{line}\n" for line in kept))
+    for line in read_metrics(path.parent):  # what follows the last newline was being written
+        if line["step"] <= step:
+            kept.append(line)
+    replace_file(path, "".join(f"{json.dumps(line)}\n" for line in kept))

@@ -19,7 +19,7 @@ Log = Callable[[Mapping[str, float | str]], None]
 def trackio_run(project: str | None, *, name: str, settings: Mapping[str, Any]) -> Iterator[Log]:
     """Log to a trackio project while the context is open; without a project, log nowhere.
 
-    A training that goes on after a kill goes on in the run of its name. Steps between the last
+    A training that is resumed after a kill continues the run of its name. Steps between the last
     checkpoint and the kill are then there twice; `metrics.jsonl` has each once.
 
     Args:

@@ -1,1 +1,1 @@
-"""What a person looks at: videos and rerun recordings of episodes. The loop knows nothing of it."""
+"""Videos and rerun files of episodes. The loop knows nothing of this room."""

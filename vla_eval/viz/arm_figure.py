@@ -1,4 +1,4 @@
-"""The Panda's arm as a line through its joints, for pictures that have no meshes."""
+"""The Panda's arm as a line through its joints, for images without meshes."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Compose the frames of a video: the cameras side by side, and what is known of the step below them."""
+"""Compose the frames of a video: the cameras side by side, and facts about the step below them."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ SUCCESS_COLOR, FAILURE_COLOR = (47, 196, 154), (255, 138, 61)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caption:
-    """What is written below the pictures of one step."""
+    """What is written below the images of one step."""
 
     instruction: str
     episode: str
@@ -43,8 +43,8 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Image
 
     Args:
         tape: the whole episode.
-        taped: the step to show; it must have pictures.
-        record: what came of the episode.
+        taped: the step to show; it must have images.
+        record: of the episode.
     """
     images = taped.result.observation.images
     small = [name for name in images if name != HUMAN_CAMERA]
@@ -65,9 +65,9 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Image
 def _scaled(image: ImageArray, size_px: int) -> Image.Image:
     # Pixels of the policy's cameras stay visible as such: it sees no more than these.
     enlarges = image.shape[0] < size_px
-    picture = Image.fromarray(image)
+    scaled = Image.fromarray(image)
     how = Image.Resampling.NEAREST if enlarges else Image.Resampling.LANCZOS
-    return picture.resize((size_px, size_px), how)
+    return scaled.resize((size_px, size_px), how)
 
 
 def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Caption:
@@ -122,7 +122,7 @@ def _fitted(
 def _draw_strip(
     draw: ImageDraw.ImageDraw, tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, width: int
 ) -> None:
-    """Draw the episode as a strip: phases, chunk boundaries as ticks, success, and where we are."""
+    """Draw the episode as a strip: phases, chunk boundaries as ticks, success, and the current step."""
     n_steps = max(tape.start.horizon_steps, 1)
     top, bottom = VIEW_PX + 2, VIEW_PX + 2 + STRIP_PX
 

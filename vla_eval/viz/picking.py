@@ -1,4 +1,4 @@
-"""Find the rerun recordings of a run that a person wants to see, or say why there are none."""
+"""Find the rerun files of a run for the viewer, or explain why there are none."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,10 +6,10 @@ from pathlib import Path
 
 from vla_eval.errors import ViewingError, unknown_name
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.recording_files import rrd_file
+from vla_eval.storage.capture_files import rrd_file
 from vla_eval.storage.run_folder import StoredRun
 
-MOST_OPENED = 5  # recordings that the viewer is given at once, unless it is told which
+MOST_OPENED = 5  # files that the viewer gets at once, unless the user chooses
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,11 +23,11 @@ class Wish:
 
 
 def pick(run: StoredRun, wish: Wish) -> list[Path]:
-    """Return the recordings of the wished episodes, in the order of the records.
+    """Return the rerun files of the requested episodes, in the order of the records.
 
     Raises:
         UnknownNameError: no episode has such a task, policy or K.
-        ViewingError: none of the wished episodes was recorded.
+        ViewingError: none of the requested episodes was captured.
     """
     for name in ("task", "policy", "n_action_steps"):
         wanted = getattr(wish, name)
@@ -52,12 +52,12 @@ def _fits(record: EpisodeRecord, wish: Wish) -> bool:
 
 
 def _why_none(run: StoredRun, wished: Sequence[EpisodeRecord], wish: Wish) -> str:
-    recorded = sorted({record.seed for record in run.records if rrd_file(run.path, record).is_file()})
-    if recorded:
-        shown = ", ".join(map(str, recorded[:10])) + (", …" if len(recorded) > 10 else "")
-        what = "no such episode" if not wished else "of the episodes asked for none was recorded"
-        return f"{run.path}: {what}. Seeds with a recording: {shown}."
+    captured = sorted({record.seed for record in run.records if rrd_file(run.path, record).is_file()})
+    if captured:
+        shown = ", ".join(map(str, captured[:10])) + (", …" if len(captured) > 10 else "")
+        what = "no such episode" if not wished else "of the episodes asked for none was captured"
+        return f"{run.path}: {what}. Seeds with a rerun file: {shown}."
     return (
-        f"{run.path}: holds no rerun recordings. What has a result is not run again: evaluate into another "
-        f"folder, with --record-rrd all|failures|successes|N --out DIR."
+        f"{run.path}: holds no rerun files. What has a result is not run again: evaluate into another "
+        f"folder, with --capture-rrd all|failures|successes|N --out DIR."
     )

@@ -1,4 +1,4 @@
-"""What writing any `.rrd` takes: a file that is there whole or not at all, and its two timelines."""
+"""Write an `.rrd` file atomically, and its two timelines."""
 
 import contextlib
 from collections.abc import Iterator
@@ -18,14 +18,14 @@ APPLICATION = "mikasa-vla"
 def rrd_when_whole(
     path: Path, *, recording_id: str, blueprint: rrb.Blueprint, failed: str, advice: str
 ) -> Iterator[rr.RecordingStream]:
-    """Give a stream to log to, whose file gets its name once everything is in it.
+    """Give a stream to log to. The file gets its name once everything is in it.
 
     Args:
         path: the file; its folder is made.
         recording_id: rerun's name of the recording.
         blueprint: how the viewer lays it out.
-        failed: what stands before the cause if it cannot be written.
-        advice: what stands behind it.
+        failed: the message before the cause, if the file cannot be written.
+        advice: the message after the cause.
 
     Raises:
         ViewingError: the file cannot be written.
@@ -33,7 +33,7 @@ def rrd_when_whole(
     unfinished = path.with_suffix(".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()  # rerun itself does not say so where it cannot write
+        unfinished.touch()  # rerun itself reports no error where it cannot write
         with rr.RecordingStream(APPLICATION, recording_id=recording_id) as stream:
             stream.save(str(unfinished), default_blueprint=blueprint)
             yield stream
@@ -45,7 +45,7 @@ def rrd_when_whole(
 
 
 def set_step(stream: rr.RecordingStream, step: int, control_hz: float) -> None:
-    """Let what is logged next belong to a control step."""
+    """Set the control step of what is logged next."""
     stream.set_time("step", sequence=step)
     stream.set_time("time", duration=step / control_hz)
 

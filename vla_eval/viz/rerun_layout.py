@@ -1,4 +1,4 @@
-"""How the rerun viewer lays an episode out when it opens it."""
+"""The layout of an episode in the rerun viewer."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ def layout(
     """Return the blueprint: the world and the cameras above, curves and words below.
 
     Args:
-        cameras: the cameras that there are pictures of.
+        cameras: the cameras that have images.
         action_dims: the entries of an action.
         state_dims: the entries of the proprioception; of datasets alone.
     """

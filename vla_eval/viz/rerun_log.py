@@ -1,6 +1,6 @@
 """Write a taped episode as an `.rrd` for the rerun viewer, with a blueprint that lays it out.
 
-    cameras/NAME          pictures, at the steps where they were rendered
+    cameras/NAME          images, at the steps where they were rendered
     world/tcp, tcp_path   the tool centre point now, and all of its way
     world/arm             a line through the joints of the arm, if it is the Panda's
     world/candidates, bodies/NAME   where things are; `robot_base`
@@ -20,7 +20,7 @@ import rerun as rr
 
 from vla_eval.core import FloatArray
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.recording_files import recording_stem
+from vla_eval.storage.capture_files import capture_stem
 from vla_eval.task_state import Phase
 from vla_eval.tasks.item_names import item_names
 from vla_eval.viz.arm_figure import ROBOT_BASE_M, arm_points_m
@@ -46,7 +46,7 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
 
     Args:
         tape: the episode.
-        record: what came of it.
+        record: of the episode.
         path: the file; it is there whole or not at all.
         control_hz: control steps per second, for the timeline `time`.
 
@@ -57,11 +57,11 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
     cameras = sorted({name for one in tape.steps for name in one.result.observation.images})
     with rrd_when_whole(
         path,
-        recording_id=recording_stem(record),
+        recording_id=capture_stem(record),
         blueprint=layout(cameras, ACTION_DIMS),
-        failed=f"the rerun recording of {record.policy} on {record.task}, seed {record.seed}, could not be "
+        failed=f"the rerun file of {record.policy} on {record.task}, seed {record.seed}, could not be "
         "written",
-        advice="Free some space, or record less; the same command runs it again.",
+        advice="Free some space, or capture less; the same command runs it again.",
     ) as stream:
         _log_facts(stream, tape, record)
         for taped in tape.steps:
@@ -72,7 +72,7 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
 
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
-    """Log what holds for the whole episode."""
+    """Log the facts of the whole episode."""
     status = tape.steps[-1].result.status
     names = item_names(record.task, status.n_candidates)
     target = "several, or none" if status.target is None else names[status.target]

@@ -1,8 +1,8 @@
-"""Remember episodes as they run: a `StepObserver` that others make videos and rerun recordings of.
+"""Record episodes in memory as they run: a `StepObserver`, from which videos and rerun files are made.
 
-What is worth keeping is often known only at the end (`failures`), so all of an episode is held in memory
-until then: 0.9 MB per pictured step with the three cameras of the tasks. Running the episode a second
-time instead would cost a second inference of everything, and on a GPU it need not be the same episode.
+Which episodes are kept is often known only at the end (`failures`), so a whole episode is held in memory
+until then: 0.9 MB per captured step with the three cameras of the tasks. Running the episode a second time
+would cost all of its inferences again, and on a GPU it need not give the same episode.
 """
 
 from collections.abc import Collection
@@ -13,7 +13,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TapedStep:
-    """What came back from one control step; the action asked for is None for the reset."""
+    """The result of one control step; the requested action is None for the reset."""
 
     step: int
     action: FloatArray | None
@@ -33,8 +33,8 @@ class EpisodeTape:
     """One episode so far.
 
     Attributes:
-        start: what the policy was told.
-        frame_stride: pictures were asked for at every so many steps; others may have asked for more.
+        start: what the policy gets at the beginning.
+        frame_stride: images were requested every so many steps; others may have requested more.
         steps, chunks: in order.
     """
 
@@ -43,8 +43,8 @@ class EpisodeTape:
     steps: list[TapedStep] = field(default_factory=list)
     chunks: list[TapedChunk] = field(default_factory=list)
 
-    def pictured(self) -> list[TapedStep]:
-        """Return the steps at even distances that have pictures, and the last one."""
+    def captured(self) -> list[TapedStep]:
+        """Return the steps at the stride that have images, and the last one."""
         return [
             one
             for one in self.steps
@@ -57,7 +57,7 @@ class Tapes:
 
     Args:
         slots: the slots whose episodes are kept.
-        frame_stride: pictures are asked for at every so many control steps, and at the last one.
+        frame_stride: images are requested every so many control steps, and at the last one.
     """
 
     def __init__(self, slots: Collection[int], *, frame_stride: int) -> None:
@@ -68,7 +68,7 @@ class Tapes:
         self.episodes: dict[int, EpisodeTape] = {}
 
     def wants_images(self, step: int) -> bool:
-        """Whether a picture is due."""
+        """Whether an image is due."""
         return step % self._frame_stride == 0 or step in self._horizons
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:

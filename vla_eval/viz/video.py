@@ -21,31 +21,31 @@ JPEG_QUALITY = 85
 def write_video(
     tape: EpisodeTape, record: EpisodeRecord, path: Path, *, thumbnail: Path, frame_rate_hz: float
 ) -> None:
-    """Write the pictured steps of an episode.
+    """Write the captured steps of an episode.
 
     Args:
         tape: the episode.
-        record: what came of it.
+        record: its record.
         path: the mp4; it is there whole or not at all.
         thumbnail: the JPEG.
-        frame_rate_hz: pictured steps per second of the episode, so that it plays as fast as it ran.
+        frame_rate_hz: captured steps per second of the episode, so that the video is as fast as the episode.
 
     Raises:
-        ViewingError: no step has pictures, or the file cannot be written.
+        ViewingError: no step has images, or the file cannot be written.
     """
-    pictured = tape.pictured()
-    if not pictured:
+    captured = tape.captured()
+    if not captured:
         raise ViewingError(
-            f"{path}: no step of this episode has a picture. The environment was made without cameras."
+            f"{path}: no step of this episode has an image. The environment was made without cameras."
         )
     unfinished = path.with_suffix(".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        frames = [compose(tape, step, record) for step in pictured]
+        frames = [compose(tape, step, record) for step in captured]
         with av.open(str(unfinished), "w", format="mp4", options={"movflags": "faststart"}) as container:
             stream = container.add_stream(CODEC, rate=Fraction(frame_rate_hz).limit_denominator(1000))
             stream.height, stream.width = frames[0].shape[:2]
-            stream.pix_fmt = "yuv420p"  # the one that every browser plays
+            stream.pix_fmt = "yuv420p"  # the one that every browser can show
             stream.options = OPTIONS
             for frame in [*frames, *frames[-1:] * round(HOLD_SECONDS * frame_rate_hz)]:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
@@ -55,5 +55,5 @@ def write_video(
     except (OSError, av.error.FFmpegError, ValueError) as exc:
         raise ViewingError(
             f"{path}: the video of {record.policy} on {record.task}, seed {record.seed}, could not be "
-            f"written ({exc}). Free some space, or record less; the same command runs it again."
+            f"written ({exc}). Free some space, or capture less; the same command runs it again."
         ) from exc

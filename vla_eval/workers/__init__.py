@@ -1,1 +1,1 @@
-"""Processes and their watchdog: an answer comes for every job. Knows nothing of what a job is."""
+"""Processes and their watchdog: every job gets an answer. Knows nothing of what a job is."""

@@ -1,8 +1,8 @@
-"""What a worker sends to its parent, put together without ever waiting for the rest of a message.
+"""Assemble a worker's messages to its parent without ever waiting for the rest of a message.
 
-The policy runs in the worker's process and may write into the same socket. What is no message of ours is
-refused by its first bytes, so that no length that somebody made up is waited for or reserved. Unpickling is
-trust in the worker: its code runs with the rights of the user in any case.
+The policy runs in the worker's process and may write into the same socket. Anything else is refused by
+its first bytes, so that a length that is not ours is neither waited for nor reserved. Unpickling trusts the
+worker, whose code has the rights of the user in any case.
 """
 
 import os
@@ -20,11 +20,11 @@ MAX_READS = 64  # at once, so that a worker that writes without end does not kee
 
 
 class BrokenMessageError(VlaEvalError):
-    """A worker has sent what is no message."""
+    """A worker has sent something that is no message."""
 
 
 def send_message(connection: Connection, message: object) -> None:
-    """Send an object to whoever has the `Inbox` at the other end."""
+    """Send an object to the `Inbox` at the other end."""
     payload = pickle.dumps(message)
     if len(payload) > MAX_MESSAGE_BYTES:
         raise BrokenMessageError(
@@ -86,7 +86,7 @@ class Inbox:
 def _unpickled(payload: bytes) -> object:
     try:
         return pickle.loads(payload)
-    except Exception as exc:  # whatever a made-up pickle leads to
+    except Exception as exc:  # a forged pickle may raise anything
         raise BrokenMessageError(
             f"expected an answer, found what cannot be unpickled ({exc!r:.200})"
         ) from exc

@@ -1,9 +1,9 @@
-"""The process between a worker and its parent: ends with the worker whatever the worker has started.
+"""The process between a worker and its parent: ends all processes of the worker when the worker ends.
 
-A policy may start processes, also such that leave the worker's session and lose their parent (daemons).
+A policy may start processes, even some that leave the worker's session and lose their parent (daemons).
 The guard is a *subreaper*: the kernel makes it the parent of every descendant that has lost its own. It
-ends them all when the worker ends or the parent does, and then ends as the worker did. Were the guard
-killed, the kernel would kill the worker.
+ends them all when the worker or the parent ends, and then exits as the worker did. If the guard is
+killed, the kernel kills the worker.
 """
 
 import contextlib
@@ -18,11 +18,11 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
 ASK_WHERE = b"?"
-"""Sent by the parent: the worker shall write the stack of every thread to its log."""
+"""Sent by the parent: the worker writes the stack of every thread to its log."""
 END = b"e"
 """Sent by the parent: end the worker. So does closing the connection, which the parent's death does."""
 
-REAP_SECONDS = 5.0  # a process that sits in a driver may survive SIGKILL for a while; go on without it
+REAP_SECONDS = 5.0  # a process that sits in a driver may survive SIGKILL for a while; continue without it
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 PR_SET_CHILD_SUBREAPER = 36
 

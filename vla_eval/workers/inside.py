@@ -28,7 +28,7 @@ SharedStage = ctypes.Array[ctypes.c_double]
 
 
 class Heartbeat:
-    """Says in shared memory what the worker is busy with, and adds up the time per stage."""
+    """Writes the current stage to shared memory, and adds up the time per stage."""
 
     def __init__(self, shared: SharedStage) -> None:
         """Take the memory to write to."""
@@ -110,5 +110,5 @@ def detach(log: Path) -> None:
     os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
     os.close(descriptor)
     faulthandler.enable(file=2, all_threads=True)
-    faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it hangs
+    faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it is stuck
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")

@@ -1,4 +1,4 @@
-"""What a worker says beside its answers: failed, found a device. Knows nothing of what a job is."""
+"""Messages of a worker beside its answers: failed, found a device. Knows nothing of what a job is."""
 
 import traceback
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class Failed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceFound:
-    """What the environment says of the device it runs on."""
+    """The device that the environment runs on."""
 
     device: Mapping[str, str]
 
@@ -38,7 +38,7 @@ def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
     """Return what is recorded of an exception."""
     try:
         message = str(exc)
-    except Exception as in_turn:  # a policy's exception may have a mistake of its own
+    except Exception as in_turn:  # a policy's exception may itself raise when it is printed
         message = f"its message cannot be read ({type(in_turn).__name__})"
     if len(message) > MAX_DETAILS:
         message = f"{message[:MAX_DETAILS]} … ({len(message) - MAX_DETAILS:,} characters left out)"

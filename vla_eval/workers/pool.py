@@ -1,7 +1,7 @@
-"""Worker processes with a watchdog: whatever a worker does, an answer comes for every job.
+"""Worker processes with a watchdog: every job gets an answer, whatever a worker does.
 
-A worker that is busy with one thing for too long is asked where it hangs and then killed; one that
-dies is replaced; both give an `EpisodeError` with the cause. A process does the jobs of one setup key
+A worker that exceeds a time limit writes its stack to its log and is killed; one that dies is replaced.
+Both give an `EpisodeError` with the cause. A process does the jobs of one setup key
 only: whatever a policy changes in its process, from the default dtype to numpy's functions, ends with
 the process. Knows nothing of environments, policies or files of results, nor of what a job is: the
 inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording_worker`.
@@ -22,16 +22,16 @@ from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
 from vla_eval.workers.messages import DeviceFound, Failed
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
-from vla_eval.workers.start import worker_context
+from vla_eval.workers.start import end_server, server_is_stopped, worker_context
 
 __all__ = ["Answered", "Job", "JobSource", "WorkerMain", "WorkerPool"]
 
 TICK_SECONDS = 0.2
-DUMP_SECONDS = 0.5  # for a hanging worker to write where it hangs
+DUMP_SECONDS = 0.5  # for a stuck worker to write its stack
 
 
 class Job(Protocol):
-    """What a worker can be told to do; it is sent to it by pickle."""
+    """What a worker can be given to do; it is sent to it by pickle."""
 
     @property
     def setup_key(self) -> Hashable:
@@ -39,18 +39,18 @@ class Job(Protocol):
 
 
 class JobSource[J: Job](Protocol):
-    """Where jobs come from; `JobQueue` is one."""
+    """A source of jobs; `JobQueue` is one."""
 
-    def __len__(self) -> int:
-        """How many jobs can be handed out now."""
+    def has_next(self) -> bool:
+        """Whether a job can be handed out now."""
 
     def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
-        """Return the next job for a worker that has `loaded` at hand, while others have `taken`."""
+        """Return the next job for a worker that has loaded `loaded`, while others have `taken`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered[J: Job, A]:
-    """What came of one job."""
+    """The result of one job."""
 
     job: J
     answer: A | Failed
@@ -136,7 +136,7 @@ class WorkerPool[J: Job, A]:
     def _hand_out(self, queue: JobSource[J]) -> None:
         for index in range(self._size):
             worker = self._workers.get(index)
-            if (worker is not None and worker.job is not None) or not len(queue):
+            if (worker is not None and worker.job is not None) or not queue.has_next():
                 continue
             if worker is not None and worker.process.says_something():  # which an idle one does at its end
                 self._end(index)
@@ -157,7 +157,7 @@ class WorkerPool[J: Job, A]:
             worker.process.give(job)
 
     def _look_at(self, index: int, worker: _Worker[J]) -> Iterator[Answered[J, A] | DeviceFound]:
-        """Take what a busy worker has said; then see whether it is alive, and in time."""
+        """Read the messages of a busy worker; then check that it is alive, and within its time limit."""
         job = worker.job
         assert job is not None  # only busy ones are looked at
         error: EpisodeError | None
@@ -181,7 +181,7 @@ class WorkerPool[J: Job, A]:
             error = self._overtime(index, worker.process)
         except BrokenMessageError as exc:
             self._end(index)
-            if worker.job is None:  # it has answered; what it says beyond that is nobody's
+            if worker.job is None:  # it has answered; what it sends beyond that belongs to no job
                 return
             error = _crashed(worker.process, f"wrote into the parent's pipe or memory: {exc}")
         except (EOFError, OSError):
@@ -197,6 +197,9 @@ class WorkerPool[J: Job, A]:
         if process.start_error is not None:
             self._end(index)
             return _crashed(process, f"could not be started: {process.start_error!r}")
+        if process.is_starting and server_is_stopped():
+            end_server()  # the worker's start is then tried again, from another server
+            return None
         busy = process.busy()
         limit_seconds = self._limits[busy.stage]
         if time.monotonic() - busy.since <= limit_seconds:
@@ -239,5 +242,5 @@ def _cause_of_death(exitcode: int | None) -> str:
     if exitcode >= 0:
         return f"exited with code {exitcode}"
     name = signal.Signals(-exitcode).name if -exitcode in set(signal.Signals) else f"signal {-exitcode}"
-    hint = " (often the kernel, for want of memory: use fewer --workers)" if name == "SIGKILL" else ""
+    hint = " (often the kernel, out of memory: use fewer --workers)" if name == "SIGKILL" else ""
     return f"was killed by {name}{hint}"

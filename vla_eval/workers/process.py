@@ -1,7 +1,7 @@
-"""One worker process as its parent sees it: given jobs, listened to, ended. Decides nothing.
+"""One worker process, from the side of its parent: give it jobs, read its answers, end it. Decides nothing.
 
-Whatever may take long, or never end, is done in a thread: starting a process by a server that may have been
-stopped, handing a job to a process that does not read, waiting for the process before.
+Calls that may block run in a thread: starting a process by a server that may have been stopped, giving a
+job to a process that does not read, waiting for the previous process.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Busy:
-    """What a worker is busy with, and since when by `time.monotonic`: one clock for all of the machine."""
+    """The stage of a worker, and since when by `time.monotonic`: one clock for the whole machine."""
 
     stage: Stage
     since: float
@@ -146,7 +146,9 @@ class WorkerProcess:
             self._process.kill()
             if self.wait(1.0) is None:
                 logger.warning(
-                    "Worker %d (process %s) does not end; going on without it.", self.index, self._process.pid
+                    "Worker %d (process %s) does not end; continuing without it.",
+                    self.index,
+                    self._process.pid,
                 )
         self.connection.close()
         self._lifeline.close()

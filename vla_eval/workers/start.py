@@ -1,4 +1,4 @@
-"""How worker processes begin: forked from one server that has imported what takes long.
+"""Start worker processes: forked from one server that has done the slow imports.
 
 Importing torch, ManiSkill and lerobot takes seconds and hundreds of megabytes, for every worker and again
 after every error; a fork has them at once, and shares the memory. Where there is an NVIDIA driver each
@@ -62,16 +62,33 @@ def begin(
     main(*args)
 
 
+def server_is_stopped() -> bool:
+    """Whether the process that workers are forked from was stopped by a signal: it would never answer."""
+    pid = _server_pid()
+    if pid is None:
+        return False
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            return file.read().rpartition(b")")[2].split()[0] == b"T"  # pid (name) state …
+    except OSError:
+        return False
+
+
 def end_server() -> None:
     """Kill the process that workers are forked from: it does not answer. The next worker starts another one.
 
     Workers are not touched; the kernel keeps the dead process until `multiprocessing` sees that it is gone.
     """
-    pid: int | None = getattr(forkserver._forkserver, "_forkserver_pid", None)  # there is no public name
+    pid = _server_pid()
     if pid is not None:
         with contextlib.suppress(ProcessLookupError, ChildProcessError):
             os.kill(pid, signal.SIGKILL)
             os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+def _server_pid() -> int | None:
+    pid: int | None = getattr(forkserver._forkserver, "_forkserver_pid", None)  # there is no public name
+    return pid
 
 
 @contextlib.contextmanager

@@ -54,8 +54,8 @@ class ConvertOptions:
     Attributes:
         head, chunk_size: see `MikasaOpenVLAConfig`.
         unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
-        pictures: fields of the pictures, in the order of the training.
-        picture_px: edge of the pictures as a camera gives them.
+        pictures: fields of the images, in the order of the training.
+        camera_px: edge of the images as a camera gives them.
         proprio: numbers of the proprioception; 0: the model has none.
         allow_pickled: read heads that are pickled tensors.
         gripper: how the training data encode it, see `steps.gripper`; None is refused: no file says it.
@@ -68,7 +68,7 @@ class ConvertOptions:
     chunk_size: int = 1
     unnorm_key: str | None = None
     pictures: tuple[str, ...] = tuple(CAMERA_KEYS.values())
-    picture_px: int = 128
+    camera_px: int = 128
     proprio: int = 0
     allow_pickled: bool = False
     gripper: str | None = None
@@ -179,7 +179,7 @@ def settle_augmentation(source: Path, stated: bool | None) -> bool:
     and experiments/robot/libero/run_libero_eval.py#L137.
 
     Raises:
-        CheckpointError: neither the name nor anybody else says it, or they disagree.
+        CheckpointError: neither the name nor the caller says it, or they disagree.
     """
     is_named = AUGMENTED_RUN in source.resolve().name
     if stated is None and not is_named:
@@ -198,7 +198,7 @@ def settle_augmentation(source: Path, stated: bool | None) -> bool:
 
 
 def _config(source: Path, options: ConvertOptions) -> MikasaOpenVLAConfig:
-    shape = (3, options.picture_px, options.picture_px)
+    shape = (3, options.camera_px, options.camera_px)
     make: Any = MikasaOpenVLAConfig  # lerobot, whose fields it has, is untyped
     config: MikasaOpenVLAConfig = make(
         head=options.head,

@@ -92,14 +92,14 @@ def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | 
 def stated_gripper(source: Path, stated: str | None) -> GripperEncoding:
     """Return how a published policy encodes the gripper, which none of its files says.
 
-    Statistics do not tell: from 0 to 1 may be from closed to open, or from open to closed.
+    Statistics cannot say it: from 0 to 1 may be from closed to open, or from open to closed.
 
     Args:
         source: the checkpoint, for messages.
         stated: by whoever converts it.
 
     Raises:
-        CheckpointError: nobody has said it, or there is no such encoding.
+        CheckpointError: it is not stated, or there is no such encoding.
     """
     for encoding in ENCODINGS:
         if stated == encoding:
@@ -152,7 +152,7 @@ def write_checkpoint(
     Args:
         source: folder of the published checkpoint.
         out: a folder that is not there yet.
-        policy: with the weights; its configuration is told where the tokenizer lies.
+        policy: with the weights; its configuration gets the path of the tokenizer.
         make_processors: makes pre- and postprocessor from that configuration.
         check_tokenizer: is given the tokenizer, and raises if it is not the model's.
 

@@ -49,9 +49,9 @@ class ConvertOptions:
 
     Attributes:
         unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
-        cameras: fields of the pictures that the policy expects; `pictures` says which of them are read.
+        cameras: fields of the images that the policy expects; `pictures` says which of them are read.
         pictures: see `MikasaSpatialVLAConfig`.
-        picture_px: edge of the pictures as a camera gives them.
+        camera_px: edge of the images as a camera gives them.
         head: whether Gemma's output matrix is that of its input (`tied`) or a tensor of its own; None: as the
             files say, and an error if they contradict each other.
         sizes: sizes that differ from the published ones.
@@ -61,7 +61,7 @@ class ConvertOptions:
     unnorm_key: str | None = None
     cameras: tuple[str, ...] = tuple(CAMERA_KEYS.values())
     pictures: tuple[str, ...] = (CAMERA_KEYS["base_camera"],)
-    picture_px: int = 128
+    camera_px: int = 128
     head: Head | None = None
     sizes: dict[str, int] = field(default_factory=dict)
     dtype: str = "bfloat16"
@@ -138,7 +138,7 @@ def _settle_head(
     if has_own and HEAD not in weights:
         raise CheckpointError(
             f"{source}: expected {HEAD}, found none. Fetch the whole checkpoint, or use `--head tied` for "
-            "files of a model that tells tokens by its input matrix."
+            "files of a model that predicts tokens with its input matrix."
         )
     if has_own or HEAD not in weights:
         return has_own
@@ -156,7 +156,7 @@ def _settle_head(
 def _config(
     source: Path, processor: Mapping[str, Any], options: ConvertOptions, *, has_own_head: bool
 ) -> MikasaSpatialVLAConfig:
-    shape = (3, options.picture_px, options.picture_px)
+    shape = (3, options.camera_px, options.camera_px)
     chunk = processor.get("action_chunk_size")
     if not isinstance(chunk, int):
         raise CheckpointError(

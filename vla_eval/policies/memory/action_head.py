@@ -1,11 +1,11 @@
 """The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
 
-Where the arm goes is told by how far away the goal is, axis by axis, in a layer that knows nothing else:
-so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
+Where the arm goes is predicted from how far away the goal is, axis by axis, in a layer that sees nothing
+else: so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
 paths still finds the way. When to go is decided with all that is known.
 
 Not every task is a way to a place: to meet a rolling ball an arm has to follow it first. There a part of
-the translation may be free, told by all that is known.
+the translation may be free, predicted from all that is known.
 """
 
 import torch
@@ -17,7 +17,7 @@ from vla_eval.policies.memory.sizes import SPACE
 
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
 WAY_HIDDEN = 64
-WAY_SEEN = 4  # numbers that tell the way along one axis
+WAY_SEEN = 4  # numbers that describe the way along one axis
 LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
 
 
@@ -25,7 +25,7 @@ class ActionHead(nn.Module):
     """Decides when to go, the rest of the action, and how large the error of each action will be.
 
     Args:
-        hidden: numbers that tell what was decided.
+        hidden: numbers of what was decided.
         chunk: actions.
         action: dimensions of an action, the first three of them a translation.
         free: whether a part of the translation does not depend on the goal.
@@ -64,7 +64,7 @@ class ActionHead(nn.Module):
     def _along_each_axis(self, way_m: Tensor) -> Tensor:
         """(N, 3) to (N, 3, WAY_SEEN): the way along the axis, up and aside, and which kind of axis it is.
 
-        The two level axes share one law: what is learned of one holds for the other.
+        The two horizontal axes share their weights: what is learned of one holds for the other.
         """
         way = way_m / WAY_SCALE_M
         up, aside = way[:, 2:], way[:, :2].norm(dim=1, keepdim=True)

@@ -3,33 +3,34 @@
 from dataclasses import dataclass, field
 from typing import Any, ClassVar  # lerobot is untyped
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.configs import PreTrainedConfig
 
 from vla_eval.errors import check_names
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.policies.memory.sizes import SPOTS, STATE
+from vla_eval.policies.ported_config import PortedConfig
 
 TYPE = "mikasa_memory"
 
 
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
-class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
+class MikasaMemoryConfig(PortedConfig):
     """A small policy with a memory, or its twin without one.
 
     A training sample is an episode from its beginning to a frame: `observation.*` at the `window_steps`
     frames up to it and, for the goal, at the episode's last frame; `action` at all of them and one chunk
     further. So any loop that follows `*_delta_indices` trains it.
 
+    Nothing is normalised by statistics: positions in metres and actions in [-1, 1] need none, and rotation
+    and gripper hardly vary in scripted demonstrations, where a deviation would scale up noise.
+
     Attributes:
         whole_episodes: `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it.
-        remembers: False for the twin, whose memory begins anew at each step.
+        remembers: False for the twin, whose memory is reset at each step.
         window_steps: frames of history in a training sample; at least the longest episode, so that no
             memory begins in its middle. None: our `finetune` takes the dataset's longest.
-        chunk_size: actions of a chunk.
-        n_action_steps: how many lerobot's own loop executes; ours sets its own number.
-        arm_cameras: the pictures whose camera is on the arm and moves with it.
+        arm_cameras: the images whose camera is on the arm and moves with it.
         free_translation: a part of the translation does not depend on where the demonstration ends, for
             tasks that are more than a way to a place.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
@@ -39,7 +40,7 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         waiting_share: a step whose action is that of the step before is used with this probability.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         doubt_weight: of the loss that teaches the policy how large its error will be.
-        mix_colors: the three colours of an episode's pictures change places at random in training.
+        mix_colors: the three colours of an episode's images change places at random in training.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps, scheduler_decay_lr: AdamW, warm-up, cosine.
     """
@@ -75,25 +76,10 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     scheduler_decay_steps: int = 2000
     scheduler_decay_lr: float = 4e-5
 
-    # Positions in metres and actions in [-1, 1] need no statistics; rotation and gripper hardly vary in
-    # scripted demonstrations, and dividing by their deviation would blow up noise.
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.IDENTITY,
-        }
-    )
-
     def __post_init__(self) -> None:
-        """Check what can be checked without a dataset."""
         super().__post_init__()
         if self.window_steps is not None and self.window_steps < 1:
             raise ValueError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
-            )
         if self.patch_px < 1 or self.patch_px % SPOTS:
             raise ValueError(
                 f"patch_px is {self.patch_px}, expected a multiple of {SPOTS}: so many spots has an edge"
@@ -105,21 +91,21 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
         if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
-            raise ValueError(f"'{TYPE}' needs pictures, observation.state and action")
+            raise ValueError(f"'{TYPE}' needs images, observation.state and action")
         if self.robot_state_feature.shape != (STATE,):
             raise ValueError(
                 f"'{TYPE}' needs the state 'eef' of {STATE} numbers, found {self.robot_state_feature.shape}: "
                 "record with state: eef"
             )
         where = f"policy.arm_cameras ({TYPE}; those whose camera is on the arm, [] if none is)"
-        check_names("picture", self.arm_cameras, self.image_features, where=where)
+        check_names("image", self.arm_cameras, self.image_features, where=where)
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
-            raise ValueError(f"'{TYPE}' needs pictures of one size, found {sorted(shapes)}")
+            raise ValueError(f"'{TYPE}' needs images of one size, found {sorted(shapes)}")
         _, height_px, width_px = next(iter(shapes))
         if height_px != width_px or height_px % self.patch_px:
             raise ValueError(
-                f"'{TYPE}' needs square pictures whose edge is a multiple of patch_px ({self.patch_px}), "
+                f"'{TYPE}' needs square images whose edge is a multiple of patch_px ({self.patch_px}), "
                 f"found {height_px}×{width_px}"
             )
 
@@ -148,24 +134,6 @@ class MikasaMemoryConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is 
         """A chunk for each frame of the window."""
         return list(range(1 - self.n_window_steps, self.chunk_size))
 
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> Any:
-        """Return lerobot's configuration of AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
-        return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-        )
+        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)

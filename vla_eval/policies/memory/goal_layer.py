@@ -1,6 +1,6 @@
 """Where the positive control goes: each look-up says where the place that it found lies in the world.
 
-The way from a place in a picture to a place in the world is one small map per camera, the same for all
+The way from a place in an image to a place in the world is one small map per camera, the same for all
 heads, so that every episode teaches it, wherever the target lay. A layer that may use all that was looked
 up, colours included, learns 250 goals by heart instead: with nine candidates it was off by 3.4 cm in new
 episodes and by 1.7 in those that it had seen.
@@ -17,10 +17,10 @@ from vla_eval.policies.memory.sizes import PLACE, POSITION_SCALE, SPACE
 
 MAP_HIDDEN = 64
 EVIDENCE_COUNTS = (3.0, 0.5, 3.0)
-"""How much what tells of a look-up counts to begin with: its largest share of attention, how much the place
-stands out, and minus how unlike its colour is to the one asked for."""
+"""How much the evidence for a look-up counts to begin with: its largest share of attention, how much the
+place stands out, and minus how unlike its colour is to the one asked for."""
 
-PLACE_SCALE = 4.0  # the table's things lie within a part of a picture of [-1, 1]: to numbers of about 1
+PLACE_SCALE = 4.0  # the table's things lie within a part of an image of [-1, 1]: to numbers of about 1
 LEAST_HEIGHT_M = 0.02
 LEAST_ERROR_M2 = 1e-8  # a camera without error would be believed alone
 KEPT_PER_BATCH = 0.95  # of what was known of errors and evidence before
@@ -57,10 +57,10 @@ class GoalLayer(nn.Module):
     """The mean of where the look-ups point to, weighted by how far each is believed: by camera, then of both.
 
     What a fixed camera sees lies where it lies, wherever the arm is: its map knows nothing but the place in
-    the picture. A place in the picture of a camera on the arm is a ray that leaves the tool: where it meets
+    the image. A place in the image of a camera on the arm is a ray that leaves the tool: where it meets
     the table depends on nothing but the tool's height, linearly, and turns and moves with the tool. Maps are
-    not told more of the arm than that: one that is learns to tell the demonstration's end from the way on
-    which the arm already is (low down, it is there), and not from the picture. Each map also says how sure
+    given no more of the arm than that: one that is learns to predict the demonstration's end from the way on
+    which the arm already is (low down, it is there), and not from the image. Each map also says how sure
     it is at a place.
 
     In training, how far each camera is believed is learned with the rest (a mixture of experts). Squared
@@ -97,20 +97,20 @@ class GoalLayer(nn.Module):
         """Return the goals in metres.
 
         Args:
-            places: (N, cameras, heads, 2) places in the pictures, -1 to 1.
+            places: (N, cameras, heads, 2) places in the images, -1 to 1.
             evidence: (N, cameras, heads, 3) of each look-up, see `EVIDENCE_COUNTS`.
             state: (N, state) in SI units: the tool centre point's position and the first two columns of its
                 rotation matrix.
         """
-        told = [each(PLACE_SCALE * places[:, index]) for index, each in enumerate(self.maps)]
+        mapped = [each(PLACE_SCALE * places[:, index]) for index, each in enumerate(self.maps)]
         pointed = torch.stack(
             [
                 _from_the_tool(camera[..., 1:], state) if rides else camera[..., 1:] / POSITION_SCALE
-                for camera, rides in zip(told, self.on_arm, strict=True)
+                for camera, rides in zip(mapped, self.on_arm, strict=True)
             ],
             dim=1,
         )
-        sure = torch.stack([camera[..., 0] for camera in told], dim=1)
+        sure = torch.stack([camera[..., 0] for camera in mapped], dim=1)
         belief = TRUST_SCALE * self.trust + (self.evidence * evidence).sum(dim=-1) + sure
         shares = belief.softmax(dim=-1)
         of_camera = (shares[..., None] * evidence).sum(dim=2)

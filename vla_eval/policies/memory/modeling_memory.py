@@ -22,14 +22,14 @@ class Episodes(NamedTuple):
     """A batch of B episodes of T steps, from their beginning; padding comes last.
 
     Attributes:
-        pictures: (B, T, cameras, 3, H, W) in [0, 1].
+        images: (B, T, cameras, 3, H, W) in [0, 1].
         state: (B, T, state).
         actions: (B, T, chunk, action).
         counts: (B, T, chunk) float, 0 for what is beyond the episode.
         goal_m: (B, 3) the tool centre point at the episode's end.
     """
 
-    pictures: Tensor
+    images: Tensor
     state: Tensor
     actions: Tensor
     counts: Tensor
@@ -68,7 +68,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         config, episodes = self.config, self._episodes(batch)
-        answer = self.network(episodes.pictures, episodes.state)
+        answer = self.network(episodes.images, episodes.state)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = _weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
@@ -91,9 +91,9 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:
         """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
-        pictures, state = self._pictures(batch), batch[STATE_KEY]
+        images, state = self._images(batch), batch[STATE_KEY]
         shape = state.shape[:2]
-        sight = self.network.see(pictures.flatten(0, 1), state.flatten(0, 1))
+        sight = self.network.see(images.flatten(0, 1), state.flatten(0, 1))
         before = self.network.begin(shape[0]) if memory is None else memory
         after = self.network.write(sight, shape, before)
         return Memory(*(part[:, -1] for part in after))
@@ -109,8 +109,8 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         self.eval()
         if self.config.remembers and memory is None:
             raise ValueError(f"'{TYPE}' with a memory needs what `remember` returned for this frame")
-        pictures, state = self._pictures(batch), batch[STATE_KEY]
-        sight = self.network.see(pictures, state)
+        images, state = self._images(batch), batch[STATE_KEY]
+        sight = self.network.see(images, state)
         if memory is None:
             after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
             memory = Memory(*(part[:, 0] for part in after))
@@ -127,7 +127,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
         return self._queue.popleft()
 
-    def _pictures(self, batch: dict[str, Tensor]) -> Tensor:
+    def _images(self, batch: dict[str, Tensor]) -> Tensor:
         return torch.stack([batch[key] for key in self.config.image_features], dim=-4)
 
     def _episodes(self, batch: dict[str, Tensor]) -> Episodes:
@@ -154,11 +154,11 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             weights = weights * (1 - config.first_action_weight) / (config.chunk_size - 1)
             weights[0] = config.first_action_weight
         counts = counts * weights * (1 + config.change_weight * change)[..., None] * kept[..., None]
-        pictures = taken(self._pictures({key: batch[key][:, :n_steps] for key in config.image_features}))
+        images = taken(self._images({key: batch[key][:, :n_steps] for key in config.image_features}))
         if self.training and config.mix_colors:
-            pictures = _mixed(pictures)
+            images = _mixed(images)
         return Episodes(
-            pictures=pictures,
+            images=images,
             state=taken(batch[STATE_KEY][:, :n_steps]),
             actions=taken(actions),
             counts=taken(counts),
@@ -233,10 +233,10 @@ def _change(actions: Tensor, real: Tensor) -> Tensor:
     return change.clamp(max=1.0)
 
 
-def _mixed(pictures: Tensor) -> Tensor:
+def _mixed(images: Tensor) -> Tensor:
     """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
-    orders = torch.rand(len(pictures), 3, device=pictures.device).argsort(dim=1)
-    return pictures.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
+    orders = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
+    return images.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
 
 
 def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:

@@ -1,10 +1,10 @@
-"""The network of the positive control: small eyes, a gated memory, and a look back through it.
+"""The network of the positive control: small vision encoders, a gated memory, attention over both.
 
-What stands out at a step is written into a memory; what the memory holds is looked up in the pictures of
+What stands out at a step is written into a memory; what the memory holds is looked up in the images of
 the same step; the answer gives the next actions. The twin without memory is the same network whose memory
-begins anew at each step.
+is reset at each step.
 
-Things are kept as they were seen, so that they can be compared with the pictures that come later: the
+Things are kept as they were seen, so that they can be compared with later images: the
 memory of a thing is the mean of all that was seen, each weighted by the exponential of a learned
 importance (exponential gating: Beck et al. 2024, "xLSTM"). All else is kept in a minimal gated recurrence,
 whose gate and candidate depend on the input alone (Feng et al. 2024, "Were RNNs All We Needed?", minGRU).
@@ -19,31 +19,31 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
-from vla_eval.policies.memory.eyes import Eye, Keys, Likeness, Places, StandingOut
 from vla_eval.policies.memory.goal_layer import GoalLayer
 from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, STATE, NetworkSizes
+from vla_eval.policies.memory.vision_encoder import Keys, Likeness, Places, StandingOut, VisionEncoder
 from vla_eval.policies.steps.precision import in_float32
 
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
 INSISTENCE = 5.0
-"""To begin with, every other pair of heads hardly lets go of the first thing that it saw: what comes later
+"""To begin with, every other pair of heads mostly keeps the first thing that it saw: what comes later
 counts e^-5 as much. A cue comes before the choice; a mean of both would be neither's colour."""
 NOTHING = -1e4  # logarithm of a weight of 0, finite
 
 
 class Answer(NamedTuple):
-    """What the network says of each step.
+    """Outputs of the network for each step.
 
     Attributes:
         actions: (B, T, chunk, action).
         doubts: (B, T, chunk) > 0, the squared error that is expected of each action. No gradient flows from
             it into anything but its own layer.
-        goal_m: (B, T, 3) where the demonstration's tool centre point ends, told from what the memory looked
-            up alone.
+        goal_m: (B, T, 3) where the demonstration's tool centre point ends, predicted from what the memory
+            looked up alone.
         pointed_m: (B, T, cameras, heads, 3) the same by each look-up alone.
-        shares: (B, T, cameras, heads) how far each is believed among those of its camera.
-        camera_shares: (B, T, cameras) how far each camera is.
-        evidence: (B, T, cameras, 3) what told of each camera how far to believe it.
+        shares: (B, T, cameras, heads) weight of each among those of its camera.
+        camera_shares: (B, T, cameras) weight of each camera.
+        evidence: (B, T, cameras, 3) of each camera: what its share is computed from.
     """
 
     actions: Tensor
@@ -90,7 +90,7 @@ class MemoryNetwork(nn.Module):
 
     Args:
         sizes: of all layers.
-        remembers: False for the twin, whose memory begins anew at each step.
+        remembers: False for the twin, whose memory is reset at each step.
     """
 
     def __init__(self, sizes: NetworkSizes, *, remembers: bool) -> None:
@@ -98,7 +98,8 @@ class MemoryNetwork(nn.Module):
         self.sizes, self.remembers = sizes, remembers
         n, hidden = sizes.cameras, sizes.hidden
         n_things = n * sizes.heads
-        self.eyes = nn.ModuleList(Eye(sizes) for _ in range(n))
+        # `eyes` is the name in the weights that ship.
+        self.eyes = nn.ModuleList(VisionEncoder(sizes) for _ in range(n))
         self.keys = nn.ModuleList(Keys(sizes) for _ in range(n))
         self.standing_out = nn.ModuleList(StandingOut(sizes) for _ in range(n))
         self.likeness = nn.ModuleList(Likeness(sizes) for _ in range(n))
@@ -138,14 +139,14 @@ class MemoryNetwork(nn.Module):
         nothing = like.new_full(things.shape[:2], NOTHING)
         return Memory(things, nothing, like.expand(n_episodes, -1))
 
-    def see(self, pictures: Tensor, state: Tensor) -> Sight:
+    def see(self, images: Tensor, state: Tensor) -> Sight:
         """Return what is seen at each step.
 
         Args:
-            pictures: (N, cameras, 3, H, W) in [0, 1].
+            images: (N, cameras, 3, H, W) in [0, 1].
             state: (N, state) in SI units.
         """
-        return self._sight([eye(pictures[:, index]) for index, eye in enumerate(self.eyes)], state)
+        return self._sight([eye(images[:, index]) for index, eye in enumerate(self.eyes)], state)
 
     @in_float32
     def _sight(self, places: list[Places], state: Tensor) -> Sight:
@@ -229,16 +230,16 @@ class MemoryNetwork(nn.Module):
             evidence=goals.evidence,
         )
 
-    def forward(self, pictures: Tensor, state: Tensor) -> Answer:
+    def forward(self, images: Tensor, state: Tensor) -> Answer:
         """Answer for each step of episodes from their beginning.
 
         Args:
-            pictures: (B, T, cameras, 3, H, W) in [0, 1].
+            images: (B, T, cameras, 3, H, W) in [0, 1].
             state: (B, T, state) in SI units.
         """
         shape = state.shape[:2]
         flat_state = state.flatten(0, 1)
-        sight = self.see(pictures.flatten(0, 1), flat_state)
+        sight = self.see(images.flatten(0, 1), flat_state)
         memories = self.write(sight, shape, self.begin(shape[0]))
         flat = Memory(*(part.flatten(0, 1) for part in memories))
         return Answer(*(by_episode(part, shape) for part in self.act(sight, flat, flat_state)))

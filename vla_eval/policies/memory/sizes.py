@@ -1,4 +1,4 @@
-"""Sizes of the positive control's network, and what is known of a place in a picture. Without torch."""
+"""Sizes of the positive control's network, and what is known of a place in an image. Without torch."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,11 @@ from vla_eval.features import STATE_NAMES
 STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
 POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
 SPACE = 3  # numbers of a position, and of the translation with which an action begins
-RGB, PLACE = 3, 2  # numbers of a colour, of a place in a picture
+RGB, PLACE = 3, 2  # numbers of a colour, of a place in an image
 APART = 1  # one number: how much a place stands out
-KNOWN = APART + RGB + PLACE  # what is told of a place beside its learned features, in this order
+KNOWN = APART + RGB + PLACE  # what is known of a place beside its learned features, in this order
 SPOTS = 4  # spots along a place's edge
-HALVES = 2  # along its edge: of each quarter of a place one spot is told
+HALVES = 2  # along its edge: of each quarter of a place one spot is described
 QUARTERS = HALVES**2
 
 
@@ -20,11 +20,11 @@ class NetworkSizes:
     """Sizes of the network.
 
     Attributes:
-        on_arm: of each picture of a step, whether its camera is on the arm.
-        image_px: height and width of a picture, a multiple of `patch_px`.
+        on_arm: of each image of a step, whether its camera is on the arm.
+        image_px: height and width of an image, a multiple of `patch_px`.
         action: dimensions of an action.
         chunk: actions of a chunk.
-        channels: learned features of a place in a picture.
+        channels: learned features of a place in an image.
         patch_px: edge of such a place, a multiple of `SPOTS`.
         heads: questions per camera: so many fixed ones, and so many of the memory.
         key: numbers of a question.
@@ -49,7 +49,7 @@ class NetworkSizes:
 
     @property
     def cameras(self) -> int:
-        """Pictures of a step."""
+        """Images of a step."""
         return len(self.on_arm)
 
     @property
@@ -59,5 +59,5 @@ class NetworkSizes:
 
     @property
     def seen(self) -> int:
-        """Numbers that one look at all pictures returns."""
+        """Numbers that one look at all images returns."""
         return self.cameras * self.heads * self.value

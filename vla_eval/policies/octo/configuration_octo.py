@@ -3,14 +3,14 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal  # lerobot is untyped
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.configs import PreTrainedConfig
 
 from vla_eval.errors import check_names
 from vla_eval.features import ACTION_KEY
 from vla_eval.policies.octo.diffusion_head import HeadSizes
 from vla_eval.policies.octo.language import T5Sizes
 from vla_eval.policies.octo.transformer import PATCH_PX, TransformerSizes
+from vla_eval.policies.ported_config import PortedConfig
 from vla_eval.policies.steps.gripper import Gripper, GripperDecoding, GripperEncoding
 from vla_eval.policies.steps.images import Augmentation
 from vla_eval.policies.steps.normalization import Normalization, mask_all_but
@@ -30,18 +30,16 @@ TRAINED: dict[Trained, tuple[str, ...]] = {
 
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
-class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
+class MikasaOctoConfig(PortedConfig):
     """Octo, Octo Model Team 2024 (arXiv:2405.12213).
 
     Attributes:
         cameras: camera of the model (`primary`, `wrist`) -> field of the dataset.
-        image_px: camera of the model -> edge that its pictures are resized to.
+        image_px: camera of the model -> edge that its images are resized to.
         window: frames that it sees, the newest included; what lies before the episode is masked.
         max_window: longest window that there are position embeddings for.
-        chunk_size: actions of a chunk.
-        n_action_steps: how many lerobot's own loop executes; ours sets its own number.
         trained: which parameters are trained, see `TRAINED`.
-        remember_readouts: compute what the frozen trunk says of a training frame once, and keep it; needs
+        remember_readouts: compute the frozen trunk's output for each training frame once; needs
             `trained: heads` and no augmentation. Another recipe than the paper's, see `docs/octo.md`.
         width, layers, heads, mlp_width, stem_channels, stem_features: see `TransformerSizes`.
         head_hidden, head_blocks, head_time, diffusion_steps, max_action: see `HeadSizes`.
@@ -50,7 +48,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         tokenizer_name: folder or name of the tokenizer, or `bytes`.
         primary_crop_area, primary_crop_ratio, brightness, contrast, saturation, hue: augmentation, see
             `Augmentation`; only the first camera is cropped, and in evaluation its middle is taken.
-        augment: whether training pictures are changed at all.
+        augment: whether training images are changed at all.
         gripper_encoding, gripper_decoding: see `Gripper`.
         normalize_gripper: whether the gripper is normalised, too; the original leaves it alone.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
@@ -104,24 +102,10 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
     scheduler_warmup_steps: int = 2000
     scheduler_decay_steps: int = 50_000
 
-    # Ours does it, with a mask: see `processor_octo`.
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.IDENTITY,
-        }
-    )
-
     def __post_init__(self) -> None:
-        """Check what can be checked without a dataset."""
         super().__post_init__()
         if not 1 <= self.window <= self.max_window:
             raise ValueError(f"window is {self.window}, expected 1 to max_window ({self.max_window})")
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
-            )
         if not self.cameras or self.cameras.keys() != self.image_px.keys():
             raise ValueError(
                 f"cameras and image_px have to name the same cameras, found {', '.join(self.cameras)} and "
@@ -132,7 +116,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
                 raise ValueError(f"image_px.{camera} is {px}, expected a multiple of {PATCH_PX}")
         if self.remember_readouts and (self.trained != "heads" or self.augment):
             raise ValueError(
-                "remember_readouts needs trained: heads and augment: false: else what the trunk says of a "
+                "remember_readouts needs trained: heads and augment: false: else the trunk's output for a "
                 "frame is not the same each time"
             )
 
@@ -140,10 +124,10 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         """Check the fields of the dataset."""
         if self.action_feature is None:
             raise ValueError(f"'{TYPE}' needs the field action")
-        check_names("picture", self.cameras.values(), self.image_features, where=f"policy.cameras ({TYPE})")
+        check_names("image", self.cameras.values(), self.image_features, where=f"policy.cameras ({TYPE})")
 
     reads_state = False  # the published checkpoints have no proprioception
-    masks_history = True  # our adapter tells it which frames lie before the episode
+    masks_history = True  # our adapter marks which frames lie before the episode
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -203,7 +187,7 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         return {"fields": {ACTION_KEY: self.action_normalization}, "gripper": self.gripper}
 
     def augmentation(self, camera: str) -> Augmentation:
-        """Return how training pictures of a camera are changed; the first one is cropped, too."""
+        """Return how training images of a camera are changed; the first one is cropped, too."""
         is_first = camera == next(iter(self.cameras))
         return Augmentation(
             crop_area=self.primary_crop_area if is_first else None,
@@ -224,24 +208,6 @@ class MikasaOctoConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is un
         """A chunk for each frame of the window."""
         return list(range(1 - self.window, self.chunk_size))
 
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> Any:
-        """Return lerobot's configuration of AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
-        return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.optimizer_lr,
-            decay_lr=0.0,
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-        )
+        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=0.0)

@@ -1,10 +1,10 @@
-"""Octo's action head: noise is turned into a chunk of actions, told by the readout. Knows only torch.
+"""Octo's action head: noise is turned into a chunk of actions, predicted from the readout. Knows only torch.
 
 Legend of shape suffixes: B batch, W steps of the window, F = chunk × action dimensions.
 
 Source: https://github.com/octo-models/octo at 241fb3514b7c40957a86d869fecb7c7fc353f540 (MIT),
 octo/model/components/action_heads.py:386-610 and diffusion.py; the schedule is Nichol & Dhariwal 2021
-(arXiv:2102.09672), equation 17. Written anew here.
+(arXiv:2102.09672), equation 17. Our own implementation.
 """
 
 import math
@@ -121,7 +121,7 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def loss(self, condition_BWD: Tensor, targets: "Targets", draws: "Draws") -> Tensor:
-        """Return the squared error of the told noise, summed over an action's dimensions, at each step."""
+        """Return the squared error of the predicted noise at each step, summed over dimensions."""
         schedule = self.schedule()
         actions = targets.actions.flatten(2).clamp(-self.sizes.max_action, self.sizes.max_action)
         left = schedule.alpha_products[draws.time]
@@ -144,9 +144,9 @@ class DiffusionHead(nn.Module):
         for index in range(self.n_steps):
             at = self.n_steps - 1 - index
             time = torch.full((len(x), 1), at, device=x.device)
-            told = self(condition_BD, x, time)
+            predicted = self(condition_BD, x, time)
             alpha, beta, left = schedule.alphas[at], schedule.betas[at], schedule.alpha_products[at]
-            x = (x - (1 - alpha) / (1 - left).sqrt() * told) / alpha.sqrt()
+            x = (x - (1 - alpha) / (1 - left).sqrt() * predicted) / alpha.sqrt()
             if at > 0:
                 x = x + beta.sqrt() * noise[:, 1 + index]
             x = x.clamp(-self.sizes.max_action, self.sizes.max_action)

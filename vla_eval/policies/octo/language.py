@@ -1,4 +1,4 @@
-"""Octo's instruction: a frozen T5 encoder, asked once per prompt. Knows nothing of pictures or actions."""
+"""Octo's instruction: a frozen T5 encoder, asked once per prompt. Knows nothing of images or actions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

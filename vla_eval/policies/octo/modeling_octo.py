@@ -138,7 +138,7 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
     def _window(self, batch: Mapping[str, Tensor]) -> Window:
         step_mask = ~_needed(batch, f"{next(iter(self.config.cameras.values()))}_is_pad")
         images = {
-            camera: self._pictures(camera, _needed(batch, field))
+            camera: self._images(camera, _needed(batch, field))
             for camera, field in self.config.cameras.items()
         }
         language_BLD = self._prompts(
@@ -154,8 +154,8 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
             language_mask=torch.ones(len(step_mask), dtype=torch.bool, device=step_mask.device),
         )
 
-    def _pictures(self, camera: str, images: Tensor) -> Tensor:
-        """Return pictures (B, W, 3, px, px) in levels, from (B, W, 3, H, W') in [0, 1]."""
+    def _images(self, camera: str, images: Tensor) -> Tensor:
+        """Return images (B, W, 3, px, px) in levels, from (B, W, 3, H, W') in [0, 1]."""
         px, changes = self.config.image_px[camera], self.config.augmentation(camera)
         levels = (images * MAX_LEVEL).round()
         if self.config.augment and self.training:

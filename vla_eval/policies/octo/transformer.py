@@ -1,11 +1,11 @@
-"""Octo's transformer: pictures, instruction and readouts as tokens, each step sees itself and the past.
+"""Octo's transformer: images, instruction and readouts as tokens, each step sees itself and the past.
 
 Legend of shape suffixes: B batch, W steps of the window, N tokens, L tokens of the instruction, D width.
 Knows only torch: nothing of lerobot, of text, or of actions.
 
 Source of all constants and rules: https://github.com/octo-models/octo at
 241fb3514b7c40957a86d869fecb7c7fc353f540 (MIT), octo/model/octo_module.py, octo/model/components/
-{block_transformer,transformer,vit_encoders,tokenizers}.py; written anew here.
+{block_transformer,transformer,vit_encoders,tokenizers}.py; our own implementation.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class TransformerSizes:
     """What the transformer is made of; the defaults are those of Octo-small.
 
     Attributes:
-        image_px: camera of the model -> edge of its square pictures, in the order of the tokens.
+        image_px: camera of the model -> edge of its square images, in the order of the tokens.
         max_window: longest window that there are position embeddings for.
         language_tokens, language_width: of the embedded instruction.
         width, layers, heads, mlp_width: of the transformer.
@@ -53,7 +53,7 @@ class Window(NamedTuple):
 
     Attributes:
         images: camera -> (B, W, 3, px, px) in levels [0, 255].
-        image_mask: camera -> (B, W), False where a camera gave no picture.
+        image_mask: camera -> (B, W), False where a camera gave no image.
         step_mask: (B, W), False for steps before the episode began.
         language_BLD: the embedded instruction.
         language_mask: (B,), False where there is none.
@@ -67,7 +67,7 @@ class Window(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What the transformer says: embeddings of the instruction, by group of each step, and the readout."""
+    """Output of the transformer: embeddings of the instruction, by group of each step, and the readout."""
 
     task_BLD: Tensor
     groups: dict[str, Tensor]  # (B, W, N, D)
@@ -89,7 +89,7 @@ class StandardizedConv2d(nn.Conv2d):
 class Stem(nn.Module):
     """Four convolutions and a patch embedding: one token per 16×16 pixels.
 
-    A goal picture is stacked onto each frame's channels; there is none here, which is zeros, hence -1.
+    A goal image is stacked onto each frame's channels; there is none here, which is zeros, hence -1.
     """
 
     def __init__(self, channels: tuple[int, ...], features: int) -> None:
@@ -103,7 +103,7 @@ class Stem(nn.Module):
         self.embedding = nn.Conv2d(channels[-1], features, 1)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return tokens (B, W, N, features), row by row, of pictures (B, W, 3, px, px) in [0, 255]."""
+        """Return tokens (B, W, N, features), row by row, of images (B, W, 3, px, px) in [0, 255]."""
         scaled = images.flatten(0, 1) / MIDDLE_LEVEL - 1
         x = torch.cat([scaled, torch.full_like(scaled, -1.0)], dim=1)
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
@@ -124,7 +124,7 @@ class Block(nn.Module):
         self.fc1, self.fc2 = nn.Linear(width, mlp_width), nn.Linear(mlp_width, width)
 
     def forward(self, x_BND: Tensor, mask: Tensor) -> Tensor:
-        """Return the next embeddings; `mask` (B, 1, N, N) says who sees (third) whom (fourth)."""
+        """Return the next embeddings; `mask` (B, 1, N, N): which place (third) attends to which (fourth)."""
         normed = self.attention_norm(x_BND)
         query, key, value = (
             part(normed).unflatten(-1, (self.heads, -1)).transpose(1, 2)
@@ -163,7 +163,7 @@ class OctoTransformer(nn.Module):
         self.norm = nn.LayerNorm(width, eps=NORM_EPSILON)
 
     def image_tokens(self, window: Window) -> dict[str, Tensor]:
-        """Return camera -> (B, W, N, stem features); a picture that is not there is black before."""
+        """Return camera -> (B, W, N, stem features); an image that is not there is black before."""
         return {
             camera: self.stems[camera](images * window.image_mask[camera][..., None, None, None])
             for camera, images in window.images.items()
@@ -205,7 +205,7 @@ def attention_mask(keys_BN: Tensor, n_task: int, n_steps: int) -> Tensor:
 
     The instruction looks at itself. A step's observation looks at the instruction and at observations of
     its own and earlier steps. A readout, the last token of its step, looks at all that, and at its own and
-    earlier readouts, which nobody else looks at. Padding is looked at by nobody.
+    earlier readouts, which nothing else attends to. Nothing attends to padding.
 
     Args:
         keys_BN: False for padding.
@@ -221,7 +221,7 @@ def attention_mask(keys_BN: Tensor, n_task: int, n_steps: int) -> Tensor:
     may = step[None, :] <= step[:, None]
     may &= ~is_readout[None, :] | is_readout[:, None]
     mask = may & keys_BN[:, None, :]
-    # A row without any key would be undefined; only padding has such rows, and nobody reads them.
+    # A row without any key would be undefined; only padding has such rows, and they are not read.
     alone = ~mask.any(dim=-1, keepdim=True) & torch.eye(n_tokens, dtype=torch.bool, device=mask.device)
     return (mask | alone)[:, None]
 

@@ -1,4 +1,4 @@
-"""Actions as tokens: 255 bins over [-1, 1], told by the last tokens of the vocabulary, counted from behind.
+"""Actions as tokens: 255 bins over [-1, 1], which are the last tokens of the vocabulary, counted from behind.
 
 Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
 prismatic/vla/action_tokenizer.py#L13-L72 and, for unknown tokens, prismatic/extern/hf/
@@ -16,14 +16,14 @@ def to_tokens(actions: Tensor, text_vocabulary: int) -> Tensor:
 
     Args:
         actions: of any shape, normalised.
-        text_vocabulary: tokens of the tokenizer: the first bin is told by the last of them.
+        text_vocabulary: tokens of the tokenizer: the first bin is the last of them.
     """
     edges = torch.linspace(-1, 1, N_BINS, dtype=torch.float64, device=actions.device)
     return text_vocabulary - torch.bucketize(actions.double().clamp(-1, 1), edges, right=True)
 
 
 def from_tokens(tokens: Tensor, text_vocabulary: int) -> Tensor:
-    """Return the normalised actions float32, the middles of the bins; a token that tells none is the nearest.
+    """Return the normalised actions float32, the middles of the bins; a token that is none is the nearest.
 
     Args:
         tokens: of any shape.

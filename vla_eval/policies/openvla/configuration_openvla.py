@@ -1,21 +1,21 @@
 """lerobot's configuration of OpenVLA and OpenVLA-OFT; `docs/openvla.md` explains it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any  # lerobot is untyped
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, STATE_KEY
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
-from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes, network_sizes
-from vla_eval.policies.steps.gripper import Gripper
+from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes
+from vla_eval.policies.ported_config import PromptedConfig
 from vla_eval.policies.steps.images import Augmentation
+from vla_eval.policies.steps.network_sizes import with_changes
 from vla_eval.policies.steps.normalization import Normalization, mask_all_but
-from vla_eval.policies.steps.precision import DTYPES
 
 TYPE = "mikasa_openvla"
 HEADS: tuple[Head, ...] = ("l1", "parallel_tokens", "tokens")
@@ -51,26 +51,17 @@ class StepDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lero
 
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
-class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
-    """OpenVLA, or OpenVLA-OFT, as one type: the head tells which.
+class MikasaOpenVLAConfig(PromptedConfig):
+    """OpenVLA, or OpenVLA-OFT, as one type; `head` says which.
 
     Attributes:
         head: see `NetworkOptions`.
-        chunk_size: actions of a chunk. A part of the model: K = 4 and K = 8 are two trainings.
-        n_action_steps: how many lerobot's own loop executes, the first ones; ours sets its own number.
-        pictures: fields of the pictures that are read, in this order; empty: all of the dataset's.
+        chunk_size: a part of the model: K = 4 and K = 8 are two trainings.
+        pictures: empty: all images of the dataset.
         use_proprio: read `observation.state` as one more token. The paper does not.
-        sizes: sizes that differ from the published model's, see `NetworkSizes`.
-        dtype: of eyes, projector and Llama: `float32`, `bfloat16`. The continuous head is always float32.
-        gradient_checkpointing: recompute activations in the backward pass.
-        image_augmentation: change training pictures at random and crop those of an evaluation alike.
-        gripper: how the gripper is encoded.
-        do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False, as the
-            original: no chunk begins so late that it has any.
-        drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.
-        tokenizer_name: folder or name of the tokenizer; `bytes`: see
-            `steps.byte_tokenizer`.
-        prompt_max_tokens: a longer prompt is an error.
+        dtype: of vision encoders, projector and Llama. The continuous head is always float32.
+        image_augmentation: change training images at random and crop those of an evaluation alike.
+        do_mask_loss_for_padding: False, as the original: no chunk begins so late that it goes beyond the end.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps: AdamW, constant, divided by ten after `scheduler_decay_steps` (0: never).
     """
@@ -78,58 +69,27 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
     head: str = "l1"
     chunk_size: int = 8
     n_action_steps: int = 8
-    pictures: list[str] = field(default_factory=list)
     use_proprio: bool = False
-    sizes: dict[str, int] = field(default_factory=dict)
-    dtype: str = "bfloat16"
-    gradient_checkpointing: bool = False
     image_augmentation: bool = True
-    gripper: str = "maniskill"
-    do_mask_loss_for_padding: bool = False
-    drop_n_last_frames: int = 0
     tokenizer_name: str = "openvla/openvla-7b"
-    prompt_max_tokens: int = 256
 
-    optimizer_lr: float = 5e-4
-    optimizer_weight_decay: float = 1e-2
     optimizer_grad_clip_norm: float = 0.0
-    scheduler_warmup_steps: int = 0
     scheduler_decay_steps: int = 100_000
 
-    # Of lerobot's own normaliser, which this policy does not use: see `normalizations`.
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.IDENTITY,
-        }
-    )
-
     def __post_init__(self) -> None:
-        """Check what can be checked without a dataset."""
         super().__post_init__()
-        for name, value, known in (("head", self.head, HEADS), ("dtype", self.dtype, DTYPES)):
-            if value not in known:
-                raise unknown_name(name, value, known, where=TYPE)
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise RecipeError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
-            )
+        self.check_choice("head", HEADS)
         self.network_sizes()
-        self.gripper_spec()
-        self.drop_n_last_frames = 0 if self.do_mask_loss_for_padding else self.chunk_size - 1
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
-        if not self.image_features or self.action_feature is None:
-            raise RecipeError(f"'{TYPE}' needs pictures and an action.")
+        super().validate_features()
         if self.use_proprio and self.robot_state_feature is None:
             raise RecipeError(f"'{TYPE}' with use_proprio needs {STATE_KEY}.")
-        check_names("picture", self.pictures, self.image_features, where=f"policy.pictures ({TYPE})")
 
     @property
-    def picture_fields(self) -> tuple[str, ...]:
-        """Fields of the pictures that are read, in order."""
+    def image_fields(self) -> tuple[str, ...]:
+        """Fields of the images that are read, in order."""
         return tuple(self.pictures) or tuple(self.image_features)
 
     @property
@@ -139,7 +99,7 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
 
     def network_sizes(self) -> NetworkSizes:
         """Return the sizes of the network."""
-        return network_sizes(self.sizes)
+        return with_changes(NetworkSizes, self.sizes)
 
     def network_options(self) -> NetworkOptions:
         """Return what the network has beside its sizes; needs the dataset's fields."""
@@ -148,11 +108,6 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
         return NetworkOptions(
             head=head, chunk=self.chunk_size, action=int(self.action_feature.shape[0]), proprio=proprio
         )
-
-    def gripper_spec(self) -> Gripper:
-        """Return how the gripper is encoded."""
-        encoding: Any = self.gripper  # `Gripper` checks it
-        return Gripper(encoding=encoding)
 
     def normalizations(self) -> dict[str, Normalization]:
         """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
@@ -172,11 +127,6 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
             )
         return fields
 
-    @property
-    def encoder_settings(self) -> dict[str, Any]:
-        """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
-        return {"fields": self.normalizations(), "gripper": self.gripper_spec()}
-
     def lora_defaults(self) -> dict[str, Any]:
         """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
         full = [name for name in FULL_MODULES if self._has(name)]
@@ -188,29 +138,6 @@ class MikasaOpenVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is
 
     def _has(self, module: str) -> bool:
         return self.head == "l1" if module == "action_head" else self.use_proprio
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """The frame itself."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        """One chunk."""
-        return list(range(self.chunk_size))
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> Any:
-        """Return lerobot's configuration of AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
 
     def get_scheduler_preset(self) -> Any:
         """Return the configuration of the schedule."""

@@ -1,4 +1,4 @@
-"""The token heads: actions as tokens, all at once or one after the other, and the loss of telling them.
+"""The token heads: actions as tokens, all at once or one after the other, and their loss.
 
 Legend as in `network`. Decoding is greedy, as the original's.
 """
@@ -16,22 +16,22 @@ from vla_eval.policies.steps.greedy import Prefix, greedy_tokens
 
 
 def parallel_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
-    """Return normalised actions (B, K, A) of the tokens that the placeholders tell."""
+    """Return normalised actions (B, K, A) of the tokens that are predicted for the placeholders."""
     hidden = network.action_states(network.sequence(inputs))
     tokens = network.llm.lm_head(hidden).argmax(dim=-1)
     return _chunk(network, tokens)
 
 
 def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
-    """Return normalised actions (B, K, A), told token after token, for prompts of several lengths."""
+    """Return normalised actions (B, K, A), predicted token after token, for prompts of several lengths."""
     sequence = network.sequence(inputs)
     n = int(sequence.first_action.max())
     lengths = sequence.first_action
     seen = torch.arange(n, device=lengths.device) < lengths[:, None]
     causal = torch.ones(n, n, dtype=torch.bool, device=lengths.device).tril()
     prefix = Prefix(sequence.embeddings[:, :n], seen[:, None, :] & causal, lengths)
-    told = greedy_tokens(_Llama(network.llm), prefix, network.options.n_action_tokens)
-    return _chunk(network, told.tokens)
+    decoded = greedy_tokens(_Llama(network.llm), prefix, network.options.n_action_tokens)
+    return _chunk(network, decoded.tokens)
 
 
 def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts: Tensor) -> Tensor:

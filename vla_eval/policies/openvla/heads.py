@@ -42,12 +42,12 @@ class ResidualMlp(nn.Module):
         values = functional.relu(self.fc1(self.layer_norm1(values)))
         for block in self.mlp_resnet_blocks:
             values = block(values)
-        told: Tensor = self.fc2(self.layer_norm2(values))
-        return told
+        predicted: Tensor = self.fc2(self.layer_norm2(values))
+        return predicted
 
 
 class L1Head(nn.Module):
-    """Hidden states of a chunk's placeholders to its actions; each action is told from its own tokens."""
+    """Hidden states of a chunk's placeholders to its actions, each from its own tokens."""
 
     def __init__(self, *, llm_width: int, chunk: int, action: int) -> None:
         super().__init__()

@@ -1,11 +1,11 @@
 """What LoRA trains of OpenVLA, by name. Knows nothing of peft.
 
 The original says `all-linear` of a transformers model, which spares its output embeddings: all linear
-layers of both eyes, the projector and Llama, but not `lm_head`. The heads are outside of it and trained
-in full. Said of a whole policy, `all-linear` would take `lm_head` and the heads, too; hence names.
+layers of both vision encoders, the projector and Llama, but not `lm_head`. The heads are outside of it and
+trained in full. For a whole policy `all-linear` would take `lm_head` and the heads, too; hence names.
 Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
 vla-scripts/finetune.py#L846-L860. It also puts adapters on blocks whose output is not used; ours are not
-there. Its eyes have one matrix for query, key and value, ours have three: the same rank makes ours freer.
+there. Its encoders have one matrix for query, key and value, ours have three: the same rank makes ours freer.
 """
 
 _DINO = (

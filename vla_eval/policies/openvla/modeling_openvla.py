@@ -6,12 +6,11 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.errors import SpecMismatchError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
 from vla_eval.policies.openvla.generation import generated_actions, parallel_actions, token_loss
 from vla_eval.policies.openvla.lora import FULL_MODULES
-from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork, Prompts
+from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import (
@@ -23,6 +22,7 @@ from vla_eval.policies.steps.images import (
     truncated_levels,
 )
 from vla_eval.policies.steps.precision import default_dtype
+from vla_eval.policies.steps.prompts import Prompts
 
 
 class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -67,14 +67,14 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
         inputs = self._inputs(batch, changed=False)
         if self.config.head == "l1":
             return self.network.actions(inputs)
-        told = generated_actions if self.config.head == "tokens" else parallel_actions
-        return told(self.network, inputs)
+        predict = generated_actions if self.config.head == "tokens" else parallel_actions
+        return predict(self.network, inputs)
 
     def _inputs(self, batch: dict[str, Tensor], *, changed: bool) -> Inputs:
         proprio = batch[STATE_KEY] if self.config.use_proprio else None
-        return Inputs(self._pictures(batch, changed=changed), self._prompts(batch), proprio)
+        return Inputs(self._images(batch, changed=changed), self._prompts(batch), proprio)
 
-    def _pictures(self, batch: dict[str, Tensor], *, changed: bool) -> Tensor:
+    def _images(self, batch: dict[str, Tensor], *, changed: bool) -> Tensor:
         """Return (B, cameras, 3, edge, edge) in [0, 1], resized and either changed at random or cropped.
 
         Source of the whole levels: in training https://github.com/moojink/dlimp_openvla/blob/
@@ -82,17 +82,15 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
         moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/experiments/robot/openvla_utils.py#L623.
         """
         edge = self.network.sizes.image_px
-        pictures = []
-        for name in self.config.picture_fields:
-            if name not in batch:
-                raise SpecMismatchError(f"'{TYPE}': the batch has no picture '{name}'.")
-            levels = resize_lanczos3((batch[name].float() * MAX_LEVEL).round(), Size(edge, edge))
+        images = []
+        for name in self.config.image_fields:
+            levels = resize_lanczos3(self._levels(batch, name), Size(edge, edge))
             if self.config.image_augmentation and changed:
                 levels = truncated_levels(augment(levels[:, None], AUGMENTATION)[:, 0])
             elif self.config.image_augmentation:
                 levels = centre_crop(levels, AUGMENTATION.centre_area, whole=truncated_levels)
-            pictures.append(levels / MAX_LEVEL)
-        return torch.stack(pictures, dim=1)
+            images.append(levels / MAX_LEVEL)
+        return torch.stack(images, dim=1)
 
     def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
         return finished(*self._prompt(batch), self.network.sizes)

@@ -1,12 +1,12 @@
-"""OpenVLA and OpenVLA-OFT: pictures, prompt and, if wanted, proprioception to a chunk of actions.
+"""OpenVLA and OpenVLA-OFT: images, prompt and, if wanted, proprioception to a chunk of actions.
 
 Legend: B samples, N tokens of a sequence, T tokens of a prompt, K actions of a chunk, A numbers of an
 action, D Llama's width.
 
-A sequence is: beginning of text, the patches of all pictures, proprioception (one token, optional), the
+A sequence is: beginning of text, the patches of all images, proprioception (one token, optional), the
 rest of the prompt, K · A action tokens, stop, padding. With the heads `l1` and `parallel_tokens` the
 action tokens are placeholders whose embeddings are zero, and every token attends to every other that is
-no padding. What a placeholder is to say is read **one position before it**, as in a language model.
+no padding. The prediction for a placeholder is read **one position before it**, as in a language model.
 Positions are counted from 0 in every row; padding is on the right.
 
 Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
@@ -22,33 +22,22 @@ from transformers import LlamaConfig, LlamaForCausalLM
 from vla_eval.policies.openvla.heads import L1Head, ProprioProjector
 from vla_eval.policies.openvla.sizes import NetworkOptions, NetworkSizes
 from vla_eval.policies.openvla.vision import FusedVision, Projector
+from vla_eval.policies.steps.prompts import Prompts
 
 RMS_NORM_EPS = 1e-6  # of OpenVLA; Llama-2's own is 1e-5
 ROPE_THETA = 10_000.0
-
-
-class Prompts(NamedTuple):
-    """Prompts of B samples, from the beginning of the text to the empty token before the actions.
-
-    Attributes:
-        ids: (B, T) int64, padded on the right.
-        mask: (B, T) bool, False for padding.
-    """
-
-    ids: Tensor
-    mask: Tensor
 
 
 class Inputs(NamedTuple):
     """What is known of B samples.
 
     Attributes:
-        pictures: (B, cameras, 3, H, W) in [0, 1].
+        images: (B, cameras, 3, H, W) in [0, 1].
         prompts: see there.
         proprio: (B, proprio) normalised; None for a model without.
     """
 
-    pictures: Tensor
+    images: Tensor
     prompts: Prompts
     proprio: Tensor | None = None
 
@@ -98,7 +87,7 @@ class OpenVLANetwork(nn.Module):
         embeddings = self.llm.model.embed_tokens(ids)
         if action_ids is None:
             embeddings = embeddings.masked_fill(is_action[..., None], 0.0)
-        middle = self.projector(self.vision(inputs.pictures))
+        middle = self.projector(self.vision(inputs.images))
         if self.options.proprio:
             assert inputs.proprio is not None
             token = self.proprio_projector(inputs.proprio).to(middle.dtype)
@@ -131,14 +120,14 @@ class OpenVLANetwork(nn.Module):
         return last
 
     def action_states(self, sequence: Sequence, *, causal: bool = False, n_more: int = 0) -> Tensor:
-        """Return the hidden states (B, K · A + n_more, D) that tell the action tokens and what follows."""
+        """Return the hidden states (B, K · A + n_more, D) that predict the action tokens and what follows."""
         n_tokens = self.options.n_action_tokens + n_more
         return _from(self.hidden(sequence, causal=causal), sequence.first_action - 1, n_tokens)
 
     def actions(self, inputs: Inputs) -> Tensor:
         """Return normalised actions (B, K, A), float32, by the `l1` head."""
-        told: Tensor = self.action_head(self.action_states(self.sequence(inputs)))
-        return told
+        predicted: Tensor = self.action_head(self.action_states(self.sequence(inputs)))
+        return predicted
 
     def _text(self, prompts: Prompts, action_ids: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Return ids (B, T + K · A + 1), which of them are actions, and which are no padding."""

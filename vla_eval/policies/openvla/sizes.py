@@ -5,12 +5,11 @@ prismatic/extern/hf/configuration_prismatic.py, and the timm models named there;
 prismatic/vla/constants.py and prismatic/extern/hf/modeling_prismatic.py at the same commit.
 """
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_eval.errors import RecipeError, check_names
+from vla_eval.errors import RecipeError
+from vla_eval.policies.steps.network_sizes import VisionSizes
 
 Head = Literal["l1", "parallel_tokens", "tokens"]
 N_BINS = 256
@@ -18,30 +17,22 @@ N_BINS = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkSizes:
-    """Sizes of all parts.
+class NetworkSizes(VisionSizes):
+    """Sizes of all parts; the last block of SigLIP is never run either, like that of DINOv2.
 
     Attributes:
-        image_px, patch_px: edge of a picture and of a patch.
         dino_width, dino_depth, dino_heads, dino_registers: DINOv2 as published. The last of `dino_depth`
             blocks is never run: its output is not used, so the network does not have it.
-        siglip_width, siglip_depth, siglip_heads, siglip_mlp: SigLIP, likewise.
         llm_width, llm_depth, llm_heads, llm_mlp: Llama.
         vocabulary: rows of the embedding; `text_vocabulary`: those of the tokenizer. Action bins are the
             last `N_BINS - 1` of the latter, counted from behind.
         bos_token, stop_token, pad_token, empty_token: numbers of these tokens.
     """
 
-    image_px: int = 224
-    patch_px: int = 14
     dino_width: int = 1024
     dino_depth: int = 24
     dino_heads: int = 16
     dino_registers: int = 4
-    siglip_width: int = 1152
-    siglip_depth: int = 27
-    siglip_heads: int = 16
-    siglip_mlp: int = 4304
     llm_width: int = 4096
     llm_depth: int = 32
     llm_heads: int = 32
@@ -54,12 +45,7 @@ class NetworkSizes:
     empty_token: int = 29871
 
     def __post_init__(self) -> None:
-        """Check what would otherwise be noticed late."""
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 0:
-                raise RecipeError(f"sizes.{field.name} is {getattr(self, field.name)}, expected ≥ 0.")
-        if self.image_px % self.patch_px:
-            raise RecipeError(f"sizes.image_px is {self.image_px}, expected a multiple of {self.patch_px}.")
+        VisionSizes.__post_init__(self)  # no super(): `slots` makes a new class of this one
         if min(self.dino_depth, self.siglip_depth) < 2:
             raise RecipeError("sizes.dino_depth and sizes.siglip_depth: expected ≥ 2; the last is not used.")
         n_needed = max(self.text_vocabulary, self.pad_token + 1, self.empty_token + 1)
@@ -68,11 +54,6 @@ class NetworkSizes:
                 f"sizes.vocabulary is {self.vocabulary} and sizes.text_vocabulary {self.text_vocabulary}; "
                 f"expected at least {n_needed}, and more than {N_BINS}."
             )
-
-    @property
-    def n_patches(self) -> int:
-        """Patches of one picture."""
-        return (self.image_px // self.patch_px) ** 2
 
     @property
     def vision_width(self) -> int:
@@ -101,15 +82,3 @@ class NetworkOptions:
     def n_action_tokens(self) -> int:
         """Tokens of a chunk."""
         return self.chunk * self.action
-
-
-def network_sizes(changes: Mapping[str, int]) -> NetworkSizes:
-    """Return the published sizes with some of them changed.
-
-    Raises:
-        UnknownNameError: there is no such size.
-        RecipeError: a value is impossible.
-    """
-    known = [field.name for field in dataclasses.fields(NetworkSizes)]
-    check_names("size", changes, known, where="finetune.policy.sizes")
-    return NetworkSizes(**changes)

@@ -1,6 +1,6 @@
-"""The fused eyes: DINOv2 with registers and SigLIP side by side, and the projector into Llama's width.
+"""The fused vision encoder, DINOv2 with registers beside SigLIP, and the projector into Llama's width.
 
-Legend: B samples, C cameras, P patches of a picture, D channels.
+Legend: B samples, C cameras, P patches of an image, D channels.
 
 Features are those of the second-to-last block, without the final norm and without class and register
 tokens. Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
@@ -12,25 +12,20 @@ from typing import Any  # transformers is untyped here
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import (
-    Dinov2WithRegistersConfig,
-    Dinov2WithRegistersModel,
-    SiglipVisionConfig,
-    SiglipVisionModel,
-)
+from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 
 from vla_eval.policies.openvla.sizes import NetworkSizes
 from vla_eval.policies.steps.precision import in_float32
+from vla_eval.policies.steps.siglip import LAYER_NORM_EPS, siglip
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what DINOv2 was trained with
 SIGLIP_MEAN, SIGLIP_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 GELU = "gelu"  # the exact one; transformers' SigLIP would take the tanh approximation, the original does not
-LAYER_NORM_EPS = 1e-6
 DINO_MLP_RATIO, PROJECTOR_RATIO = 4, 4
 
 
 class FusedVision(nn.Module):
-    """Pictures to features of patches."""
+    """Images to features of patches."""
 
     mean: Tensor
     std: Tensor
@@ -46,20 +41,20 @@ class FusedVision(nn.Module):
         self.register_buffer("std", stds, persistent=False)
 
     @in_float32
-    def normalised(self, pictures: Tensor) -> Tensor:
+    def normalised(self, images: Tensor) -> Tensor:
         """Return (2, N, 3, H, W): what DINOv2 sees and what SigLIP sees of (N, 3, H, W) in [0, 1]."""
-        return (pictures - self.mean) / self.std
+        return (images - self.mean) / self.std
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Return (B, C · P, D), the patches of a sample's pictures one after the other.
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (B, C · P, D), the patches of a sample's images one after the other.
 
         Args:
-            pictures: (B, C, 3, H, W) in [0, 1].
+            images: (B, C, 3, H, W) in [0, 1].
         """
-        for_dino, for_siglip = self.normalised(pictures.flatten(0, 1)).to(self.dino.dtype).unbind()
+        for_dino, for_siglip = self.normalised(images.flatten(0, 1)).to(self.dino.dtype).unbind()
         seen = self.dino(for_dino).last_hidden_state[:, self.n_prefix_tokens :]
         features = torch.cat([seen, self.siglip(for_siglip).last_hidden_state], dim=-1)
-        return features.reshape(len(pictures), -1, features.shape[-1])
+        return features.reshape(len(images), -1, features.shape[-1])
 
 
 class Projector(nn.Module):
@@ -100,22 +95,6 @@ def _dino(sizes: NetworkSizes) -> Any:
 
 
 def _siglip(sizes: NetworkSizes) -> Any:
-    config: Any = SiglipVisionConfig
-    model: Any = SiglipVisionModel(
-        config(
-            hidden_size=sizes.siglip_width,
-            intermediate_size=sizes.siglip_mlp,
-            num_hidden_layers=sizes.siglip_depth - 1,
-            num_attention_heads=sizes.siglip_heads,
-            hidden_act=GELU,
-            layer_norm_eps=LAYER_NORM_EPS,
-            image_size=sizes.image_px,
-            patch_size=sizes.patch_px,
-            vision_use_head=False,
-            attn_implementation="sdpa",
-        )
-    )
-    # In some versions of transformers the tower is wrapped: parameters have the same names in all.
-    tower = getattr(model, "vision_model", model)
+    tower = siglip(sizes, n_blocks=sizes.siglip_depth - 1, activation=GELU)
     tower.post_layernorm = nn.Identity()
     return tower

@@ -1,7 +1,7 @@
-"""Names and layouts of weights: those of `openvla/openvla-7b` and OFT to ours, and back, exactly.
+"""Names and layouts of weights: those of `openvla/openvla-7b` and OFT to ours, exactly.
 
-The original's eyes are timm models: one matrix for query, key and value, positions without a row for the
-class token. What it has and never uses (last blocks, final norms, SigLIP's pooling) is left out knowingly.
+The original's vision encoders are timm models: one matrix for query, key and value, positions without a row
+for the class token. What it has and never uses (last blocks, final norms, SigLIP's pooling) is left out.
 """
 
 from collections.abc import Iterable, Mapping
@@ -55,50 +55,22 @@ def to_ours(weights: Mapping[str, Tensor], sizes: NetworkSizes) -> dict[str, Ten
     Args:
         weights: by the original's names. A name that is not known is kept as it is, for whoever loads
             the result to refuse it.
-        sizes: of the network, whose depths tell what is not used.
+        sizes: of the network, whose depths say what is not used.
     """
     ours: dict[str, Tensor] = {}
     for name, tensor in weights.items():
         if unused(name, sizes):
             continue
         if name.startswith(SIGLIP):
-            ours.update(_eye(name.removeprefix(SIGLIP), tensor, OUR_SIGLIP, SIGLIP_NAMES, SIGLIP_SPLIT))
+            ours.update(_encoder(name.removeprefix(SIGLIP), tensor, OUR_SIGLIP, SIGLIP_NAMES, SIGLIP_SPLIT))
         elif name.startswith(DINO):
-            ours.update(_eye(name.removeprefix(DINO), tensor, OUR_DINO, DINO_NAMES, DINO_SPLIT))
+            ours.update(_encoder(name.removeprefix(DINO), tensor, OUR_DINO, DINO_NAMES, DINO_SPLIT))
         else:
             ours[_replaced(name, TOP)] = tensor
     return ours
 
 
-def to_original(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return our tensors under the original's names and in its layouts; what it never uses is not there."""
-    original: dict[str, Tensor] = {}
-    for name, tensor in weights.items():
-        if name.startswith(OUR_SIGLIP):
-            eye = (OUR_SIGLIP, SIGLIP, SIGLIP_NAMES, SIGLIP_SPLIT)
-        elif name.startswith(OUR_DINO):
-            eye = (OUR_DINO, DINO, DINO_NAMES, DINO_SPLIT)
-        else:
-            original[_replaced(name, _back(TOP))] = tensor
-            continue
-        ours, theirs, names, split = eye
-        rest = name.removeprefix(ours)
-        if rest == DINO_POSITIONS:
-            # The row of the class token is not always zero after training; it belongs to that token.
-            original[theirs + POSITIONS] = tensor[:, 1:]
-            original[f"{theirs}cls_token"] = weights[f"{ours}embeddings.cls_token"] + tensor[:, :1]
-        elif rest == SIGLIP_POSITIONS:
-            original[theirs + POSITIONS] = tensor[None]
-        elif split[0] in rest:
-            parts = [weights[ours + rest.replace(split[0], part)] for part in split]
-            fused = _replaced(rest.replace(split[0], FUSED), _back(names))
-            original[theirs + fused] = torch.cat(parts)
-        elif not any(part in rest for part in split):
-            original.setdefault(theirs + _replaced(rest, _back(names)), tensor)
-    return original
-
-
-def _eye(
+def _encoder(
     rest: str,
     tensor: Tensor,
     prefix: str,
@@ -122,7 +94,3 @@ def _replaced(name: str, pairs: Iterable[tuple[str, str]]) -> str:
         if name.startswith(old) or (old.startswith(".") and old in name) or name == old:
             name = name.replace(old, new, 1)
     return name
-
-
-def _back(pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    return tuple((new, old) for old, new in pairs)

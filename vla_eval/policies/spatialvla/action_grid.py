@@ -1,6 +1,6 @@
 """Adaptive action grids: where the bins of translation and rotation lie. Knows nothing of tokens or networks.
 
-A translation is told by its direction (theta from the z axis, phi around it) and its length r, in
+A translation is given by its direction (theta from the z axis, phi around it) and its length r, in
 normalised units; a rotation by its three numbers. On each axis the edges are either even or quantiles of a
 Gaussian that was fitted to the actions of a dataset, cut to the axis' limits, so that common actions get
 narrow bins. Source: Qu et al. 2025 (arXiv 2501.15830), section III-B.
@@ -52,7 +52,6 @@ class ActionGrid:
     edges: tuple[tuple[float, ...], ...]
 
     def __post_init__(self) -> None:
-        """Check that the edges cover each axis."""
         if len(self.edges) != len(AXES):
             raise RecipeError(f"action grid: expected {len(AXES)} axes, found {len(self.edges)}.")
         for name, edges in zip(AXES, self.edges, strict=True):

@@ -16,8 +16,8 @@ def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
     """Return the matrix (3, 3), float32, of a pinhole camera with square pixels and a centred axis.
 
     Args:
-        height_px: of its pictures.
-        width_px: of its pictures.
+        height_px: of its images.
+        width_px: of its images.
         fov_rad: vertical field of view, as ManiSkill declares it.
 
     Raises:
@@ -31,7 +31,7 @@ def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
 
 @in_float32
 def resized_intrinsics(matrix: Tensor, *, height_px: int, width_px: int, to_px: int) -> Tensor:
-    """Return the matrix of pictures that were resized to `to_px` by `to_px`."""
+    """Return the matrix of images that were resized to `to_px` by `to_px`."""
     factors = torch.tensor([to_px / width_px, to_px / height_px, 1.0], dtype=matrix.dtype)
     return matrix * factors.to(matrix.device)[:, None]
 
@@ -42,7 +42,7 @@ def back_projected(depth: Tensor, matrices: Tensor, *, cell_px: float) -> Tensor
 
     Args:
         depth: (B, rows, columns) metres along z.
-        matrices: (B, 3, 3) of the pictures that the cells tile.
+        matrices: (B, 3, 3) of the images that the cells tile.
         cell_px: edge of a cell, in their pixels.
     """
     rows, columns = depth.shape[-2:]

@@ -6,14 +6,15 @@ from dataclasses import dataclass, field
 from typing import Any  # lerobot is untyped
 
 import torch
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS
+from vla_eval.policies.ported_config import PromptedConfig
 from vla_eval.policies.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,
@@ -26,11 +27,9 @@ from vla_eval.policies.spatialvla.sizes import (
     N_ACTION,
     Attention,
     NetworkSizes,
-    network_sizes,
 )
-from vla_eval.policies.steps.gripper import Gripper
+from vla_eval.policies.steps.network_sizes import with_changes
 from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
-from vla_eval.policies.steps.precision import DTYPES
 
 TYPE = "mikasa_spatialvla"
 GRIDS = ("refitted", "kept", "uniform")
@@ -61,35 +60,24 @@ class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # le
 
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
-class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
+class MikasaSpatialVLAConfig(PromptedConfig):
     """SpatialVLA.
 
     Attributes:
         chunk_size: actions of a chunk, three tokens each.
-        n_action_steps: how many lerobot's own loop executes, the first ones; ours sets its own number.
-        pictures: fields of the pictures that are read, in this order. The base camera alone, as the original
-            does; with the wrist's it is an extension of ours.
+        pictures: the base camera alone, as the original does; with the wrist's it is an extension of ours.
         camera_fov_rad: vertical field of view of their cameras, from which their matrices are made. MIKASA's
             cameras have a quarter turn; an evaluation with others is refused.
         action_grid: where a fine-tuning has the bins: `refitted` to the dataset's actions (tokens of a base
             are moved along), `kept` as the base has them, `uniform`.
         grid: edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion.
         base_grid: those of the base, if they were others; set by a fine-tuning.
-        prefix_attention: what pictures and prompt attend to, see `sizes.Attention`.
+        prefix_attention: what images and prompt attend to, see `sizes.Attention`.
         inference_attention: the same for inference; None becomes that of training. A converted checkpoint has
             `bidirectional`, because the original predicts so, though its scripts train with `causal`. What is
             fine-tuned here predicts as it was trained, whatever its base does.
         train_spatial_embeddings: train the embeddings of the action tokens.
-        train_word_embeddings: train Gemma's own embeddings, and what tells the tokens.
-        sizes: sizes that differ from the published model's, see `NetworkSizes`.
-        dtype: of the network: `float32`, `bfloat16`.
-        gradient_checkpointing: recompute activations in the backward pass.
-        gripper: how the gripper is encoded.
-        do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False: chunks that
-            have any are refused.
-        drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.
-        tokenizer_name: folder or name of the tokenizer; `bytes`: see `steps.byte_tokenizer`.
-        prompt_max_tokens: a longer prompt is an error.
+        train_word_embeddings: train Gemma's own embeddings, and the matrix that predicts tokens.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps: AdamW, and
             `mikasa_linear_decay`.
     """
@@ -105,64 +93,34 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
     inference_attention: str | None = None
     train_spatial_embeddings: bool = False
     train_word_embeddings: bool = False
-    sizes: dict[str, int] = field(default_factory=dict)
-    dtype: str = "bfloat16"
-    gradient_checkpointing: bool = False
     gripper: str = "unit_open"
     do_mask_loss_for_padding: bool = True
-    drop_n_last_frames: int = 0
     tokenizer_name: str = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
-    prompt_max_tokens: int = 256
 
-    optimizer_lr: float = 5e-4
     optimizer_weight_decay: float = 0.0
-    optimizer_grad_clip_norm: float = 1.0
     scheduler_warmup_steps: int = 250
 
-    # Of lerobot's own normaliser, which this policy does not use: see `normalizations`.
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.IDENTITY,
-        }
-    )
-
     def __post_init__(self) -> None:
-        """Check what can be checked without a dataset."""
         super().__post_init__()
         self.inference_attention = self.inference_attention or self.prefix_attention
-        for name, value, known in (
-            ("action_grid", self.action_grid, GRIDS),
-            ("prefix_attention", self.prefix_attention, ATTENTIONS),
-            ("inference_attention", self.inference_attention, ATTENTIONS),
-            ("dtype", self.dtype, DTYPES),
-        ):
-            if value not in known:
-                raise unknown_name(name, value, known, where=TYPE)
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise RecipeError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
-            )
+        self.check_choice("action_grid", GRIDS)
+        self.check_choice("prefix_attention", ATTENTIONS)
+        self.check_choice("inference_attention", ATTENTIONS)
         if not 0 < self.camera_fov_rad < math.pi:
             raise RecipeError(f"camera_fov_rad is {self.camera_fov_rad}, expected radians in (0, π).")
         if not self.pictures:
-            raise RecipeError(f"'{TYPE}': pictures is empty, expected the fields that are read, in order.")
+            raise RecipeError(f"'{TYPE}': `pictures` is empty, expected the fields that are read, in order.")
         self.network_sizes()
-        self.gripper_spec()
-        self.drop_n_last_frames = 0 if self.do_mask_loss_for_padding else self.chunk_size - 1
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
-        if not self.image_features or self.action_feature is None:
-            raise RecipeError(f"'{TYPE}' needs pictures and an action.")
+        super().validate_features()
         found = tuple(self.action_feature.shape)
         if found != (N_ACTION,):
             raise RecipeError(
-                f"'{TYPE}' tells translation, rotation and gripper: expected actions of {N_ACTION} numbers, "
-                f"found shape {found}."
+                f"'{TYPE}' predicts translation, rotation and gripper: expected actions of {N_ACTION} "
+                f"numbers, found shape {found}."
             )
-        check_names("picture", self.pictures, self.image_features, where=f"policy.pictures ({TYPE})")
 
     not_of_base = ("inference_attention",)  # a fine-tuning does not take it over
 
@@ -173,15 +131,10 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
 
     def network_sizes(self) -> NetworkSizes:
         """Return the sizes of the network."""
-        return network_sizes(self.sizes)
-
-    def gripper_spec(self) -> Gripper:
-        """Return how the gripper is encoded."""
-        encoding: Any = self.gripper  # `Gripper` checks it
-        return Gripper(encoding=encoding)
+        return with_changes(NetworkSizes, self.sizes)
 
     def attention(self, *, training: bool) -> Attention:
-        """Return what pictures and prompt attend to."""
+        """Return what images and prompt attend to."""
         name: Any = self.prefix_attention if training else self.inference_attention
         chosen: Attention = name  # checked in `__post_init__`
         return chosen
@@ -218,7 +171,7 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
         """Return where the bins lie.
 
         Raises:
-            RecipeError: nobody has set it, or it has other bins than the network has tokens.
+            RecipeError: it is not set, or it has other bins than the network has tokens.
         """
         if not self.grid:
             raise RecipeError(
@@ -248,38 +201,10 @@ class MikasaSpatialVLAConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot
         mask = mask_all_but(N_ACTION, left_alone=(-1,))
         return {ACTION_KEY: Normalization(kind="q01_q99", mask=mask, clip=True)}
 
-    @property
-    def encoder_settings(self) -> dict[str, Any]:
-        """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
-        return {"fields": self.normalizations(), "gripper": self.gripper_spec()}
-
     def lora_defaults(self) -> dict[str, Any]:
         """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
         full = [SPATIAL_EMBEDDINGS] if self.train_spatial_embeddings else None
         return {"target_modules": LORA_TARGETS, "modules_to_save": full}
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """The frame itself."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        """One chunk."""
-        return list(range(self.chunk_size))
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
-        return None
-
-    def get_optimizer_preset(self) -> Any:
-        """Return lerobot's configuration of AdamW."""
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
 
     def get_scheduler_preset(self) -> Any:
         """Return the configuration of the schedule."""

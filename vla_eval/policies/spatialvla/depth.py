@@ -1,8 +1,8 @@
-"""The frozen depth model: transformers' ZoeDepth, and the form in which the original shows it pictures.
+"""The frozen depth model: transformers' ZoeDepth, and the form in which the original gives it images.
 
-Pictures are padded by mirroring, resized to the model's size, and the depth is resized and cut back.
+Images are padded by mirroring, resized to the model's size, and the depth is resized and cut back.
 ZoeDepth has a head for rooms and one for streets and takes **one for a whole batch**, by a vote; here each
-picture gets the head that it votes for itself, so that its depth does not depend on what is beside it.
+image gets the head that it votes for itself, so that its depth does not depend on what is beside it.
 """
 
 from typing import Any  # transformers is untyped here
@@ -16,7 +16,7 @@ from vla_eval.policies.spatialvla.sizes import NetworkSizes
 from vla_eval.policies.steps.precision import in_float32
 
 PAD_PX = 31
-"""Pixels that are mirrored at each edge, whatever the picture's size. It is ZoeDepth's own padding,
+"""Pixels that are mirrored at each edge, whatever the image's size. It is ZoeDepth's own padding,
 √(size / 2) · 3, at 224. Source: transformers 5.5.4, models/zoedepth/image_processing_zoedepth.py."""
 MEAN = STD = 0.5  # of ZoeDepth's normalisation, per colour
 NECK_SHARES = (4, 2, 1, 1)  # of `depth_neck`: 256, 512, 1024, 1024 as published
@@ -33,7 +33,7 @@ ROUTER = {
 
 
 class DepthModel(nn.Module):
-    """Pictures to metres. Frozen, and never in training mode: its eye would drop paths at random."""
+    """Images to metres. Frozen, and never in training mode: its vision encoder would drop paths at random."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
@@ -48,13 +48,13 @@ class DepthModel(nn.Module):
         return self
 
     @torch.no_grad()
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Return depth (N, depth_px, depth_px), float32, of the padded pictures.
+    def forward(self, images: Tensor) -> Tensor:
+        """Return depth (N, depth_px, depth_px), float32, of the padded images.
 
         Args:
-            pictures: (N, 3, H, W) in [0, 1].
+            images: (N, 3, H, W) in [0, 1].
         """
-        shown = shown_pictures(pictures, self.size_px).to(self.zoe.dtype)
+        shown = shown_images(images, self.size_px).to(self.zoe.dtype)
         answer = self.zoe(shown)
         votes = answer.domain_logits.argmax(dim=-1)
         depth: Tensor = answer.predicted_depth
@@ -66,17 +66,17 @@ class DepthModel(nn.Module):
 
 
 @in_float32
-def shown_pictures(pictures: Tensor, size_px: int) -> Tensor:
-    """Return (N, 3, size, size), float32: what the depth model sees of pictures in [0, 1]."""
-    padded = functional.pad(pictures, (PAD_PX,) * 4, mode="reflect")
+def shown_images(images: Tensor, size_px: int) -> Tensor:
+    """Return (N, 3, size, size), float32: what the depth model sees of images in [0, 1]."""
+    padded = functional.pad(images, (PAD_PX,) * 4, mode="reflect")
     resized = functional.interpolate(padded, size=(size_px, size_px), mode="bicubic", align_corners=True)
     return (resized - MEAN) / STD
 
 
 @in_float32
-def cut_depth(depth: Tensor, picture_px: int) -> Tensor:
-    """Return the depth (N, picture_px, picture_px) of the pictures without their padding."""
-    padded_px = picture_px + 2 * PAD_PX
+def cut_depth(depth: Tensor, image_px: int) -> Tensor:
+    """Return the depth (N, image_px, image_px) of the images without their padding."""
+    padded_px = image_px + 2 * PAD_PX
     resized = functional.interpolate(
         depth[:, None], size=(padded_px, padded_px), mode="bicubic", align_corners=True
     )
@@ -91,8 +91,8 @@ def zoe_depth(sizes: NetworkSizes) -> Any:
 
 def zoe_config(sizes: NetworkSizes) -> Any:
     """Return transformers' configuration of it."""
-    make_eye: Any = BeitConfig
-    eye = make_eye(
+    make_encoder: Any = BeitConfig
+    encoder = make_encoder(
         image_size=sizes.depth_px,
         hidden_size=sizes.depth_width,
         num_hidden_layers=sizes.depth_layers,
@@ -104,7 +104,7 @@ def zoe_config(sizes: NetworkSizes) -> Any:
     )
     make: Any = ZoeDepthConfig
     return make(
-        backbone_config=eye,
+        backbone_config=encoder,
         neck_hidden_sizes=[sizes.depth_neck // share for share in NECK_SHARES],
         fusion_hidden_size=sizes.depth_fusion,
         bottleneck_features=sizes.depth_fusion,

@@ -10,7 +10,6 @@ Gemma 2, SigLIP and its image processor: transformers 4.47.0, with which the ori
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any  # JSON
 
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint import CONFIG_FILE, read_json
@@ -20,16 +19,16 @@ from vla_eval.policies.spatialvla.ego3d import CELLS, N_FREQUENCIES
 from vla_eval.policies.spatialvla.network import (
     ATTENTION_CAP,
     GELU,
-    LAYER_NORM_EPS,
     LOGIT_CAP,
     RMS_NORM_EPS,
     ROPE_THETA,
 )
-from vla_eval.policies.spatialvla.sections import OF_NO_EFFECT, Section
+from vla_eval.policies.spatialvla.sections import OF_NO_EFFECT, Field, Section
 from vla_eval.policies.spatialvla.sizes import SLIDING_WINDOW, NetworkSizes
 from vla_eval.policies.steps.images import MAX_LEVEL
+from vla_eval.policies.steps.siglip import LAYER_NORM_EPS
 
-PROCESSOR_FILE, PICTURES_FILE, GENERATION_FILE = (
+PROCESSOR_FILE, IMAGES_FILE, GENERATION_FILE = (
     "processor_config.json",
     "preprocessor_config.json",
     "generation_config.json",
@@ -50,19 +49,19 @@ def check_described(source: Path, sizes: NetworkSizes) -> None:
         CheckpointError: a file is missing, or says something else or something that is not known here.
     """
     config, processor = read_json(source / CONFIG_FILE), read_json(source / PROCESSOR_FILE)
-    pictures = read_json(source / PICTURES_FILE)
+    images = read_json(source / IMAGES_FILE)
     lines = _top(sizes).problems(config)
     lines += _gemma(sizes).problems(config.get("text_config"))
     lines += _siglip(sizes).problems(config.get("vision_config"))
     if sizes.depth_layers:
-        depth, eye = _zoe(sizes)
+        depth, encoder = _zoe(sizes)
         described = config.get("vision_zoe_config")
         lines += depth.problems(described)
         if isinstance(described, Mapping):
-            lines += eye.problems(described.get("backbone_config"))
+            lines += encoder.problems(described.get("backbone_config"))
     lines += _PROCESSOR.problems(processor)
     lines += _bins(sizes).problems(_flat_bins(processor.get("action_config")))
-    lines += _pictures(sizes).problems(pictures)
+    lines += _images(sizes).problems(images)
     if (source / GENERATION_FILE).is_file():
         lines += _generation(sizes).problems(read_json(source / GENERATION_FILE))
     if lines:
@@ -72,22 +71,17 @@ def check_described(source: Path, sizes: NetworkSizes) -> None:
 def _top(sizes: NetworkSizes) -> Section:
     return Section(
         where=CONFIG_FILE,
-        expected={
-            "model_type": "spatialvla",
-            "image_token_index": sizes.image_token,
-            "action_token_begin_idx": sizes.first_action_token,
-            "spatial_token_num": sizes.n_action_tokens,
-            "use_spatial_token": True,
-            "use_vision_zoe": True,
-            "ego3d_patch_reso": CELLS,
-            "n_freqs": N_FREQUENCIES,
-            "projection_dim": sizes.llm_width,
+        fields={
+            "model_type": Field("spatialvla", "spatialvla"),
+            "image_token_index": Field(sizes.image_token, 256_000),
+            "action_token_begin_idx": Field(sizes.first_action_token),
+            "spatial_token_num": Field(sizes.n_action_tokens, 259),
+            "use_spatial_token": Field(True, False),
+            "use_vision_zoe": Field(True, True),
+            "ego3d_patch_reso": Field(CELLS, 4),
+            "n_freqs": Field(N_FREQUENCIES, 8),
+            "projection_dim": Field(sizes.llm_width, 2048),
             **_special_tokens(sizes),
-        },
-        missing={
-            **{"model_type": "spatialvla", "image_token_index": 256_000, "spatial_token_num": 259},
-            **{"use_spatial_token": False, "use_vision_zoe": True, "ego3d_patch_reso": 4, "n_freqs": 8},
-            "projection_dim": 2048,
         },
         elsewhere=frozenset(
             {
@@ -104,40 +98,33 @@ def _top(sizes: NetworkSizes) -> Section:
 def _gemma(sizes: NetworkSizes) -> Section:
     return Section(
         where=f"{CONFIG_FILE}: text_config",
-        expected={
-            "model_type": "gemma2",
-            "vocab_size": sizes.vocabulary,
-            "hidden_size": sizes.llm_width,
-            "intermediate_size": sizes.llm_mlp,
-            "num_hidden_layers": sizes.llm_depth,
-            "num_attention_heads": sizes.llm_heads,
-            "num_key_value_heads": sizes.llm_kv_heads,
-            "head_dim": sizes.llm_head_width,
+        fields={
+            "model_type": Field("gemma2", "gemma2"),
+            "vocab_size": Field(sizes.vocabulary, 256_000),
+            "hidden_size": Field(sizes.llm_width, 2304),
+            "intermediate_size": Field(sizes.llm_mlp, 9216),
+            "num_hidden_layers": Field(sizes.llm_depth, 26),
+            "num_attention_heads": Field(sizes.llm_heads, 8),
+            "num_key_value_heads": Field(sizes.llm_kv_heads, 4),
+            "head_dim": Field(sizes.llm_head_width, 256),
             # Attention is divided by the root of this, whatever the heads' width is.
-            "query_pre_attn_scalar": sizes.llm_head_width,
-            "hidden_activation": GELU,
-            "rms_norm_eps": RMS_NORM_EPS,
-            "rope_theta": ROPE_THETA,
-            "attention_bias": False,
-            "attention_dropout": 0.0,
-            "sliding_window": SLIDING_WINDOW,
-            "attn_logit_softcapping": ATTENTION_CAP,
-            "final_logit_softcapping": LOGIT_CAP,
-        },
-        missing={
-            **{"model_type": "gemma2", "vocab_size": 256_000, "hidden_size": 2304, "intermediate_size": 9216},
-            **{"num_hidden_layers": 26, "num_attention_heads": 8, "num_key_value_heads": 4, "head_dim": 256},
-            **{"query_pre_attn_scalar": 256, "hidden_activation": GELU, "rms_norm_eps": 1e-6},
-            **{"rope_theta": 10_000.0, "attention_bias": False, "attention_dropout": 0.0},
-            **{"sliding_window": 4096, "attn_logit_softcapping": 50.0, "final_logit_softcapping": 30.0},
+            "query_pre_attn_scalar": Field(sizes.llm_head_width, 256),
+            "hidden_activation": Field(GELU, GELU),
+            "rms_norm_eps": Field(RMS_NORM_EPS, 1e-6),
+            "rope_theta": Field(ROPE_THETA, 10_000.0),
+            "attention_bias": Field(False, False),
+            "attention_dropout": Field(0.0, 0.0),
+            "sliding_window": Field(SLIDING_WINDOW, 4096),
+            "attn_logit_softcapping": Field(ATTENTION_CAP, 50.0),
+            "final_logit_softcapping": Field(LOGIT_CAP, 30.0),
         },
         elsewhere=frozenset(
             {
                 "tie_word_embeddings",  # `convert` settles where Gemma's output matrix is
                 "hidden_act",  # Gemma 2 reads `hidden_activation`
-                "max_position_embeddings",  # places turn without end; a sequence is shorter than a window
+                "max_position_embeddings",  # rotary positions have no limit; a sequence is within a window
                 "num_image_tokens",  # the original overwrites it by the number of patches
-                # The prompt's and those of generating are told at the top and by generation_config.json.
+                # The prompt's and those of generating are at the top and in generation_config.json.
                 *("pad_token_id", "bos_token_id", "eos_token_id"),
             }
         ),
@@ -147,25 +134,19 @@ def _gemma(sizes: NetworkSizes) -> Section:
 def _siglip(sizes: NetworkSizes) -> Section:
     return Section(
         where=f"{CONFIG_FILE}: vision_config",
-        expected={
-            "model_type": "siglip_vision_model",
-            "hidden_size": sizes.siglip_width,
-            "intermediate_size": sizes.siglip_mlp,
-            "num_hidden_layers": sizes.siglip_depth,
-            "num_attention_heads": sizes.siglip_heads,
-            "num_channels": 3,
-            "image_size": sizes.image_px,
-            "patch_size": sizes.patch_px,
-            "hidden_act": GELU,
-            "layer_norm_eps": LAYER_NORM_EPS,
-            "attention_dropout": 0.0,
-            "vision_use_head": False,
-        },
-        missing={
-            **{"model_type": "siglip_vision_model", "hidden_size": 768, "intermediate_size": 3072},
-            **{"num_hidden_layers": 12, "num_attention_heads": 12, "num_channels": 3, "image_size": 224},
-            **{"patch_size": 16, "hidden_act": GELU, "layer_norm_eps": 1e-6, "attention_dropout": 0.0},
-            "vision_use_head": True,
+        fields={
+            "model_type": Field("siglip_vision_model", "siglip_vision_model"),
+            "hidden_size": Field(sizes.siglip_width, 768),
+            "intermediate_size": Field(sizes.siglip_mlp, 3072),
+            "num_hidden_layers": Field(sizes.siglip_depth, 12),
+            "num_attention_heads": Field(sizes.siglip_heads, 12),
+            "num_channels": Field(3, 3),
+            "image_size": Field(sizes.image_px, 224),
+            "patch_size": Field(sizes.patch_px, 16),
+            "hidden_act": Field(GELU, GELU),
+            "layer_norm_eps": Field(LAYER_NORM_EPS, 1e-6),
+            "attention_dropout": Field(0.0, 0.0),
+            "vision_use_head": Field(False, True),
         },
         # The original takes the projector's width from the top, and counts patches itself.
         elsewhere=frozenset({"projection_dim", "num_image_tokens", "num_positions"}),
@@ -177,7 +158,7 @@ _NOT_OF_ZOE = frozenset(
     {"backbone_config", "dtype", "architectures", "_name_or_path", "id2label", "label2id"}
 )
 # Of BEiT: its pretraining, its heads for classes and segments, and dropout, which a frozen model has not.
-_NOT_OF_EYE = frozenset(
+_NOT_OF_ENCODER = frozenset(
     {
         *("add_fpn", "auxiliary_channels", "auxiliary_concat_input", "auxiliary_loss_weight", "vocab_size"),
         *("auxiliary_num_convs", "use_auxiliary_head", "pool_scales", "semantic_loss_ignore_index"),
@@ -188,37 +169,38 @@ _NOT_OF_EYE = frozenset(
 
 
 def _zoe(sizes: NetworkSizes) -> tuple[Section, Section]:
-    """Return the sections of the depth model and of its eye: what transformers says of ours."""
+    """Return the sections of the depth model and of its vision encoder: what transformers writes for ours."""
     depth = zoe_config(sizes).to_dict()
-    eye = depth["backbone_config"]
+    encoder = depth["backbone_config"]
     # The published file names every field; transformers' defaults stand for those that others leave out.
-    depth, eye = (
+    depth, encoder = (
         {name: value for name, value in part.items() if name not in OF_NO_EFFECT | left_out}
-        for part, left_out in ((depth, _NOT_OF_ZOE), (eye, _NOT_OF_EYE | _NOT_OF_ZOE))
+        for part, left_out in ((depth, _NOT_OF_ZOE), (encoder, _NOT_OF_ENCODER | _NOT_OF_ZOE))
     )
-    depth["backbone_hidden_size"] = sizes.depth_width  # the model notes it where its eye does not say it
+    depth["backbone_hidden_size"] = sizes.depth_width  # the model notes it where its encoder does not
     tokens = frozenset({"bos_token_id", "eos_token_id", "pad_token_id", "tie_word_embeddings"})
     return (
         Section(
             where=f"{CONFIG_FILE}: vision_zoe_config",
-            expected=depth,
-            missing=depth,
-            # `backbone` and what is beside it name an eye to be fetched; it is described instead.
+            fields=_as_published(depth),
+            # `backbone` and what is beside it name an encoder to be fetched; it is described instead.
             elsewhere=tokens | _NOT_OF_ZOE | {"backbone", "use_pretrained_backbone"},
         ),
         Section(
             where=f"{CONFIG_FILE}: vision_zoe_config.backbone_config",
-            expected=eye,
-            missing=eye,
-            elsewhere=tokens | _NOT_OF_ZOE | _NOT_OF_EYE,
+            fields=_as_published(encoder),
+            elsewhere=tokens | _NOT_OF_ZOE | _NOT_OF_ENCODER,
         ),
     )
 
 
+def _as_published(fields: Mapping[str, object]) -> dict[str, Field]:
+    return {name: Field(value, value) for name, value in fields.items()}
+
+
 _PROCESSOR = Section(
     where=PROCESSOR_FILE,
-    expected={"num_obs_steps": 1},
-    missing={"num_obs_steps": 1},
+    fields={"num_obs_steps": Field(1, 1)},
     elsewhere=frozenset(
         {
             *("action_chunk_size", "bin_policy", "statistics"),  # `convert` reads them
@@ -233,10 +215,10 @@ _PROCESSOR = Section(
 
 
 def _bins(sizes: NetworkSizes) -> Section:
-    axes = {f"{name}_bins": n_bins for name, n_bins in zip(AXES, sizes.n_bins, strict=True)}
+    axes = {f"{name}_bins": Field(n_bins) for name, n_bins in zip(AXES, sizes.n_bins, strict=True)}
     return Section(
         where=f"{PROCESSOR_FILE}: action_config",
-        expected={"use_spherical": True, "gripper": N_GRIPPER_BINS, **axes},
+        fields={"use_spherical": Field(True), "gripper": Field(N_GRIPPER_BINS), **axes},
         # A sum of the others; and where the bins come from, whose edges are stored.
         elsewhere=frozenset({"total", "distribution"}),
     )
@@ -252,19 +234,18 @@ def _flat_bins(described: object) -> object:
     return flat
 
 
-def _pictures(sizes: NetworkSizes) -> Section:
+def _images(sizes: NetworkSizes) -> Section:
     size = {"height": sizes.image_px, "width": sizes.image_px}
     return Section(
-        where=PICTURES_FILE,
-        expected={
-            **{"do_resize": True, "size": size, "resample": BICUBIC},
-            **{"do_rescale": True, "rescale_factor": 1 / MAX_LEVEL},
-            "do_normalize": False,  # the network does it, for SigLIP and for the depth model
-            "image_seq_length": sizes.n_patches,
-        },
-        missing={
-            **{"do_resize": True, "size": {"height": 224, "width": 224}, "resample": BICUBIC},
-            **{"do_rescale": True, "rescale_factor": 1 / MAX_LEVEL, "do_normalize": True},
+        where=IMAGES_FILE,
+        fields={
+            "do_resize": Field(True, True),
+            "size": Field(size, {"height": 224, "width": 224}),
+            "resample": Field(BICUBIC, BICUBIC),
+            "do_rescale": Field(True, True),
+            "rescale_factor": Field(1 / MAX_LEVEL, 1 / MAX_LEVEL),
+            "do_normalize": Field(False, True),  # the network does it, for SigLIP and for the depth model
+            "image_seq_length": Field(sizes.n_patches),
         },
         # Means and deviations without normalising; frames are RGB; the original names its classes itself.
         elsewhere=frozenset(
@@ -274,12 +255,12 @@ def _pictures(sizes: NetworkSizes) -> Section:
 
 
 def _generation(sizes: NetworkSizes) -> Section:
-    return Section(where=GENERATION_FILE, expected=_special_tokens(sizes))
+    return Section(where=GENERATION_FILE, fields=_special_tokens(sizes))
 
 
-def _special_tokens(sizes: NetworkSizes) -> dict[str, Any]:
+def _special_tokens(sizes: NetworkSizes) -> dict[str, Field]:
     return {
-        "pad_token_id": sizes.pad_token,
-        "bos_token_id": sizes.bos_token,
-        "eos_token_id": sizes.stop_token,
+        "pad_token_id": Field(sizes.pad_token),
+        "bos_token_id": Field(sizes.bos_token),
+        "eos_token_id": Field(sizes.stop_token),
     }

@@ -1,6 +1,6 @@
-"""Ego3D position encoding: where in space, seen from the camera, each patch of a picture is.
+"""Ego3D position encoding: where in space, seen from the camera, each patch of an image is.
 
-Legend: N pictures, P patches, D SigLIP's width. Each patch is 2 × 2 cells; a cell's point in space comes
+Legend: N images, P patches, D SigLIP's width. Each patch is 2 × 2 cells; a cell's point in space comes
 from its mean depth and the camera's matrix. Source: Qu et al. 2025 (arXiv 2501.15830), section III-A.
 """
 
@@ -35,7 +35,7 @@ class Ego3DEncoding(nn.Module):
 
         Args:
             depth: (N, H, W) metres, H = W = image_px.
-            matrices: (N, 3, 3) of pictures of that size.
+            matrices: (N, 3, 3) of images of that size.
         """
         encoded = frequencies(patch_points(depth, matrices, self.sizes))
         first: nn.Linear = self.position_embedding_head[0]  # type: ignore[assignment]  # of a Sequential

@@ -1,7 +1,7 @@
-"""Action tokens: the loss of telling them, and telling them one after the other.
+"""Action tokens: their loss, and predicting them one after the other.
 
 Legend as in `network`. Decoding is greedy, as the original's. A chunk has a fixed length: exactly its tokens
-are told, and only their columns' tokens are taken for it (`action_tokens.from_tokens`).
+are predicted, and only their columns' tokens are taken for it (`action_tokens.from_tokens`).
 """
 
 import torch
@@ -12,7 +12,7 @@ from vla_eval.policies.spatialvla.action_grid import ActionGrid
 from vla_eval.policies.spatialvla.action_tokens import from_tokens, to_tokens
 from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.sizes import TOKENS_PER_ACTION, Attention
-from vla_eval.policies.steps.greedy import Prefix, Told, greedy_tokens
+from vla_eval.policies.steps.greedy import Decoded, Prefix, greedy_tokens
 
 
 def token_loss(
@@ -36,7 +36,7 @@ def token_loss(
     ids = to_tokens(actions, grid, network.sizes).flatten(1)
     sequence = network.sequence(inputs, ids)
     hidden = network.hidden(sequence, attention)
-    # What a token is to be told by is the place before it.
+    # A token is predicted at the place before it.
     places = sequence.first_action[:, None] - 1 + torch.arange(ids.shape[1] + 1, device=ids.device)
     logits = network.logits(hidden.take_along_dim(places[..., None], dim=1))
     wanted = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
@@ -45,8 +45,10 @@ def token_loss(
     return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
 
 
-def generated_tokens(network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention) -> Told:
-    """Return the tokens (B, 3 · K) of a chunk; stop is never told, whatever is likeliest.
+def generated_tokens(
+    network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention
+) -> Decoded:
+    """Return the tokens (B, 3 · K) of a chunk; stop is never predicted, whatever is likeliest.
 
     Args:
         network: see there.
@@ -65,6 +67,6 @@ def generated_actions(
     network: SpatialVLANetwork, grid: ActionGrid, inputs: Inputs, *, chunk: int, attention: Attention
 ) -> Tensor:
     """Return normalised actions (B, K, 7), float32, with the gripper 0 or 1."""
-    told = generated_tokens(network, inputs, chunk=chunk, attention=attention)
-    tokens = told.tokens.reshape(len(told.tokens), chunk, TOKENS_PER_ACTION)
+    decoded = generated_tokens(network, inputs, chunk=chunk, attention=attention)
+    tokens = decoded.tokens.reshape(len(decoded.tokens), chunk, TOKENS_PER_ACTION)
     return from_tokens(tokens, grid, network.sizes).float()

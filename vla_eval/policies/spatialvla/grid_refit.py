@@ -1,6 +1,6 @@
 """Give action tokens that move to another grid the embeddings that lie there. Knows nothing of networks.
 
-When a grid is fitted anew, token number n tells another action than before. Its embedding is then read
+When a grid is fitted again, token number n stands for another action. Its embedding is then read
 from the old table at its new place: linearly along each of the three axes, between the middles of the old
 bins, and at the outermost middle beyond it. The gripper's two rows stay.
 

@@ -1,7 +1,7 @@
 """What LoRA trains of SpatialVLA, by name. Knows nothing of peft.
 
 The original names ends of modules (`q_proj`, `out_proj`, `linear` …) in the whole model, which also hits the
-`out_proj` of four blocks of the frozen depth model; here whole names are told, and none of those. Source:
+`out_proj` of four blocks of the frozen depth model; here whole names are given, and none of those. Source:
 scripts/spatialvla_4b_finetune/finetune_lora.sh and train/spatialvla_finetune.py of the original at
 https://github.com/SpatialVLA/SpatialVLA/tree/e48075326a92116adaaf1232cf01471f15f09a73.
 """

@@ -6,17 +6,17 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.errors import SpecMismatchError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.policies.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.policies.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
 from vla_eval.policies.spatialvla.generation import generated_actions, token_loss
 from vla_eval.policies.spatialvla.grid_refit import refitted
-from vla_eval.policies.spatialvla.network import Inputs, Prompts, SpatialVLANetwork
+from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import MAX_LEVEL, Size, resize_bicubic
 from vla_eval.policies.steps.precision import default_dtype
+from vla_eval.policies.steps.prompts import Prompts
 
 
 class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -46,16 +46,16 @@ class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[
     def begin_from_base(self) -> None:
         """Move the base's action tokens to this policy's grid; to be called once, with the base's weights.
 
-        The rows that tell the tokens move as those that are read do, or a token would be told by what it
-        was before.
+        The rows that predict the tokens move like those that embed them: else a token would be predicted by
+        its old row.
         """
         former = self.config.former_grid()
         if former is None:
             return
         network = self.network
         head = network.lm_head if network.sizes.llm_own_head else network.llm.embed_tokens
-        told = head.weight[network.sizes.first_action_token :]
-        for table in (network.spatial_embed_tokens.weight, told):
+        predicting = head.weight[network.sizes.first_action_token :]
+        for table in (network.spatial_embed_tokens.weight, predicting):
             table.copy_(refitted(table, former, self.grid))
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
@@ -76,18 +76,16 @@ class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[
         )
 
     def _inputs(self, batch: dict[str, Tensor]) -> Inputs:
-        """Return pictures, resized as PIL does it, the matrices of their cameras, and prompts."""
+        """Return images, resized as PIL does it, the matrices of their cameras, and prompts."""
         edge = self.network.sizes.image_px
-        pictures, matrices = [], []
+        images, matrices = [], []
         for name in self.config.pictures:
-            if name not in batch:
-                raise SpecMismatchError(f"'{TYPE}': the batch has no picture '{name}'.")
-            levels = (batch[name].float() * MAX_LEVEL).round()
+            levels = self._levels(batch, name)
             height_px, width_px = levels.shape[-2:]
             camera = intrinsics(height_px=height_px, width_px=width_px, fov_rad=self.config.camera_fov_rad)
             matrices.append(resized_intrinsics(camera, height_px=height_px, width_px=width_px, to_px=edge))
-            pictures.append(resize_bicubic(levels, Size(edge, edge)) / MAX_LEVEL)
-        shown = torch.stack(pictures, dim=1)
+            images.append(resize_bicubic(levels, Size(edge, edge)) / MAX_LEVEL)
+        shown = torch.stack(images, dim=1)
         cameras = torch.stack(matrices).to(shown.device).expand(len(shown), -1, -1, -1)
         return Inputs(shown, cameras, self._prompts(batch))
 

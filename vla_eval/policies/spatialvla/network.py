@@ -1,9 +1,9 @@
-"""SpatialVLA: pictures with places in space, and a prompt, to tokens that tell a chunk of actions.
+"""SpatialVLA: images with places in space, and a prompt, to the tokens of a chunk of actions.
 
-Legend: B samples, C cameras, P patches of a picture, T tokens of a prompt, N of a sequence, K actions of a
+Legend: B samples, C cameras, P patches of an image, T tokens of a prompt, N of a sequence, K actions of a
 chunk, D Gemma's width.
 
-A sequence is: the patches of all pictures, beginning of text, prompt, newline, 3 · K action tokens, stop,
+A sequence is: the patches of all images, beginning of text, prompt, newline, 3 · K action tokens, stop,
 padding on the right. Places are counted from 1, as in PaliGemma. Two matrices embed tokens: Gemma's own the
 words, another one the actions; both are multiplied by the root of D, and the patches are not. That is what
 the original comes to, which divides the patches by that root and lets Gemma multiply everything.
@@ -18,44 +18,34 @@ from typing import Any, NamedTuple  # transformers is untyped here
 
 import torch
 from torch import Tensor, nn
-from transformers import DynamicCache, Gemma2Config, Gemma2Model, SiglipVisionConfig, SiglipVisionModel
+from transformers import DynamicCache, Gemma2Config, Gemma2Model
 
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.spatialvla.depth import DepthModel, cut_depth
 from vla_eval.policies.spatialvla.ego3d import Ego3DEncoding
 from vla_eval.policies.spatialvla.sizes import SLIDING_WINDOW, Attention, NetworkSizes
+from vla_eval.policies.steps.prompts import Prompts
+from vla_eval.policies.steps.siglip import siglip
 
 SIGLIP_MEAN = SIGLIP_STD = 0.5  # per colour
 GELU = "gelu_pytorch_tanh"  # of SigLIP and of Gemma 2
-LAYER_NORM_EPS = RMS_NORM_EPS = 1e-6
+RMS_NORM_EPS = 1e-6
 ATTENTION_CAP, LOGIT_CAP = 50.0, 30.0  # of Gemma 2: x becomes cap · tanh(x / cap)
 ROPE_THETA = 10_000.0
 FIRST_PLACE = 1
-
-
-class Prompts(NamedTuple):
-    """Prompts of B samples, from the beginning of the text to the newline.
-
-    Attributes:
-        ids: (B, T) int64, padded on the right.
-        mask: (B, T) bool, False for padding.
-    """
-
-    ids: Tensor
-    mask: Tensor
 
 
 class Inputs(NamedTuple):
     """What is known of B samples.
 
     Attributes:
-        pictures: (B, C, 3, H, W) in [0, 1].
-        intrinsics: (B, C, 3, 3) of the cameras, for pictures of that size.
+        images: (B, C, 3, H, W) in [0, 1].
+        intrinsics: (B, C, 3, 3) of the cameras, for images of that size.
         prompts: see there.
-        depth: (B, C, h, w) metres, of the padded pictures; None: the network's depth model is asked.
+        depth: (B, C, h, w) metres, of the padded images; None: the network's depth model is asked.
     """
 
-    pictures: Tensor
+    images: Tensor
     intrinsics: Tensor
     prompts: Prompts
     depth: Tensor | None = None
@@ -81,7 +71,7 @@ class SpatialVLANetwork(nn.Module):
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        self.vision = _siglip(sizes)
+        self.vision = siglip(sizes, n_blocks=sizes.siglip_depth, activation=GELU)
         self.position_embedding_3d = Ego3DEncoding(sizes)
         self.projector = nn.Linear(sizes.siglip_width, sizes.llm_width)
         make_llm: Any = Gemma2Model
@@ -94,12 +84,12 @@ class SpatialVLANetwork(nn.Module):
             self.depth = DepthModel(sizes)
 
     def image_features(self, inputs: Inputs) -> Tensor:
-        """Return the tokens (B, C · P, D) of the pictures, one picture after the other."""
-        pictures = inputs.pictures.flatten(0, 1)
-        seen = self.vision(((pictures.float() - SIGLIP_MEAN) / SIGLIP_STD).to(self.projector.weight.dtype))
+        """Return the tokens (B, C · P, D) of the images, one image after the other."""
+        images = inputs.images.flatten(0, 1)
+        seen = self.vision(((images.float() - SIGLIP_MEAN) / SIGLIP_STD).to(self.projector.weight.dtype))
         places = self.position_embedding_3d(self._depth(inputs), inputs.intrinsics.flatten(0, 1))
         features: Tensor = self.projector(seen.last_hidden_state + places)
-        return features.reshape(len(inputs.pictures), -1, features.shape[-1])
+        return features.reshape(len(inputs.images), -1, features.shape[-1])
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Return the embeddings (…, D) of tokens of words and of actions."""
@@ -127,7 +117,7 @@ class SpatialVLANetwork(nn.Module):
         if embeddings.shape[1] > SLIDING_WINDOW:
             raise SpecMismatchError(
                 f"a sequence has {embeddings.shape[1]} tokens, expected at most {SLIDING_WINDOW}: shorten "
-                "the instruction, or name fewer pictures."
+                "the instruction, or name fewer images."
             )
         first = lengths + patches.shape[1]
         return Sequence(embeddings, first + n_more, first)
@@ -135,7 +125,7 @@ class SpatialVLANetwork(nn.Module):
     def mask(self, sequence: Sequence, attention: Attention) -> Tensor:
         """Return (B, N, N) bool: which place (second N) each place attends to.
 
-        Padding attends to something, too, so that no row is empty; nobody attends to it, unless `attention`
+        Padding attends to something, too, so that no row is empty; nothing attends to it, unless `attention`
         is `bidirectional_with_padding`.
         """
         n = sequence.embeddings.shape[1]
@@ -178,10 +168,10 @@ class SpatialVLANetwork(nn.Module):
     def _depth(self, inputs: Inputs) -> Tensor:
         """Return (B · C, image_px, image_px) metres."""
         if inputs.depth is not None:
-            told = inputs.depth.flatten(0, 1)
+            depth = inputs.depth.flatten(0, 1)
         else:
-            told = self.depth(inputs.pictures.flatten(0, 1))
-        return cut_depth(told, self.sizes.image_px)
+            depth = self.depth(inputs.images.flatten(0, 1))
+        return cut_depth(depth, self.sizes.image_px)
 
 
 def _followed(prompts: Prompts, action_ids: Tensor, sizes: NetworkSizes) -> tuple[Tensor, int]:
@@ -196,26 +186,6 @@ def _followed(prompts: Prompts, action_ids: Tensor, sizes: NetworkSizes) -> tupl
     ids[:, :n_prompt] = prompts.ids.masked_fill(~prompts.mask, sizes.pad_token)
     places = lengths + torch.arange(more.shape[1], device=more.device)
     return ids.scatter(1, places, more), more.shape[1]
-
-
-def _siglip(sizes: NetworkSizes) -> Any:
-    config: Any = SiglipVisionConfig
-    model: Any = SiglipVisionModel(
-        config(
-            hidden_size=sizes.siglip_width,
-            intermediate_size=sizes.siglip_mlp,
-            num_hidden_layers=sizes.siglip_depth,
-            num_attention_heads=sizes.siglip_heads,
-            hidden_act=GELU,
-            layer_norm_eps=LAYER_NORM_EPS,
-            image_size=sizes.image_px,
-            patch_size=sizes.patch_px,
-            vision_use_head=False,
-            attn_implementation="sdpa",
-        )
-    )
-    # In some versions of transformers the tower is wrapped: parameters have the same names in all.
-    return getattr(model, "vision_model", model)
 
 
 def _gemma_config(sizes: NetworkSizes) -> Any:

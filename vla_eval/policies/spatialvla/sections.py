@@ -5,7 +5,8 @@ it may change what the model does. A missing field means what the original's cod
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 # Generating is greedy, with one beam, and nothing is forbidden, forced or made less likely.
 GREEDY: Mapping[str, object] = {
@@ -40,35 +41,44 @@ OF_NO_EFFECT = frozenset(
 )
 
 
+class Field(NamedTuple):
+    """What one field has to say.
+
+    Attributes:
+        ours: the value that we implement.
+        default: what the original takes where the field is missing; None: it has to be there.
+    """
+
+    ours: object
+    default: object = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
     """What one section of a file may say.
 
     Attributes:
         where: the file, and the section in it.
-        expected: field -> the value that we implement.
-        missing: field -> what the original takes where the field is missing.
+        fields: those that are compared.
         elsewhere: fields that are read elsewhere (`convert`), or without effect for the reason beside them.
     """
 
     where: str
-    expected: Mapping[str, object]
-    missing: Mapping[str, object] = field(default_factory=dict)
+    fields: Mapping[str, Field]
     elsewhere: frozenset[str] = frozenset()
 
     def problems(self, found: object) -> list[str]:
         """Return a line for each field that says something else."""
         if not isinstance(found, Mapping):
             return [f"{self.where}: expected a section of fields, found {found}"]
-        known = {**GREEDY, **self.expected}
+        known = {name: Field(value, value) for name, value in GREEDY.items()} | dict(self.fields)
         lines = []
-        for name, value in known.items():
-            if name in found and _plain(found[name]) != _plain(value):
-                lines.append(f"{self.where}.{name}: expected {_plain(value)}, found {found[name]}")
-            if name in self.expected and name not in found and self.missing.get(name) != value:
+        for name, (ours, default) in known.items():
+            if name in found and _plain(found[name]) != _plain(ours):
+                lines.append(f"{self.where}.{name}: expected {_plain(ours)}, found {found[name]}")
+            if name not in found and default != ours:
                 lines.append(
-                    f"{self.where}.{name}: expected {_plain(value)}, found nothing, which means "
-                    f"{self.missing.get(name)}"
+                    f"{self.where}.{name}: expected {_plain(ours)}, found nothing, which means {default}"
                 )
         unknown = found.keys() - known.keys() - self.elsewhere - OF_NO_EFFECT
         return lines + [

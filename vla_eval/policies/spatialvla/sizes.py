@@ -5,15 +5,14 @@ PaliGemma 2 3B (SigLIP so400m/14, Gemma 2 2B) and of `Intel/zoedepth-nyu-kitti`,
 4,027,854,731 parameters of the published files. Gemma's output matrix is one of its own there.
 """
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_eval.errors import RecipeError, check_names
+from vla_eval.errors import RecipeError
+from vla_eval.policies.steps.network_sizes import VisionSizes
 
 Attention = Literal["causal", "bidirectional", "bidirectional_with_padding"]
-"""What a token of the prefix (pictures and prompt) attends to; action tokens see all before them.
+"""What a token of the prefix (images and prompt) attends to; action tokens see all before them.
 
 - `causal`: to nothing after it. What the original's training scripts do, which run flash attention.
 - `bidirectional`: to the whole prefix. What the original does at inference with eager attention.
@@ -28,17 +27,15 @@ TOKENS_PER_ACTION = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkSizes:
+class NetworkSizes(VisionSizes):
     """Sizes of all parts.
 
     Attributes:
-        image_px, patch_px: edge of a picture and of a patch.
-        siglip_width, siglip_depth, siglip_heads, siglip_mlp: SigLIP.
         llm_width, llm_depth, llm_heads, llm_kv_heads, llm_head_width, llm_mlp: Gemma 2.
         llm_own_head: 1: Gemma has an output matrix of its own, as published; 0: that of its input, as Gemma 2
             itself and the golden files.
-        depth_px, depth_width, depth_layers, depth_heads, depth_mlp: ZoeDepth's eye (BEiT); without layers
-            there is no depth model, and depth has to be given.
+        depth_px, depth_width, depth_layers, depth_heads, depth_mlp: ZoeDepth's encoder (BEiT); without
+            layers there is no depth model, and depth has to be given.
         depth_neck, depth_fusion, depth_features, depth_embedding, depth_bins: the rest of ZoeDepth.
         theta_bins, phi_bins, r_bins: of the translation's direction and length.
         roll_bins, pitch_bins, yaw_bins: of the rotation.
@@ -46,12 +43,6 @@ class NetworkSizes:
         first_action_token: of the first action token; they are the last of the vocabulary.
     """
 
-    image_px: int = 224
-    patch_px: int = 14
-    siglip_width: int = 1152
-    siglip_depth: int = 27
-    siglip_heads: int = 16
-    siglip_mlp: int = 4304
     llm_width: int = 2304
     llm_depth: int = 26
     llm_heads: int = 8
@@ -83,12 +74,7 @@ class NetworkSizes:
     first_action_token: int = 257153
 
     def __post_init__(self) -> None:
-        """Check what would otherwise be noticed late."""
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 0:
-                raise RecipeError(f"sizes.{field.name} is {getattr(self, field.name)}, expected ≥ 0.")
-        if self.image_px % self.patch_px:
-            raise RecipeError(f"sizes.image_px is {self.image_px}, expected a multiple of {self.patch_px}.")
+        VisionSizes.__post_init__(self)  # no super(): `slots` makes a new class of this one
         if self.depth_layers % 4:
             raise RecipeError(f"sizes.depth_layers is {self.depth_layers}, expected a multiple of 4.")
         if min(self.n_bins) < 2:
@@ -101,11 +87,6 @@ class NetworkSizes:
                 f"sizes.first_action_token is {self.first_action_token}, expected a number beyond all other "
                 f"tokens ({max(words)})."
             )
-
-    @property
-    def n_patches(self) -> int:
-        """Patches of one picture."""
-        return (self.image_px // self.patch_px) ** 2
 
     @property
     def n_bins(self) -> tuple[int, ...]:
@@ -121,32 +102,20 @@ class NetworkSizes:
 
     @property
     def n_translations(self) -> int:
-        """Tokens that tell a translation."""
+        """Tokens for a translation."""
         return self.theta_bins * self.phi_bins * self.r_bins
 
     @property
     def n_rotations(self) -> int:
-        """Tokens that tell a rotation."""
+        """Tokens for a rotation."""
         return self.roll_bins * self.pitch_bins * self.yaw_bins
 
     @property
     def n_action_tokens(self) -> int:
-        """Tokens that tell actions; the last two are the closed and the open gripper."""
+        """Tokens for actions; the last two are the closed and the open gripper."""
         return self.n_translations + self.n_rotations + 2
 
     @property
     def vocabulary(self) -> int:
         """All tokens."""
         return self.first_action_token + self.n_action_tokens
-
-
-def network_sizes(changes: Mapping[str, int]) -> NetworkSizes:
-    """Return the published sizes with some of them changed.
-
-    Raises:
-        UnknownNameError: there is no such size.
-        RecipeError: a value is impossible.
-    """
-    known = [field.name for field in dataclasses.fields(NetworkSizes)]
-    check_names("size", changes, known, where="finetune.policy.sizes")
-    return NetworkSizes(**changes)

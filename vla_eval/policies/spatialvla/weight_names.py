@@ -1,4 +1,4 @@
-"""Names of weights: those of `IPEC-COMMUNITY/spatialvla-4b-224-pt` to ours, and back; layouts are equal."""
+"""Names of weights: those of `IPEC-COMMUNITY/spatialvla-4b-224-pt` to ours; layouts are equal."""
 
 from collections.abc import Mapping
 
@@ -18,12 +18,6 @@ EMBEDDINGS, HEAD = "language_model.model.embed_tokens.weight", "language_model.l
 def to_ours(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the original's tensors under our names; an unknown name is left for whoever loads to refuse."""
     return {_renamed(name, BEGINNINGS): tensor for name, tensor in weights.items()}
-
-
-def to_original(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return our tensors under the original's names."""
-    back = tuple((ours, original) for original, ours in BEGINNINGS)
-    return {_renamed(name, back): tensor for name, tensor in weights.items()}
 
 
 def _renamed(name: str, pairs: tuple[tuple[str, str], ...]) -> str:

@@ -1,1 +1,1 @@
-"""Steps that several ported policies share: normalisation, gripper, pictures, trainable parameters."""
+"""Steps that several ported policies share: normalisation, gripper, images, trainable parameters."""

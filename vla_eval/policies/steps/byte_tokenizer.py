@@ -6,7 +6,6 @@ from typing import Any  # tokenizers and transformers are untyped here
 BYTE_TOKENIZER = "bytes"
 """`tokenizer_name` of it in a recipe: one token per byte."""
 BYTE_SPECIAL = ("<pad>", "<s>", "</s>")  # tokens 0, 1 and 2: padding, begin and end of a text
-N_BYTES = 256
 
 
 def byte_tokenizer() -> Any:

@@ -1,4 +1,4 @@
-"""What policies share that tell chunks from pictures and a prompt: lerobot's own loop, padding, prompts."""
+"""What policies share that predict chunks from images and a prompt: lerobot's own loop, padding, prompts."""
 
 from collections import deque
 from typing import Any  # lerobot is untyped
@@ -8,6 +8,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor
 
 from vla_eval.errors import SpecMismatchError, TrainingError
+from vla_eval.policies.steps.images import MAX_LEVEL
 
 
 class PromptedChunks:
@@ -35,7 +36,7 @@ class PromptedChunks:
         return self._queue.popleft()
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """Tell lerobot what LoRA trains."""
+        """Return what LoRA trains; lerobot asks for it."""
         return self.config.lora_defaults()  # type: ignore[no-any-return]  # lerobot is untyped
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -51,6 +52,16 @@ class PromptedChunks:
                 f"{self.config.prompt_max_tokens} (prompt_max_tokens)."
             )
         return ids, batch[OBS_LANGUAGE_ATTENTION_MASK]
+
+    def _levels(self, batch: dict[str, Tensor], name: str) -> Tensor:
+        """Return an image (B, 3, H, W) of the batch in levels, 0 to 255.
+
+        Raises:
+            SpecMismatchError: there is no such image.
+        """
+        if name not in batch:
+            raise SpecMismatchError(f"'{self.name}': the batch has no image '{name}'.")
+        return (batch[name].float() * MAX_LEVEL).round()
 
     def _counts(self, is_pad: Tensor | None, actions: Tensor) -> Tensor:
         """Return (B, chunk) float: 0 for actions beyond an episode's end.

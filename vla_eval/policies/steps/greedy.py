@@ -14,7 +14,7 @@ from transformers import DynamicCache
 
 
 class Prefix(NamedTuple):
-    """What is read before the first token is told.
+    """What is read before the first token is predicted.
 
     Attributes:
         embeddings: (B, N, D), padded on the right.
@@ -27,8 +27,8 @@ class Prefix(NamedTuple):
     lengths: Tensor
 
 
-class Told(NamedTuple):
-    """What was told.
+class Decoded(NamedTuple):
+    """What was predicted.
 
     Attributes:
         tokens: (B, T) int64.
@@ -61,14 +61,14 @@ class LanguageModel(Protocol):
 
 def greedy_tokens(
     model: LanguageModel, prefix: Prefix, n_tokens: int, *, never: tuple[int, ...] = ()
-) -> Told:
+) -> Decoded:
     """Return the likeliest token, the likeliest after that, and so on, `n_tokens` of them.
 
     Args:
         model: see there.
         prefix: see there.
-        n_tokens: how many to tell.
-        never: tokens that are not told, however likely; the logits that are returned keep them.
+        n_tokens: how many to predict.
+        never: tokens that are not chosen, however likely; the logits that are returned keep them.
     """
     lengths, n = prefix.lengths, prefix.embeddings.shape[1]
     cache = DynamicCache()
@@ -82,7 +82,7 @@ def greedy_tokens(
         hidden = model.read(model.embed(tokens[-1]), seen[:, None, :], (lengths + step)[:, None], cache)
         logits.append(model.logits(hidden))
         tokens.append(_likeliest(logits[-1], never))
-    return Told(torch.cat(tokens, dim=1), torch.cat(logits, dim=1))
+    return Decoded(torch.cat(tokens, dim=1), torch.cat(logits, dim=1))
 
 
 def _likeliest(logits: Tensor, never: tuple[int, ...]) -> Tensor:

@@ -1,8 +1,8 @@
-"""Pictures as TensorFlow's image functions make them: resize, crop, augment. Knows only torch.
+"""Images as TensorFlow's image functions make them: resize, crop, augment. Knows only torch.
 
-The published VLAs were trained on pictures resized by `tf.image.resize(method="lanczos3", antialias=True)`;
+The published VLAs were trained on images resized by `tf.image.resize(method="lanczos3", antialias=True)`;
 PIL's filter of that name differs by up to 11 levels of 255 on hard edges. SpatialVLA's were resized by PIL's
-bicubic filter, which is here, too. Pictures are (…, 3, height, width) float in levels [0, 255] here, unless
+bicubic filter, which is here, too. Images are (…, 3, height, width) float in levels [0, 255] here, unless
 a function says otherwise.
 
 Source of the formulas: TensorFlow v2.19.1, tensorflow/core/kernels/image/{scale_and_translate_op.cc,
@@ -28,7 +28,7 @@ PIL_PRECISION = 1 << 22  # steps of PIL's weights
 
 
 class Size(NamedTuple):
-    """Of a picture, in pixels."""
+    """Of an image, in pixels."""
 
     height_px: int
     width_px: int
@@ -36,7 +36,7 @@ class Size(NamedTuple):
 
 @in_float32
 def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
-    """Return the pictures in another size, rounded to whole levels; those of that size are left alone.
+    """Return the images in another size, rounded to whole levels; those of that size are left alone.
 
     Args:
         images: (…, 3, H, W) in [0, 255].
@@ -49,7 +49,7 @@ def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
 
 @in_float32
 def resize_bicubic(images: Tensor, size: Size) -> Tensor:
-    """Return the pictures in another size, bit for bit as PIL's BICUBIC does it with whole levels.
+    """Return the images in another size, bit for bit as PIL's BICUBIC does it with whole levels.
 
     Args:
         images: (…, 3, H, W) whole levels in [0, 255].
@@ -127,7 +127,7 @@ def _distances(n_in: int, n_out: int) -> Tensor:
 
 
 class Boxes(NamedTuple):
-    """Where B pictures are cropped, as fractions of height and width, each (B,)."""
+    """Where B images are cropped, as fractions of height and width, each (B,)."""
 
     top: Tensor
     left: Tensor
@@ -137,7 +137,7 @@ class Boxes(NamedTuple):
 
 @in_float32
 def crop_and_resize(images: Tensor, boxes: Boxes) -> Tensor:
-    """Return the crops (B, …, 3, H, W), enlarged to the pictures' own size, bilinear, corners aligned.
+    """Return the crops (B, …, 3, H, W), enlarged to the images' own size, bilinear, corners aligned.
 
     Args:
         images: (B, …, 3, H, W) of any range.
@@ -160,7 +160,7 @@ def _crop_weights(start: Tensor, length: Tensor, n_px: int) -> Tensor:
 
 @in_float32
 def centre_crop(images: Tensor, area: float, *, whole: Callable[[Tensor], Tensor] = _whole_levels) -> Tensor:
-    """Return the middle of the pictures, this share of their area, enlarged to their size, in whole levels.
+    """Return the middle of the images, this share of their area, enlarged to their size, in whole levels.
 
     Args:
         images: (B, …, 3, H, W) in [0, 255].
@@ -190,7 +190,7 @@ def truncated_levels(images: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """Random changes of training pictures; one draw per sample and camera, alike for all its frames.
+    """Random changes of training images; one draw per sample and camera, alike for all its frames.
 
     Applied in this order. A value at which nothing changes switches that change off.
 
@@ -198,7 +198,7 @@ class Augmentation:
         crop_area: least and largest share of the area that is kept; None: no crop.
         crop_ratio: least and largest width / height of the crop.
         brightness: up to so much is added, of the range 1.
-        contrast: least and largest factor about each picture's mean, per colour.
+        contrast: least and largest factor about each image's mean, per colour.
         saturation: least and largest factor.
         hue: turned by up to so much of a full circle.
     """
@@ -218,7 +218,7 @@ class Augmentation:
 
 @in_float32
 def augment(images: Tensor, spec: Augmentation) -> Tensor:
-    """Return changed pictures; draws from torch's global generator, which the training loop seeds.
+    """Return changed images; draws from torch's global generator, which the training loop seeds.
 
     Args:
         images: (B, T, 3, H, W) in [0, 255].
@@ -228,10 +228,10 @@ def augment(images: Tensor, spec: Augmentation) -> Tensor:
     if spec.crop_area is not None:
         images = crop_and_resize(images, _random_boxes(n, spec, images.device))
     unit = images / MAX_LEVEL
-    per_picture = (n, *[1] * (images.ndim - 1))
+    per_image = (n, *[1] * (images.ndim - 1))
 
     def drawn(low: float, high: float) -> Tensor:
-        return torch.empty(n, device=images.device).uniform_(low, high).reshape(per_picture)
+        return torch.empty(n, device=images.device).uniform_(low, high).reshape(per_image)
 
     if spec.brightness:
         unit = unit + drawn(-spec.brightness, spec.brightness)
@@ -254,7 +254,7 @@ def _random_boxes(n: int, spec: Augmentation, device: torch.device) -> Boxes:
 
 
 def _turn_colors(unit: Tensor, saturation: Tensor, turn: Tensor) -> Tensor:
-    """Change saturation and hue in HSV; pictures (…, 3, H, W) in [0, 1]."""
+    """Change saturation and hue in HSV; images (…, 3, H, W) in [0, 1]."""
     value, brightest = unit.max(dim=-3)
     spread = value - unit.min(dim=-3).values
     red, green, blue = unit.unbind(dim=-3)

@@ -43,7 +43,6 @@ class Normalization:
     clip_unmasked: bool = False
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
         if self.kind not in STATISTICS:
             raise RecipeError(
                 f"normalization.kind is '{self.kind}'.{did_you_mean(self.kind, STATISTICS)} Known: "

@@ -1,4 +1,4 @@
-"""Names in which the files of a checkpoint speak of our processor steps. Knows nothing, not even torch.
+"""Names of our processor steps in the files of a checkpoint. Knows nothing, not even torch.
 
 A loader, a training loop and the notes of an evaluation read them there.
 """
@@ -16,4 +16,4 @@ STATISTICS: Mapping[NormalizationKind, tuple[str, str]] = {
 """Kind of normalisation -> the statistics that it takes."""
 
 EXTREMES: Mapping[NormalizationKind, tuple[str, ...]] = {"mean_std": (), "q01_q99": ("min", "max")}
-"""Kind of normalisation -> what is also used where it is known: it tells which dimensions never vary."""
+"""Kind of normalisation -> what is also used where it is known: it shows which dimensions never vary."""

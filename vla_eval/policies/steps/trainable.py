@@ -1,4 +1,4 @@
-"""Say by regular expressions which parameters are trained, and check that just these are. Knows only torch.
+"""Choose by regular expressions which parameters are trained, and check that it is just these. Knows torch.
 
 `target_modules="all-linear"` is refused: on a policy, peft then puts adapters on heads and embeddings, too.
 """

@@ -1,0 +1,55 @@
+"""The audit as text: one row per task and protocol, or all counts as JSON."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from vla_eval.audit.evaluations import ALPHA, CONTROLS, Counts, TaskAudit
+
+COLUMNS = tuple(dict.fromkeys(control for controls in CONTROLS.values() for control in controls))
+NOT_PLAYED = "–"
+
+
+def render_audit(audits: Sequence[TaskAudit], style: str) -> str:
+    """Return the audit as `markdown` or `json`.
+
+    In Markdown a cell holds success once, in percent, and after a slash the first choices if there are
+    candidates. JSON has every count.
+    """
+    if style == "json":
+        return json.dumps([asdict(audit) for audit in audits], indent=2)
+    header = ["task", "protocol", "chance", *COLUMNS, "verdict"]
+    rows = [header, [":--", ":--", *["--:"] * (1 + len(COLUMNS)), ":--"], *map(_row, audits)]
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([*lines, "", *_notes(audits)])
+
+
+def _row(audit: TaskAudit) -> list[str]:
+    chance = "measured" if audit.chance is None else f"{100 * audit.chance:.1f}"
+    cells = [_cell(audit.counts.get(control)) for control in COLUMNS]
+    return [audit.task, audit.protocol, chance, *cells, ", ".join(audit.verdict)]
+
+
+def _cell(counts: Counts | None) -> str:
+    if counts is None or counts.n_episodes == 0:
+        return NOT_PLAYED
+    success = f"{100 * counts.success_once / counts.n_episodes:.0f}"
+    if counts.first_choice is None:
+        return success
+    return f"{success} / {100 * counts.first_choice / counts.n_episodes:.0f}"
+
+
+def _notes(audits: Sequence[TaskAudit]) -> list[str]:
+    episodes = sorted({counts.n_episodes for audit in audits for counts in audit.counts.values()})
+    spread = f"{episodes[0]} to {episodes[-1]}" if len(episodes) > 1 else "".join(map(str, episodes))
+    notes = [
+        f"Success once / right first choices, in percent of {spread} episodes per cell. A shortcut is named "
+        f"where its control beats chance (exact binomial test, p < {ALPHA}) or, where that is measured, "
+        "the blind arm (Fisher's test); `needs memory`: no such control, and the oracle beats the blind arm.",
+    ]
+    n_errors = sum(audit.n_errors for audit in audits)
+    if n_errors:
+        notes.append(
+            f"{n_errors} episodes ended in an error and are in no cell; the same command retries them."
+        )
+    return notes

@@ -1,0 +1,113 @@
+"""Check `meta/info.json` of a LeRobotDataset before lerobot reads it.
+
+lerobot fills in the templates of paths with `str.format`, which can reach any attribute of what it is given,
+and takes text for numbers. Knows nothing of the files that the templates name.
+"""
+
+import string
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from vla_eval.errors import DatasetError
+from vla_eval.strict_json import Count, Positive, Source, as_dataclass, read_file, read_json, shown
+
+INFO_FILE = Path("meta/info.json")
+REMEDY = "It is not read. Fetch the dataset again, from where you trust it."
+# The fields that lerobot 0.6.1 fills in (`LeRobotDatasetMetadata.get_data_file_path`, `get_video_file_path`).
+TEMPLATES = {
+    "data_path": frozenset({"chunk_index", "file_index"}),
+    "video_path": frozenset({"chunk_index", "file_index", "video_key"}),
+}
+FORMAT_LETTERS = frozenset("0123456789d")  # of `{file_index:03d}`
+MAX_FORMAT_LETTERS = 3  # a width of up to 99
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetInfo:
+    """The fields of lerobot's `info.json` that it computes with; it may hold others.
+
+    Attributes:
+        codebase_version, robot_type: text.
+        fps: frames per second.
+        features: name -> its description.
+        total_episodes, total_frames, total_tasks: counts.
+        chunks_size, data_files_size_in_mb, video_files_size_in_mb: limits of files.
+        data_path, video_path: templates of paths below the dataset.
+    """
+
+    codebase_version: str
+    fps: Positive
+    features: dict[str, dict[str, Any]]  # Any: JSON
+    total_episodes: Count = 0
+    total_frames: Count = 0
+    total_tasks: Count = 0
+    chunks_size: Positive = 1
+    data_files_size_in_mb: Positive = 1
+    video_files_size_in_mb: Positive = 1
+    data_path: str = ""
+    video_path: str | None = None
+    robot_type: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Feature:
+    """What lerobot computes with of a feature."""
+
+    dtype: str
+    shape: tuple[Positive, ...]
+    names: Any = field(default=None)  # Any: a list, or a mapping of lists
+
+
+def check_info(root: Path) -> None:
+    """Raise `DatasetError` unless `meta/info.json` holds what lerobot may be given.
+
+    Args:
+        root: the dataset's folder.
+    """
+    path = root / INFO_FILE
+    source = Source(where=str(path), what="a LeRobotDataset's info", remedy=REMEDY, error=DatasetError)
+    try:
+        data = read_json(read_file(path, source), source)
+    except (FileNotFoundError, NotADirectoryError) as exc:
+        raise source.refuse("nothing", "the file is missing") from exc
+    info = as_dataclass(DatasetInfo, _known(DatasetInfo, data), source)
+    for name, feature in info.features.items():
+        if not _is_feature_name(name):
+            raise source.refuse(
+                f"the feature {shown(name)}", "expected a printable name without '/' and '..'"
+            )
+        within = Source(where=f"{path}: {name}", what="a feature", remedy=REMEDY, error=DatasetError)
+        as_dataclass(_Feature, _known(_Feature, feature), within)
+    for name, allowed in TEMPLATES.items():
+        template = getattr(info, name)
+        if template is not None and not _is_template(template, allowed):
+            places = ", ".join(f"{{{place}}}" for place in sorted(allowed))
+            raise source.refuse(
+                f"{name} {shown(template)}",
+                f"expected a path inside of the dataset with no places but {places}",
+            )
+
+
+def _known(cls: type, data: dict[str, Any]) -> dict[str, Any]:  # Any: JSON
+    return {one.name: data[one.name] for one in fields(cls) if one.name in data}
+
+
+def _is_feature_name(name: str) -> bool:
+    return name.isprintable() and name != "" and "/" not in name and ".." not in name
+
+
+def _is_template(template: str, allowed: frozenset[str]) -> bool:
+    """Whether `str.format` can fill it in with nothing but the allowed values as they are."""
+    try:
+        parts = list(string.Formatter().parse(template))
+    except ValueError:
+        return False
+    for _, place, spec, conversion in parts:
+        if place is None:
+            continue
+        letters = spec or ""
+        is_plain = len(letters) <= MAX_FORMAT_LETTERS and FORMAT_LETTERS.issuperset(letters)
+        if place not in allowed or conversion is not None or not is_plain:
+            return False
+    return True

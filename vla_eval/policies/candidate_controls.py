@@ -1,0 +1,121 @@
+"""Controls for tasks with candidates: go to the right one or ones, to any, or to one after another.
+
+All see the true state of the world, but not the answer before the choice can be made.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
+from vla_eval.task_state import PrivilegedState
+
+STATIC_RAD_S = 0.2
+
+Mode = Literal["oracle", "cue_blind", "tour"]
+
+
+class CandidateExpert(Protocol):
+    """Brings the arm to one of several candidates."""
+
+    def is_done(self, state: PrivilegedState, candidate: int) -> bool:
+        """Whether all is done with this candidate that is to be done, but for coming to rest."""
+
+    def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7)."""
+
+
+class VisitExpert(Protocol):
+    """Brings the arm to several candidates, one after another."""
+
+    def plan_visits(
+        self, state: PrivilegedState, wanted: Sequence[int], n_actions: int, *, in_order: bool
+    ) -> NDArray[np.float32]:
+        """Return (n_actions, 7) that touch the wanted candidates, in their order or in any."""
+
+
+class ChoicePolicy(ScriptedPolicy):
+    """Goes to candidates: the right one, one drawn uniformly, or one after another."""
+
+    privileged = True
+    states = ("qvel",)
+
+    def __init__(self, context: PolicyContext, expert: CandidateExpert, mode: Mode) -> None:
+        super().__init__(context)
+        self._expert = expert
+        self._mode = mode
+        self._order: dict[int, list[int]] = {}
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Decide, without looking, where a blind arm goes (first)."""
+        super().reset(episodes)
+        for episode in episodes:
+            order = self._rng[episode.slot].permutation(self._context.n_candidates)
+            self._order[episode.slot] = [int(i) for i in order]
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Hold until the choice can be made, then go."""
+        state = self.privileged_state(window)
+        if state.phase != "response":
+            return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
+        candidate = self._candidate(window, state)
+        return ActionChunk(actions=self._expert.plan(state, candidate, self._n_actions))
+
+    def _candidate(self, window: ObservationWindow, state: PrivilegedState) -> int:
+        if self._mode == "oracle":
+            assert state.target is not None  # the policy is only made for tasks with candidates
+            return state.target
+        order = self._order[window.slot]
+        if self._mode == "tour" and len(order) > 1 and self._touches(window, state, order[0]):
+            here = state.candidate_positions_m[order.pop(0)]
+            order.sort(key=lambda i: float(np.linalg.norm(state.candidate_positions_m[i] - here)))
+        return order[0]
+
+    def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:
+        at_rest = bool(np.abs(window.last.state["qvel"][:-2]).max() <= STATIC_RAD_S)
+        return at_rest and self._expert.is_done(state, candidate)
+
+
+class VisitPolicy(ScriptedPolicy):
+    """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
+
+    A blind arm knows how many were shown, and draws which ones, and their order, before it sees anything.
+    """
+
+    privileged = True
+
+    def __init__(self, context: PolicyContext, expert: VisitExpert, mode: Mode) -> None:
+        super().__init__(context)
+        self._expert = expert
+        self._mode = mode
+        self._drawn: dict[int, list[int]] = {}
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Decide, without looking, where a blind arm goes."""
+        super().reset(episodes)
+        for episode in episodes:
+            order = self._rng[episode.slot].permutation(self._context.n_candidates)
+            self._drawn[episode.slot] = [int(i) for i in order]
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Hold until the choice can be made, then go."""
+        state = self.privileged_state(window)
+        if state.phase != "response":
+            return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
+        wanted, in_order = self._itinerary(window.slot, state)
+        left = [candidate for candidate in wanted if candidate not in state.touched_candidates]
+        return ActionChunk(actions=self._expert.plan_visits(state, left, self._n_actions, in_order=in_order))
+
+    def _itinerary(self, slot: int, state: PrivilegedState) -> tuple[list[int], bool]:
+        """Return the candidates to touch, and whether in this order."""
+        drawn = self._drawn[slot]
+        if self._mode == "oracle":
+            return list(state.right_candidates), state.in_order
+        if self._mode == "cue_blind":
+            return drawn[: len(state.right_candidates)], state.in_order
+        begun = bool(state.touched_candidates)
+        return (drawn, False) if begun else (drawn[:1], True)

@@ -1,0 +1,31 @@
+"""Prompts of language models: tokens and mask, and the words of an instruction. Knows no tokenizer."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from vla_eval.errors import MissingInstructionError
+
+
+class Prompts(NamedTuple):
+    """Prompts of B samples, from the beginning of the text to the last token before the actions.
+
+    Attributes:
+        ids: (B, T) int64, padded on the right.
+        mask: (B, T) bool, False for padding.
+    """
+
+    ids: Tensor
+    mask: Tensor
+
+
+def instruction_words(instruction: str, *, model: str) -> str:
+    """Return the instruction in lower case, as both originals have it.
+
+    Raises:
+        MissingInstructionError: it is empty.
+    """
+    words = instruction.strip().lower()
+    if not words:
+        raise MissingInstructionError(f"{model} needs an instruction, found an empty one.")
+    return words

@@ -1,0 +1,146 @@
+"""Outcomes of the choice in a row's episodes: right, not finished, forgot, habit, never chose, not moved.
+
+Reads records and returns counts; changes nothing. `docs/report_page.md` explains each cause.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import p_above
+from vla_eval.results.grouping import RowEpisodes
+
+Cause = Literal["right", "not_finished", "forgot", "position_habit", "never_chose", "could_not_move"]
+CAUSES: tuple[Cause, ...] = (
+    "right",
+    "not_finished",
+    "forgot",
+    "position_habit",
+    "never_chose",
+    "could_not_move",
+)
+Kind = Literal["item", "place"]
+
+MOVED_M = 0.05  # half the distance between two neighbouring places: below it, the arm went to none of them
+HABIT_LEVEL = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Habit:
+    """Wrong choices that go to one place (or item) more often than expected by chance.
+
+    Attributes:
+        index: the place or item with the smallest p value among the wrong choices.
+        n_chosen: number of wrong choices that went to it.
+        n_possible: number of wrong choices that could go to it: those of episodes in which it was wrong.
+        by_luck: the share that would go to it if all wrong ones were equally likely: 1/(N - 1).
+        p_value: one-sided exact binomial test, times N because N were tested (Bonferroni).
+    """
+
+    index: int
+    n_chosen: int
+    n_possible: int
+    by_luck: float
+    p_value: float
+
+    @property
+    def is_found(self) -> bool:
+        """Whether it is significant at 5 %."""
+        return self.p_value < HABIT_LEVEL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChoiceReport:
+    """The choices of a row's episodes with candidates.
+
+    Attributes:
+        n_candidates: number of candidates.
+        causes: cause -> number of episodes; contains every cause.
+        confusion: by item and by place: (target, chosen or None) -> number of episodes. Empty if it was
+            not recorded, or if several candidates are right.
+        habits: by item and by place; None if there is nothing to test: fewer than three candidates, no
+            wrong choice, or nothing recorded.
+        reach_is_known: whether the records say how far the arm moved; otherwise no episode counts as
+            `could_not_move`.
+    """
+
+    n_candidates: int
+    causes: Mapping[Cause, int]
+    confusion: Mapping[Kind, Mapping[tuple[int, int | None], int]]
+    habits: Mapping[Kind, Habit | None]
+    reach_is_known: bool
+
+
+def report_choices(group: RowEpisodes) -> ChoiceReport | None:
+    """Sort a row's episodes by the outcome of the choice.
+
+    Returns:
+        None for a task without candidates, and if there is no result.
+    """
+    results = [record for record in group.results if record.n_candidates]
+    if not results:
+        return None
+    n_candidates = max(record.n_candidates or 0 for record in results)
+    confusion: dict[Kind, Counter[tuple[int, int | None]]] = {
+        "item": Counter((r.target, r.first_choice) for r in results if r.target is not None),
+        "place": Counter(
+            (r.target_place, r.first_choice_place) for r in results if r.target_place is not None
+        ),
+    }
+    habits: dict[Kind, Habit | None] = {
+        kind: find_habit(counts, n_candidates) for kind, counts in confusion.items()
+    }
+    causes = Counter(_cause(record, habits["place"]) for record in results)
+    return ChoiceReport(
+        n_candidates=n_candidates,
+        causes={cause: causes[cause] for cause in CAUSES},
+        confusion=confusion,
+        habits=habits,
+        reach_is_known=all(record.tcp_reach_m is not None for record in results),
+    )
+
+
+def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) -> Habit | None:
+    """Test whether wrong choices prefer one index.
+
+    Only wrong choices are used: right ones follow the target, wherever it is.
+
+    Args:
+        counts: (target, chosen or None) -> number of episodes.
+        n_candidates: number of indices; with two there is only one wrong choice.
+
+    Returns:
+        The index with the smallest p value, or None if there is nothing to test.
+    """
+    wrong = {pair: n for pair, n in counts.items() if pair[1] is not None and pair[0] != pair[1]}
+    if n_candidates < 3 or not wrong:
+        return None
+    by_luck = 1 / (n_candidates - 1)
+    found = []
+    for index in range(n_candidates):
+        n_possible = sum(n for (target, _), n in wrong.items() if target != index)
+        n_chosen = sum(n for (_, chosen), n in wrong.items() if chosen == index)
+        if n_possible:
+            p = p_above(n_chosen, n_possible, by_luck)
+            found.append(
+                Habit(
+                    index=index,
+                    n_chosen=n_chosen,
+                    n_possible=n_possible,
+                    by_luck=by_luck,
+                    p_value=min(1.0, p * n_candidates),
+                )
+            )
+    return min(found, key=lambda habit: habit.p_value)
+
+
+def _cause(record: EpisodeRecord, habit: Habit | None) -> Cause:
+    if record.first_choice is None:
+        stayed = record.tcp_reach_m is not None and record.tcp_reach_m < MOVED_M
+        return "could_not_move" if stayed else "never_chose"
+    if record.first_choice_success:
+        return "right" if record.success_once else "not_finished"
+    is_habit = habit is not None and habit.is_found and record.first_choice_place == habit.index
+    return "position_habit" if is_habit else "forgot"

@@ -1,0 +1,93 @@
+"""The success table as data: its rows and their notes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Literal
+
+IntervalKind = Literal["wilson", "t_over_runs"]
+ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One policy on one task, at one `n_action_steps` and one variant of the settings.
+
+    `docs/statistics.md` says what each value means and how it is computed. An undefined value is None.
+
+    Attributes:
+        n_episodes: episodes with a result; n_errors: episodes without one, in no rate.
+        n_success_once: how many succeeded at any step.
+        success_once: their share; over several runs the mean of the run means.
+        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
+        n_runs: independent runs with a result; sem: standard error over them.
+        success_at_end: share that succeeded at the last step.
+        first_choice_success: share whose first candidate touched was the right one.
+        n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
+        right_if_chose: the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson
+            interval, of one run.
+        mean_success_step: control steps until success, over the successes.
+        inferences_per_episode: calls of the policy.
+        baseline, baseline_n_action_steps: the row with which this one is compared, on the same episodes.
+        paired_difference: this row minus the baseline, over n_pairs pairs.
+        paired_p, paired_p_raw: exact McNemar, with and without Holm's correction.
+        chance, chance_source: success without memory, and its source.
+        ceiling: success of the `oracle` at the same n_action_steps.
+        chance_corrected: success_once relative to chance (0) and ceiling (1).
+        variant: the settings that differ from the others in the table; None if there is only one.
+    """
+
+    task: str
+    policy: str
+    n_action_steps: int
+    variant: str | None
+    n_episodes: int
+    n_errors: int
+    n_success_once: int | None
+    success_once: float | None
+    ci_low: float | None
+    ci_high: float | None
+    interval: IntervalKind | None
+    n_runs: int
+    sem: float | None
+    success_at_end: float | None
+    first_choice_success: float | None
+    n_chose: int | None
+    n_chose_right: int | None
+    right_if_chose: float | None
+    right_if_chose_low: float | None
+    right_if_chose_high: float | None
+    mean_success_step: float | None
+    inferences_per_episode: float | None
+    baseline: str | None
+    baseline_n_action_steps: int | None
+    paired_difference: float | None
+    n_pairs: int | None
+    paired_p: float | None
+    paired_p_raw: float | None
+    chance: float | None
+    chance_source: ChanceSource | None
+    ceiling: float | None
+    chance_corrected: float | None
+
+    def to_dict(self) -> dict[str, str | int | float | None]:
+        """Return the row by column name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """Rows and their notes.
+
+    Attributes:
+        rows: in the order of the configuration.
+        notes: footnotes, whole sentences.
+        baseline: the policy with which the others are compared; None if the table has none.
+        n_comparisons: how many p values were corrected together.
+        runs: run folder -> name of its configuration.
+    """
+
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+    baseline: str | None
+    n_comparisons: int
+    runs: Mapping[str, str]

@@ -1,0 +1,29 @@
+"""What the video and the rerun file of an episode are called. An episode that was not captured has none."""
+
+from pathlib import Path
+
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.folders import RRDS, VIDEOS
+
+
+def capture_stem(record: EpisodeRecord) -> str:
+    """Return `RememberColor3-v0_oracle_K1_run0_seed7_success`."""
+    return (
+        f"{record.task}_{record.policy}_K{record.n_action_steps}_run{record.run}_seed{record.seed}"
+        f"_{record.outcome}"
+    )
+
+
+def video_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the video of an episode is, or would be."""
+    return folder / VIDEOS / f"{capture_stem(record)}.mp4"
+
+
+def thumbnail_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the image of an episode's last captured step is, or would be."""
+    return folder / VIDEOS / f"{capture_stem(record)}.jpg"
+
+
+def rrd_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the rerun file of an episode is, or would be."""
+    return folder / RRDS / f"{capture_stem(record)}.rrd"

@@ -1,0 +1,116 @@
+"""Start to write into a folder: make it, lock it, and remove it again if the start fails.
+
+A mistake leaves no empty folder behind. Knows nothing of what the folder is for.
+"""
+
+import contextlib
+import errno
+import logging
+import os
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.errors import RunFolderError
+from vla_eval.storage.durable import FolderLock, storage_full
+
+logger = logging.getLogger(__name__)
+
+LOGS_FOLDER = "logs"
+DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+
+
+class FolderStart:
+    """What a start finds at its place, to be noted before it makes anything there.
+
+    Args:
+        path: the folder that is going to be made, if it is not there.
+        own: names of what the start writes into it.
+    """
+
+    def __init__(self, path: Path, *, own: Collection[str]) -> None:
+        self._path = path
+        self._own = frozenset(own)
+        self._made = [folder for folder in (path, *path.parents) if not folder.exists()]
+        self._before = frozenset(os.listdir(path)) if path.is_dir() else frozenset[str]()
+
+    def undo(self) -> None:
+        """Remove what the start has made; nothing, if there is anything that it does not know."""
+        try:
+            self._undo()
+        except OSError as exc:  # the error that ended the start says more
+            logger.warning("%s: what a failed start has made could not be removed (%s)", self._path, exc)
+
+    def _undo(self) -> None:
+        if not self._path.is_dir():
+            return
+        new = [self._path / name for name in sorted(set(os.listdir(self._path)) - self._before)]
+        folders = [entry for entry in new if entry.is_dir() and not entry.is_symlink()]
+        files = [entry for entry in new if entry not in folders]
+        known = self._own.issuperset(file.name for file in files)
+        if not known or not all(_is_bare(folder) or _is_of_logs(folder) for folder in folders):
+            return
+        for file in files:
+            file.unlink()
+        for folder in folders:
+            shutil.rmtree(folder)
+        for folder in self._made:  # the innermost first
+            if any(folder.iterdir()):  # somebody else has begun to use it
+                return
+            folder.rmdir()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartedFolder:
+    """A folder that this process has made or found, and locked."""
+
+    start: FolderStart
+    lock: FolderLock
+
+
+@contextlib.contextmanager
+def starting(
+    path: Path, *, own: Collection[str], lock_file: str, purpose: str, make: Callable[[Path], None]
+) -> Iterator[StartedFolder]:
+    """Make and lock a folder; if the block ends with an exception, all that was made is removed.
+
+    Args:
+        path: the folder.
+        own: names of the files that a start writes into it.
+        lock_file: name of the file that is locked.
+        purpose: `a run folder`, for messages.
+        make: makes the folder if it is not there, after checks of its own.
+
+    Raises:
+        FolderInUseError: another process has locked it.
+        StorageFullError: the disk is full.
+        RunFolderError: the folder cannot be used.
+    """
+    try:
+        start = FolderStart(path, own=own)
+        make(path)
+        started = StartedFolder(start=start, lock=FolderLock(path / lock_file))
+        try:
+            yield started
+        except BaseException:
+            start.undo()
+            started.lock.release()
+            raise
+    except OSError as exc:
+        if exc.errno in DISK_TROUBLE:
+            raise storage_full(path, exc) from exc
+        raise RunFolderError(
+            f"{path}: cannot be used as {purpose} ({exc.strerror or exc}). Use another --out."
+        ) from exc
+
+
+def _is_of_logs(folder: Path) -> bool:
+    return folder.name == LOGS_FOLDER and all(
+        entry.suffix == ".log" and entry.is_file() for entry in folder.iterdir()
+    )
+
+
+def _is_bare(folder: Path) -> bool:
+    """Whether there is no file in it, at any depth."""
+    return all(entry.is_dir() and not entry.is_symlink() for entry in folder.rglob("*"))
