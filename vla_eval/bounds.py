@@ -1,7 +1,7 @@
 """How large the numbers of a recipe may be. Knows nothing of what they mean.
 
-The upper bounds lie far above what anyone needs. They turn a slip of the pen into a message, where it would
-otherwise fill the memory, or fail in every episode after the start.
+The upper bounds lie far above what anyone needs. With them a typo gives a message at the start. Without them
+it would fill the memory, or fail in every episode.
 """
 
 from collections.abc import Mapping

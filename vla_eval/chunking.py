@@ -10,7 +10,7 @@ actions for steps `s, s + 1, …`; with a delay of `d` steps it is available fro
   Source: Zhao et al. 2023 (ACT, arXiv:2304.13705), section IV-B, where decay is called m.
 
 With a delay, what a chunk says about steps that are past when it arrives is dropped (`delay_alignment:
-skip`), as a robot that goes on moving during inference must do; or the whole chunk is executed late
+skip`), as a robot that keeps moving during inference must do; or the whole chunk is executed late
 (`stale`), which is what a loop that does not know of its own latency does.
 """
 

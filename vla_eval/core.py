@@ -31,7 +31,7 @@ class Observation:
 
     Attributes:
         step: control steps executed since reset; 0 is the reset observation.
-        images: camera name -> (H, W, 3) uint8 RGB. Empty where nobody asked for pictures: a camera
+        images: camera name -> (H, W, 3) uint8 RGB. Empty if no image was requested: a camera
             is never replaced by a blank one.
         state: name -> (D,) float32, as `EnvSpec.states` describes them.
         privileged: the true state of the world; None unless the policy declares that it is privileged.
@@ -72,7 +72,7 @@ class ActionChunk:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStart:
-    """What a policy is told when an episode begins.
+    """What a policy gets when an episode begins.
 
     Attributes:
         slot: the slot the episode runs in.

@@ -48,7 +48,7 @@ class MissingDependencyError(VlaEvalError):
 
 
 class RenderingError(VlaEvalError):
-    """The renderer could not be started or did not give a picture."""
+    """The renderer could not be started or did not give an image."""
 
 
 class RunFolderError(VlaEvalError):
@@ -104,10 +104,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
     Args:
         name: what the user wrote.
-        known: the names that exist. Upper and lower case are not told apart when comparing.
+        known: the names that exist. Comparing ignores case.
     """
     by_folded = {candidate.lower(): candidate for candidate in known}
-    # Longer names are no slip of the pen, and comparing takes time that grows with the square of the length.
+    # Longer names are not typos, and comparing takes time that grows with the square of the length.
     close = difflib.get_close_matches(name[:MAX_SHOWN].lower(), list(by_folded), n=1, cutoff=0.5)
     return f" Did you mean '{by_folded[close[0]]}'?" if close else ""
 

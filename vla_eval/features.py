@@ -136,7 +136,7 @@ def frame_values(
 
     Args:
         before: what was observed before the action; it has images of all cameras.
-        after: what came of the action.
+        after: the result of the action.
         action: (7,) the action to store.
         state: which proprioception `observation.state` is.
         is_last: whether this is the last frame of the episode.

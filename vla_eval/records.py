@@ -36,7 +36,7 @@ REMEDY = (
     "or start a new run folder."
 )
 MADE_REMEDY = (
-    "Nothing was stored. Mend the environment or the policy that gave these values; a policy's file with "
+    "Nothing was stored. Fix the environment or the policy that gave these values; a policy's file with "
     "such a name has to be renamed."
 )
 
@@ -70,7 +70,7 @@ class EpisodeError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeRecord:
-    """What came of one episode. A field that has no meaning for it is None, never 0.
+    """The result of one episode. A field that has no meaning for it is None, never 0.
 
     Attributes:
         outcome: `success` if the success rule held at any step, `failure` if it never did, `error` if

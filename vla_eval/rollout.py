@@ -36,7 +36,7 @@ class RolloutSettings:
         eager_rendering: render every frame also for a policy that reads only the last one. Changes no
             result; for checking exactly that.
         stop_at_success: end an episode at its first success; success_at_end is then unknown.
-        steps_after_success: with `stop_at_success`, go on for so many control steps.
+        steps_after_success: with `stop_at_success`, continue for this many control steps.
     """
 
     chunking: ChunkingSpec

@@ -110,7 +110,7 @@ def _rebuild(args: argparse.Namespace) -> int:
         return stop.exit_code
     print(describe_dataset(rebuilt.dataset))
     print(
-        f"episodes whose raw images are those that were recorded: {rebuilt.n_same_pictures} "
+        f"episodes whose raw images are those that were recorded: {rebuilt.n_same_images} "
         f"of {rebuilt.dataset.facts.n_episodes}"
     )
     return 0

@@ -188,10 +188,10 @@ def _differences(summary: DatasetSummary) -> str:
         _expert_difference(facts, summary),
         f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper's recorder kept "
         f"every episode of its batch, whether it succeeded or not.",
-        f"- Cut: {_cut(facts)}; the paper's recorder went on to the horizon.",
+        f"- Cut: {_cut(facts)}; the paper's recorder recorded to the horizon.",
         "- Actions are end-effector deltas as they were executed; the paper's recordings for reinforcement "
         "learning hold joint deltas.",
-        "- Pictures are video (lossy); the paper's are arrays of pixels.",
+        "- Images are video (lossy); the paper's are arrays of pixels.",
     ]
     render = facts.recipe.get("render")
     if isinstance(render, dict) and render.get("wrist_mesh") == "simplified":

@@ -20,8 +20,8 @@ def check_complete(root: Path) -> DatasetFacts | ImportFacts:
     imported = read_import(root)
     if imported is None:
         raise DatasetError(
-            f"{root}: not a complete dataset of this project: neither {RECORDING_FILE} nor {IMPORT_FILE} is "
-            f"there, which are written last. Run the command that makes it again: it goes on."
+            f"{root}: not a complete dataset of this project: neither {RECORDING_FILE} nor {IMPORT_FILE}, "
+            f"which are written last, is there. Run the command that makes it again: it resumes."
         )
     _check_files(root, imported.files)
     return imported

@@ -1,4 +1,4 @@
-"""One picture of a few episodes: what the cameras saw in each phase. Numpy and Pillow only."""
+"""One image of a few episodes: what the cameras saw in each phase. Numpy and Pillow only."""
 
 import io
 from collections.abc import Sequence

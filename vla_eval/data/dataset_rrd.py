@@ -1,6 +1,6 @@
 """Write an episode of a dataset as an `.rrd` for the rerun viewer: what a policy is trained on.
 
-    cameras/NAME                 pictures as they are decoded from the dataset's video
+    cameras/NAME                 images as they are decoded from the dataset's video
     actions/DIM/stored, state/DIM, reward, success
     world/arm                    where `proprio.joints` are those of the Panda
     world/tcp, tcp_path          where the numbers of `observation.state` or `proprio.eef` begin with x, y, z

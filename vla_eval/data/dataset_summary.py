@@ -1,4 +1,4 @@
-"""Read from a dataset what its card says: lengths, success, actions, a few pictures."""
+"""Read from a dataset what its card says: lengths, success, actions, a few images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

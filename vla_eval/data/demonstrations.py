@@ -1,8 +1,8 @@
-"""One demonstration: let the expert act and take down what it did; do it again and look at it.
+"""One demonstration in two passes: the expert acts, then its actions are replayed and rendered.
 
-An `Attempt` is the result of the first, without pictures. `replay_attempt` is the second: the same
-seed and actions give the same states, which is checked, and now there are frames. Knows nothing of
-files, lerobot or processes.
+The first pass gives an `Attempt`, without images. `replay_attempt` is the second pass: the same seed and
+actions give the same states, which is checked, and frames are rendered. Knows nothing of files, lerobot
+or processes.
 """
 
 import hashlib
@@ -64,16 +64,16 @@ class EpisodeLog:
     """A `StepObserver` that keeps all results of one episode.
 
     Args:
-        n_pictures: ask for the pictures of so many first observations.
+        n_images: request the images of this many first observations.
     """
 
-    n_pictures: int = 0
+    n_images: int = 0
     results: list[StepResult] = field(default_factory=list)
     asked: list[FloatArray] = field(default_factory=list)
 
     def wants_images(self, step: int) -> bool:
-        """No picture of the last observation: no action follows it."""
-        return step < self.n_pictures
+        """The last observation needs no image: no action follows it."""
+        return step < self.n_images
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Keep the reset's result."""
@@ -182,7 +182,7 @@ def attempt(
     *,
     heartbeat: Callable[[Stage], None],
 ) -> Attempt:
-    """Let the expert act on one seed, without pictures; errors as `rollout`."""
+    """Let the expert act on one seed, without images; errors as `rollout`."""
     log = EpisodeLog()
     (record,) = rollout(env, expert, [start], settings, observers=[log], heartbeat=heartbeat)
     executed = log.executed()
@@ -214,7 +214,7 @@ def replay_actions(
     """Execute recorded actions.
 
     Args:
-        env: the environment; for pictures it must have been made with cameras.
+        env: the environment; to render images it must have been made with cameras.
         start: the episode; its horizon is the number of actions.
         actions: (n_steps, A).
         heartbeat: called with what is about to be done.
@@ -223,7 +223,7 @@ def replay_actions(
     Returns:
         All results, from reset on.
     """
-    log = EpisodeLog(n_pictures=len(actions) if with_pictures else 0)
+    log = EpisodeLog(n_images=len(actions) if with_pictures else 0)
     settings = RolloutSettings(chunking=ONE_BY_ONE)
     rollout(env, RecordedActions(actions), [start], settings, observers=[log], heartbeat=heartbeat)
     return log
@@ -232,7 +232,7 @@ def replay_actions(
 def replay_attempt(
     env: SimEnv, start: EpisodeStart, attempt: Attempt, *, heartbeat: Callable[[Stage], None]
 ) -> EpisodeLog:
-    """Do an attempt again, with pictures.
+    """Replay an attempt, with images.
 
     Raises:
         RecordingError: the states are not those of the attempt.

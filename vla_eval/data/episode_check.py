@@ -19,14 +19,14 @@ from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY
 STATE_TOLERANCE = 1e-2  # m, rad, rad/s; for machines whose arithmetic differs in the last bits
 MIN_PSNR_DB: dict[Simulator, float] = {
     "maniskill": 34.0,  # yuv444p at crf 12 gives 38 to 41 dB; yuv420p stays below 34 at any quality
-    "fake": 25.0,  # its pictures are noise, of which the codec keeps 31 dB; another picture has 8 dB
+    "fake": 25.0,  # its images are noise, which the codec keeps at 31 dB; a different image has 8 dB
 }
 MAX_LEVEL = 255.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PictureCheck:
-    """What a comparison of pictures has found; `psnr_db` is that of the video, by camera."""
+class ImageCheck:
+    """What a comparison of images has found; `psnr_db` is that of the video, by camera."""
 
     mismatches: tuple[str, ...]
     psnr_db: dict[str, float]
@@ -79,21 +79,21 @@ def check_pictures(
     *,
     expect_equal_bits: bool,
     min_psnr_db: float,
-) -> PictureCheck:
-    """Compare fresh pictures with the manifest's digests, and the video with them.
+) -> ImageCheck:
+    """Compare rendered images with the manifest's digests, and the video with the images.
 
     Args:
         episode: what the manifest says.
-        frames: camera -> fresh picture, per step.
+        frames: camera -> rendered image, per step.
         decoded: camera -> frames of the video.
-        expect_equal_bits: whether the pictures must be the recorded ones, bit for bit.
-        min_psnr_db: how close the video must come to the fresh pictures.
+        expect_equal_bits: whether the images must be bit-equal to the recorded ones.
+        min_psnr_db: how close the video must come to the rendered images.
     """
     found = []
     fresh = images_digests(frames)
     if expect_equal_bits:
         found += [
-            f"{camera}: the raw pictures are not those that were recorded"
+            f"{camera}: the raw images differ from the recorded ones"
             for camera, digest in episode.images_sha256.items()
             if fresh.get(camera) != digest
         ]
@@ -106,11 +106,11 @@ def check_pictures(
         for camera, decibels in quality.items()
         if decibels < min_psnr_db
     ]
-    return PictureCheck(mismatches=tuple(found), psnr_db=quality)
+    return ImageCheck(mismatches=tuple(found), psnr_db=quality)
 
 
 def psnr_db(reference: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """Return the peak signal-to-noise ratio of 8-bit pictures of one shape; 100 for equal ones."""
+    """Return the peak signal-to-noise ratio of 8-bit images of one shape; 100 for equal ones."""
     error = reference.astype(np.float64) - other.astype(np.float64)
     mean_square = float((error**2).mean())
     return 100.0 if mean_square == 0 else float(10 * np.log10(MAX_LEVEL**2 / mean_square))

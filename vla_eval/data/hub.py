@@ -78,7 +78,7 @@ def pull_dataset(
 ) -> PulledDataset:
     """Download a dataset and check it; the folder appears when it is complete.
 
-    Called again after an interruption, it goes on with what `OUT.partial` holds already.
+    After an interruption the same call resumes from `OUT.partial`.
 
     Args:
         repo_id: `USER/NAME`.

@@ -145,11 +145,11 @@ class ReplayReport:
     Attributes:
         passed: every episode that was replayed is what the manifest says.
         n_episodes: episodes replayed; n_total: episodes of the dataset.
-        pixels: whether pictures were compared, too.
+        pixels: whether images were compared, too.
         states_compared: `bit-equal`, or the tolerance where environments differ.
         mismatches: one sentence each.
         lowest_psnr_db: camera -> how close the video comes to the rendered frames in the worst episode;
-            empty where pictures were not compared.
+            empty where images were not compared.
         manifest_sha256: digest of the manifest that was replayed; another manifest needs another replay.
         environment: where it was replayed.
     """
@@ -246,7 +246,7 @@ def read_facts(dataset: Path) -> DatasetFacts:
     facts = from_json(DatasetFacts, _content(path), where=str(path))
     check_file_names(facts.files, where=path)
     if not facts.complete:
-        raise DatasetError(f"{dataset}: is not complete. Run the command that records it again: it goes on.")
+        raise DatasetError(f"{dataset}: is not complete. Run the command that records it again: it resumes.")
     return facts
 
 

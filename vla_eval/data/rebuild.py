@@ -1,7 +1,7 @@
-"""Make a dataset anew from its manifest: an episode is a function of (task, arguments, seed, actions).
+"""Rebuild a dataset from its manifest: an episode is a function of (task, arguments, seed, actions).
 
-For a dataset whose videos or tables are damaged or were never fetched, and for one that shall be
-rendered in another way. Goes through the second pass of a recording, with its shards and its checks.
+For a dataset whose videos or tables are damaged or were never fetched, and for one that is to be
+rendered with other settings. It runs the second pass of a recording, with its shards and its checks.
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ from vla_eval.errors import DatasetError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rebuilt:
-    """The new dataset, and how many of its episodes have the raw pictures of the old one."""
+    """The new dataset, and how many of its episodes have the raw images of the old one."""
 
     dataset: RecordedDataset
-    n_same_pictures: int
+    n_same_images: int
 
 
 def rebuild(
@@ -34,12 +34,12 @@ def rebuild(
     observer: RecordingObserver,
     workers: int | Literal["auto"] = "auto",
 ) -> Rebuilt | None:
-    """Make a dataset anew in OUT/TASK; stopped, the same call goes on.
+    """Rebuild a dataset in OUT/TASK; after an interruption the same call resumes.
 
     Args:
         dataset: the old dataset; only its manifest and its recipe are read.
         out: another folder.
-        observer: is told of progress.
+        observer: gets the progress.
         workers: processes.
 
     Returns:
@@ -73,7 +73,7 @@ def rebuild(
     (made,) = summary.datasets
     pairs = zip(episodes, read_manifest(made.path), strict=True)
     return Rebuilt(
-        dataset=made, n_same_pictures=sum(old.images_sha256 == new.images_sha256 for old, new in pairs)
+        dataset=made, n_same_images=sum(old.images_sha256 == new.images_sha256 for old, new in pairs)
     )
 
 

@@ -1,8 +1,8 @@
 """Record demonstrations: choose seeds without rendering, render and encode what is kept, put it together.
 
-One LeRobotDataset per task, OUT/TASK, since policies are trained per task. Stopped at any moment, by any
-means, the same call goes on where it stopped; what comes of it does not depend on that, nor on the number
-of workers.
+One LeRobotDataset per task, OUT/TASK, since policies are trained per task. It may be stopped at any
+moment, by any means: the same call resumes where it stopped. The result depends neither on that, nor on the
+number of workers.
 """
 
 import functools
@@ -70,7 +70,7 @@ class _Silence:
         """Do nothing."""
 
     def on_tick(self) -> bool:
-        """Go on."""
+        """Continue."""
         return False
 
 
@@ -101,7 +101,7 @@ class RecordingSummary:
 def recording_main(connection: Connection, shared: SharedStage, log: Path) -> None:
     """Record for the parent until it closes the pipe; the entry point of a worker process."""
     detach(log)
-    # Imported by the worker alone: lerobot costs the parent 5 s, in which a mistake can long be told.
+    # Imported by the worker alone: importing lerobot would delay the parent's message about a mistake by 5 s.
     runner = importlib.import_module(WORKER_MODULE).RecordingRunner
     serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
 
@@ -124,11 +124,11 @@ def record(
         recipe: what to record.
         out: the folder; each task's dataset appears in it.
         command: what the user typed, for the record.
-        allow_environment_change: go on although package versions or the machine have changed.
-        observer: is told of progress.
+        allow_environment_change: resume although package versions or the machine have changed.
+        observer: gets the progress.
 
     Raises:
-        VlaEvalError: a mistake in the recipe, a recording that cannot go on, a full disk. What was
+        VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk. What was
             recorded stays.
     """
     return run_plan(
@@ -158,9 +158,9 @@ def run_plan(
         recipe: what to record.
         plan: what `plan_recording` makes of it.
         out: the folder.
-        observer: is told of progress.
+        observer: gets the progress.
         command: what the user typed.
-        allow_environment_change: go on although package versions or the machine have changed.
+        allow_environment_change: resume although package versions or the machine have changed.
         selections: task -> the attempts to render, where they are known already.
         source: digest of what the selections were read from.
     """
@@ -342,6 +342,6 @@ def _raise_if_hopeless(failed: Failed, n_tries: int, where: str) -> int:
         error = failed.error
         raise RecordingError(
             f"{where}: failed {MAX_TRIES} times, the last time during {error.stage}: {error.kind}: "
-            f"{error.message}\n{error.details or ''}\nWhat was recorded is kept; the same command goes on."
+            f"{error.message}\n{error.details or ''}\nWhat was recorded is kept; the same command resumes."
         )
     return n_tries + 1

@@ -1,4 +1,4 @@
-"""What a recording keeps while it goes on, so that it can be stopped at any moment.
+"""What a recording keeps while it runs, so that it can be stopped at any moment.
 
     OUT/TASK/                            a finished dataset; appears in one step
     OUT/recording/run.json               recipe and environment it was started with, and each continuation
@@ -58,12 +58,12 @@ class RecordingFolder:
 
     @classmethod
     def open(cls, out: Path, description: RunDescription, *, allow_environment_change: bool) -> Self:
-        """Start a recording in a folder, or go on with the one that is there.
+        """Start a recording in a folder, or resume the one that is there.
 
         Args:
             out: the folder; it is made if it is not there.
             description: recipe and environment; they must be what they were before.
-            allow_environment_change: go on although commit, versions or machine have changed.
+            allow_environment_change: resume although commit, versions or machine have changed.
 
         Raises:
             RunChangedError: recipe or environment are not what they were; the message says in what.
@@ -107,12 +107,12 @@ class RecordingFolder:
 
     @property
     def device(self) -> dict[str, str]:
-        """What is known of the device that pictures are rendered on."""
+        """What is known of the device that renders the images."""
         device = self._run_file.description.environment.get(DEVICE)
         return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
 
     def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
-        """Record the device; pictures of one dataset must come from one device.
+        """Record the device; all images of a dataset must come from one device.
 
         Raises:
             RunChangedError: it is another one than before, and changes are not allowed.

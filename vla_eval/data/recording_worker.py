@@ -1,6 +1,6 @@
 """The inside of a worker that records: tries seeds, renders and encodes shards, puts datasets together.
 
-It is told what to do over a pipe, as `vla_eval.evaluation.worker` is, and keeps the environment between
+It gets its jobs over a pipe, as `vla_eval.evaluation.worker` does, and keeps the environment between
 jobs of one kind. Only whole shards and whole datasets appear on the disk.
 """
 

@@ -58,9 +58,9 @@ class ReplayJob:
         dataset: the dataset's folder.
         episode: what the manifest says of it.
         env: the environment.
-        pixels: whether pictures are compared, too.
+        pixels: whether images are compared, too.
         same_machine: whether machine and versions are those of the recording.
-        device: the device that the recording's pictures were rendered on.
+        device: the device that rendered the recording's images.
     """
 
     dataset: Path
@@ -78,7 +78,7 @@ class ReplayJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeReplayed:
-    """What came of one episode: sentences about mismatches, and the video's quality by camera."""
+    """The result of one episode: sentences about mismatches, and the video's quality by camera."""
 
     episode_index: int
     mismatches: tuple[str, ...]
@@ -120,7 +120,7 @@ def find_datasets(path: Path) -> tuple[Path, ...]:
     if not below:
         raise DatasetError(
             f"{path}: holds no finished dataset (no {RECORDING_FILE}, here or one folder below). If a "
-            f"recording was stopped, its command goes on."
+            f"recording was stopped, its command resumes it."
         )
     return tuple(below)
 
@@ -139,10 +139,10 @@ def replay(
     Args:
         dataset: the dataset's folder.
         logs: folder for what the workers write.
-        observer: is told of progress and mismatches.
+        observer: gets progress and mismatches.
         episodes: their numbers; None: all. A report of a part is returned, and not written over one of
             the whole unless it has found a mismatch.
-        pixels: compare pictures, too.
+        pixels: compare images, too.
         workers: processes.
 
     Returns:
@@ -248,7 +248,7 @@ def recipe_of(facts: DatasetFacts) -> DatasetRecipe:
 
 
 def _episode_of(event: Answered[ReplayJob, EpisodeReplayed]) -> EpisodeReplayed:
-    """Return what came of an episode; that it could not be replayed says nothing about the dataset."""
+    """Return an episode's result; an episode that could not be replayed says nothing about the dataset."""
     if not isinstance(event.answer, Failed):
         return event.answer
     error = event.answer.error

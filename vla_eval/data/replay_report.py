@@ -11,7 +11,7 @@ def keep_report(dataset: Path, report: ReplayReport) -> None:
     """Write the report, unless one that is there says more.
 
     A mismatch is always written. A report without any is written if it is about all episodes, and does
-    not hide a mismatch of pictures that it has not looked at.
+    not hide a mismatch of images that it has not compared.
     """
     if report.passed:
         before = read_replay(dataset)
@@ -45,7 +45,7 @@ def require_passed(dataset: Path) -> ReplayReport | None:
         shown = "\n".join(f"  {sentence}" for sentence in report.mismatches[:5])
         raise DatasetError(
             f"{dataset}: its replay failed with {len(report.mismatches)} mismatches:\n{shown}\nWhat is "
-            f"learned from it would not fit the environment. Record it again, or make it anew from its "
+            f"learned from it would not fit the environment. Record it again, or rebuild it from its "
             f"manifest: mikasa-vla replay {dataset} --rebuild OUT"
         )
     return report

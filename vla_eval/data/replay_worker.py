@@ -1,4 +1,4 @@
-"""The inside of a worker that replays: does an episode's actions again and compares what comes of it."""
+"""The inside of a worker that replays: executes an episode's actions and compares the result."""
 
 import logging
 from collections.abc import Callable

@@ -60,7 +60,7 @@ class SeedQueue[J]:
         return self._make_job(seed)
 
     def add(self, attempt: Attempt) -> None:
-        """Take down what came of a seed."""
+        """Record a seed's result."""
         self._in_flight.discard(attempt.seed)
         self._known[attempt.seed] = attempt
 

@@ -10,10 +10,10 @@ Three kinds of policies, told apart by their configuration:
   reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
 - with indices, such as [-1, 0] or [0]: it gets these frames, (B, T, …), as in training (Diffusion
   Policy, SmolVLA); before the first frame of an episode there is the first frame again. One whose
-  configuration says `masks_history = True` is told which frames these are, by `FIELD_is_pad` (Octo).
+  configuration says `masks_history = True` gets `FIELD_is_pad`, which marks these frames (Octo).
 - with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
-  gets `memory` (a recurrent policy of one's own).
+  gets `memory` (a recurrent policy of your own).
 """
 
 import zlib

@@ -89,7 +89,7 @@ class RunFolder:
         self._finished = {key for key, record in records.items() if record.outcome != "error"}
         self._has_lines = bool(records)
         cut_tail(path / TIMINGS_FILE)
-        # run.json comes first: episodes without it would be nobody's.
+        # run.json comes first: episodes without it would belong to no run.
         self._run_file.save(path)
         self._episodes: LineFile | None = LineFile(path / EPISODES_FILE, durable=True)
         self._timings = LineFile(path / TIMINGS_FILE, durable=False)
@@ -145,7 +145,7 @@ class RunFolder:
         """Store one episode; it is durable when this returns.
 
         Args:
-            record: what came of it.
+            record: the episode's result.
             timing: how long it took; not made durable, and lost rather than an error if it cannot be kept.
 
         Raises:
@@ -244,7 +244,7 @@ class RunFolder:
 
 
 def read_run(path: Path) -> StoredRun:
-    """Read a run folder without touching it; a run may be going on in it.
+    """Read a run folder without touching it; a run may be writing to it.
 
     Args:
         path: the folder.
