@@ -10,7 +10,7 @@ from tests.unit.eval_configs import MINIMAL, config
 from vla_eval.config import shipped
 from vla_eval.config.decoding import decode, load_yaml
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import apply_overrides, find_recipe, list_recipes, load_recipe
+from vla_eval.config.files import apply_overrides, digest_of, find_recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, UnknownNameError, VlaEvalError
 from vla_eval.evaluation.grid import is_model_table, load_model_table
@@ -307,3 +307,9 @@ def test_a_huge_file_is_no_recipe(tmp_path: Path) -> None:
 
     with pytest.raises(RecipeError, match=r"more than 1000000 characters"):
         load_recipe("policies", str(recipe), PolicyRecipe)
+
+
+def test_a_digest_is_that_of_ascii_json_with_sorted_keys() -> None:
+    """So that run folders and datasets of earlier versions can be resumed."""
+    text = b'{"a": [2, "\\u00e9", null], "b": 0.5}'
+    assert digest_of({"b": 0.5, "a": [2, "é", None]}) == hashlib.sha256(text).hexdigest()

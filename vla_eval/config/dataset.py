@@ -1,14 +1,12 @@
 """`datasets/*.yaml`: which demonstrations, how recorded, how many. Knows nothing of lerobot or simulators."""
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import TimeoutConfig
-from vla_eval.config.files import check_run_name, to_data
+from vla_eval.config.files import check_run_name, digest_of, to_data
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings, StateKind
 
@@ -99,5 +97,4 @@ def options_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data
 
 def fingerprint(recipe: DatasetRecipe) -> str:
     """Return the sha256 of the part of a recipe that the dataset's content depends on."""
-    text = json.dumps(content_of(recipe), sort_keys=True, ensure_ascii=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return digest_of(content_of(recipe))

@@ -7,6 +7,7 @@ package. Knows nothing of what the recipes mean.
 
 import dataclasses
 import hashlib
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -169,3 +170,8 @@ def to_data(value: Any) -> Any:  # Any: plain data of whatever the recipe holds
     if isinstance(value, list | tuple):
         return [to_data(item) for item in value]
     return value
+
+
+def digest_of(data: Any) -> str:  # Any: plain data
+    """Return the sha256 of plain data, written as ASCII JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, ensure_ascii=True).encode()).hexdigest()

@@ -4,8 +4,6 @@ Every mistake in a configuration that can be found without starting a simulator 
 first episode. Knows nothing of processes or files of results.
 """
 
-import hashlib
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,7 +11,7 @@ from typing import Any, NamedTuple
 from vla_eval.bounds import MAX_EPISODES
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
-from vla_eval.config.files import Recipe, to_data
+from vla_eval.config.files import Recipe, digest_of, to_data
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import load_prompts, sentences_of
 from vla_eval.errors import RecipeError
@@ -182,8 +180,7 @@ def options_of(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
 
 def fingerprint(config: EvalConfig) -> str:
     """Return the sha256 of the part of a configuration that results depend on."""
-    text = json.dumps(results_config(config), sort_keys=True, ensure_ascii=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return digest_of(results_config(config))
 
 
 def _refuse_instruction(config: EvalConfig) -> None:

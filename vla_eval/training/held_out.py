@@ -5,15 +5,13 @@ It runs while the training waits, since both need the same device. A training th
 finishes it first and then resumes.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import to_data
+from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.errors import RecipeError
@@ -56,8 +54,7 @@ class HeldOut:
         """A digest of the settings: evaluations with other settings have another."""
         settings = to_data(self.settings)
         del settings["workers"]  # moves no result
-        text = json.dumps([settings, self.task], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+        return digest_of([settings, self.task])[:ID_DIGITS]
 
     def is_due(self, step: int) -> bool:
         """Whether the checkpoint of this step is evaluated."""
