@@ -1,10 +1,17 @@
-"""For all tests: nothing is looked for on the Hugging Face Hub; workers fork from one server."""
+"""For all tests: no access to the Hub; workers fork from one server; fixtures that several rooms use."""
 
+import contextlib
 import os
+import shutil
 import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+from tests.tasks.sample import SAMPLED_TASKS
 
 # Read when huggingface_hub is imported.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -34,3 +41,125 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
         connect(self, address)
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that takes `sampled_task` on every task of the catalogue."""
+    if "sampled_task" in metafunc.fixturenames:
+        metafunc.parametrize("sampled_task", SAMPLED_TASKS)
+
+
+@pytest.fixture(scope="session")
+def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vla_eval.data.dataset_folder import digest_files
+    from vla_eval.data.manifest import (
+        FAILED_FILE,
+        MANIFEST_FILE,
+        MIKASA_FOLDER,
+        RECORDING_FILE,
+        DatasetFacts,
+        FailedSeed,
+        RecordedEpisode,
+        encode_actions,
+        write_entry,
+        write_lines,
+    )
+    from vla_eval.testing.synthetic import write_synthetic_dataset
+
+    root = write_synthetic_dataset(
+        tmp_path_factory.mktemp("recorded") / "RememberColor3-v0", n_episodes=4, n_frames=13
+    )
+    (root / MIKASA_FOLDER).mkdir()
+    lengths = [13, 14, 15, 13]
+    episodes = [
+        RecordedEpisode(
+            episode_index=index,
+            task="RememberColor3-v0",
+            task_version=1,
+            env_kwargs={},
+            seed=1000 + index + (index >= 2),  # 1002 failed
+            instruction="look, wait, choose",
+            expert="oracle",
+            expert_version=1,
+            cue_steps=5,
+            delay_steps=5,
+            n_steps=n_steps,
+            success_step=n_steps,
+            actions=encode_actions(np.zeros((n_steps, 7), np.float32)),
+            intended_actions=None,
+            states_sha256="0" * 64,
+            images_sha256={},
+        )
+        for index, n_steps in enumerate(lengths)
+    ]
+    write_lines(root / MANIFEST_FILE, episodes)
+    write_lines(root / FAILED_FILE, [FailedSeed(seed=1002, n_steps=60)])
+    facts = DatasetFacts(
+        complete=True,
+        name="tiny",
+        task="RememberColor3-v0",
+        task_version=1,
+        instruction="look, wait, choose",
+        state="eef",
+        n_episodes=4,
+        n_frames=sum(lengths),
+        n_failed_seeds=1,
+        recipe={"name": "tiny", "keep": "successes", "cut": "after_success", "steps_after_success": 5},
+        recipe_sha256="1" * 64,
+        recipe_files={"policies/oracle": "2" * 64},
+        environment={},
+        device={"simulator": "fake"},
+        files=digest_files(root),
+    )
+    write_entry(root / RECORDING_FILE, facts)
+    return root
+
+
+@pytest.fixture
+def recorded(_recorded: Path, tmp_path: Path) -> Path:
+    """Return a copy of a dataset that counts as recorded: 4 episodes of 13, 14, 15, 13 frames."""
+    copy = tmp_path / "recorded" / _recorded.name
+    shutil.copytree(_recorded, copy)
+    return copy
+
+
+@pytest.fixture
+def small_act() -> Iterator[None]:
+    """ACT with a small network as its vision encoder: most of a training's time went there."""
+    from vla_eval.testing.tiny_models import tiny_resnet
+
+    with tiny_resnet():
+        yield
+
+
+@pytest.fixture
+def small_act_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same in worker processes, which have to import lerobot for it."""
+    from vla_eval.evaluation import evaluate
+    from vla_eval.testing.tiny_models import tiny_worker_main
+
+    monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
+
+
+@pytest.fixture
+def killed_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[int], contextlib.AbstractContextManager[None]]:
+    """Training stops at a step: nothing is written after the last checkpoint before, as with kill -9."""
+    from vla_eval.training import loop
+
+    class Killed(BaseException):
+        pass
+
+    @contextlib.contextmanager
+    def killed(step: int) -> Iterator[None]:
+        def seed_step(run_seed: int, at: int, process: int, original: Any = loop.seed_step) -> None:
+            if at == step:
+                raise Killed
+            original(run_seed, at, process)
+
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(loop, "seed_step", seed_step)
+            yield
+
+    return killed

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.json_cases import BYTES, VALUES, accepted_or_refused, as_bytes, near
-from tests.unit.run_records import describe
-from tests.unit.test_strict_records import CONFIG, RECORD, VALID
+from tests.storage.run_records import describe
+from tests.storage.test_strict_records import CONFIG, RECORD, VALID
 from vla_eval.cli.main import main
 from vla_eval.records import EpisodeTiming
 from vla_eval.results.report import build_table, render

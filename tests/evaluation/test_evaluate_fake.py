@@ -1,0 +1,198 @@
+"""Whole runs on the fake simulator: the same lines however they are run, resumed as what they were."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.evaluation import evaluation_bench
+from tests.evaluation.evaluation_bench import TASK, Bench
+from vla_eval.cli.main import main
+from vla_eval.errors import RunChangedError
+from vla_eval.evaluation.evaluate import default_run_folder
+from vla_eval.storage.run_folder import read_run
+
+bench = evaluation_bench.bench
+
+
+# ------------------------------------------------------------------------------------------ side by side
+
+
+class TestSlots:
+    def test_records_do_not_depend_on_how_many_episodes_run_side_by_side(self, bench: Bench) -> None:
+        bench.write_policy("pair_policy:make")
+
+        bench.run("alone", runs=2)
+        bench.run("beside", runs=2, slots_per_worker=4)
+
+        assert len(bench.lines("alone")) == 12
+        assert bench.lines("beside") == bench.lines("alone")
+        # 12 control steps each: 12 episodes one by one; then, per run, 4 side by side and 2 side by side.
+        passes = (bench.folder / "passes").read_text().split()
+        assert passes == ["1"] * 12 * 12 + (["4"] * 12 + ["2"] * 12) * 2
+
+    def test_an_error_is_the_error_of_one_episode_and_not_of_its_neighbours(self, bench: Bench) -> None:
+        bench.write_policy("pair_policy:make")
+        bench.run("alone")
+        bench.write_policy("pair_policy:make", fails_at=3)
+
+        summary = bench.run("beside", slots_per_worker=4)
+
+        records = bench.records("beside")
+        assert (summary.n_errors, summary.n_open) == (1, 1)
+        assert {seed for seed, record in records.items() if record.error is not None} == {3}
+        bench.mend()
+        assert bench.run("beside", slots_per_worker=4).n_open == 0
+        assert bench.lines("beside") == bench.lines("alone")
+
+    def test_a_run_is_not_continued_with_another_number_of_slots(self, bench: Bench) -> None:
+        bench.run("out")
+        with pytest.raises(RunChangedError, match="slots_per_worker"):
+            bench.run("out", slots_per_worker=2)
+
+
+# ------------------------------------------------------------------------------------------ sameness
+
+
+class TestSameness:
+    def test_any_number_of_workers_gives_the_same_lines(self, bench: Bench) -> None:
+        fields: dict[str, Any] = {
+            "tasks": [TASK, "InterceptMedium-v0"],
+            "policies": [str(bench.folder / "night.yaml"), "random"],
+            "n_action_steps": [1, 3],
+            "runs": 2,
+            "env": {"horizon_steps": 12},
+        }
+        bench.run("one", workers=1, **fields)
+        bench.run("two", workers=2, **fields)
+
+        # 2 tasks x 2 policies x 2 K x 2 runs x 6 seeds
+        assert len(bench.lines("one")) == 96
+        assert bench.lines("one") == bench.lines("two")
+
+    def test_pictures_change_nothing_but_the_device_is_noted(self, bench: Bench) -> None:
+        bench.run("blind")
+        bench.write_policy(cameras=["base_camera"])
+        bench.run("seeing")
+
+        assert bench.lines("blind") == bench.lines("seeing")
+        assert read_run(bench.folder / "seeing").description.environment["device"] == {"simulator": "fake"}
+
+    def test_runs_differ_for_a_policy_that_draws_by_run(self, bench: Bench) -> None:
+        bench.run("out", runs=2, episodes=1)
+
+        digests = {record.trajectory_sha256 for record in read_run(bench.folder / "out").records}
+        assert len(digests) == 2
+
+    def test_the_record_s_policy_is_the_recipe_s_name(self, bench: Bench) -> None:
+        bench.run("out", episodes=1)
+
+        assert bench.records("out")[1].policy == "night"
+
+    def test_scripted_controls_do_on_the_fake_what_they_are_for(self, bench: Bench) -> None:
+        bench.run("out", policies=["oracle", "random"], episodes=5, env={})
+
+        rates = {
+            policy: [r.success_once for r in read_run(bench.folder / "out").records if r.policy == policy]
+            for policy in ("oracle", "random")
+        }
+        assert rates["oracle"] == [True] * 5
+        assert rates["random"] == [False] * 5
+
+
+# ------------------------------------------------------------------------------------------ resume
+
+
+class TestResume:
+    def test_a_finished_run_is_not_run_again(self, bench: Bench) -> None:
+        bench.run("out")
+        before = bench.worker_pids()
+
+        summary = bench.run("out")
+
+        assert summary.n_open == 0
+        assert bench.worker_pids() == before
+
+    def test_a_changed_configuration_is_refused(self, bench: Bench) -> None:
+        bench.run("out")
+
+        with pytest.raises(RunChangedError, match="episodes"):
+            bench.run("out", episodes=7)
+
+    def test_a_changed_recipe_is_refused(self, bench: Bench) -> None:
+        bench.run("out")
+        bench.write_policy(pause=0.001)
+
+        with pytest.raises(RunChangedError, match="policies/night"):
+            bench.run("out")
+
+    def test_options_may_change(self, bench: Bench) -> None:
+        bench.run("out")
+
+        assert bench.run("out", workers=2, timeouts={"step_seconds": 9.0}).n_open == 0
+
+    def test_the_default_folder_is_that_of_the_configuration(self, bench: Bench) -> None:
+        first, same = default_run_folder(bench.config()), default_run_folder(bench.config(workers=2))
+        other = default_run_folder(bench.config(episodes=7))
+
+        assert first == same != other
+        assert first.parent == Path("runs")
+        assert first.name.startswith("test-")
+
+
+# ------------------------------------------------------------------------------------------ command line
+
+
+class TestCommandLine:
+    def test_standard_output_carries_the_table_alone(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(bench.folder)
+
+        code = main(["eval", "demo", "--episodes", "2", "--set", "simulator=fake", "--format", "json"])
+
+        out, err = capsys.readouterr()
+        assert code == 0
+        # 2 tasks x 3 policies
+        assert len(json.loads(out)["rows"]) == 6
+        assert "12 episodes, 0 of them finished before" in err
+
+    def test_a_second_run_prints_the_same_table_and_runs_nothing(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(bench.folder)
+        command = [
+            "eval",
+            "--task",
+            TASK,
+            "--policy",
+            "night.yaml",
+            "--episodes",
+            "3",
+            "--set",
+            "simulator=fake",
+        ]
+        assert main(command) == 0
+        first = capsys.readouterr()
+
+        assert main(command) == 0
+
+        second = capsys.readouterr()
+        assert second.out == first.out
+        assert "all 3 episodes are there" in second.err
+        assert len(list((bench.folder / "runs").iterdir())) == 1
+
+    def test_episodes_that_ended_in_an_error_have_an_exit_code_of_their_own(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bench.write_policy(faults={"2": "raise"})
+        command = ["eval", "--task", TASK, "--policy", str(bench.folder / "night.yaml"), "--episodes", "3"]
+        command += ["--out", str(bench.folder / "out"), "--set", "simulator=fake"]
+
+        code = main(command)
+
+        err = capsys.readouterr().err
+        assert code == 3
+        assert f"error: night on {TASK}, seed 2, run 0: ZeroDivisionError: a mistake in the policy" in err
+        assert "1 episodes ended in an error" in err

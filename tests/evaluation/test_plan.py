@@ -1,0 +1,156 @@
+"""What an evaluation will run, in which order, and what two runs are compared by."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.config.eval_configs import config
+from vla_eval.config.decoding import decode
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import to_data
+from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
+from vla_eval.evaluation.job_queue import JobQueue
+from vla_eval.evaluation.plan import fingerprint, make_plan, results_config
+from vla_eval.tasks.catalog import TASKS
+
+
+class TestPlan:
+    def test_every_episode_is_planned_once(self) -> None:
+        plan = make_plan(
+            config(
+                tasks=["RememberColor3-v0", "ShellGameTouch-v0"], n_action_steps=[1, 4], episodes=3, runs=2
+            )
+        )
+
+        keys = [job.key for job in plan.jobs]
+        # 2 tasks x 1 policy x 2 K x 2 runs x 3 seeds
+        assert len(keys) == len(set(keys)) == 24
+        assert keys[0] == ("RememberColor3-v0", "random", 1, 0, 1)
+        assert keys[-1] == ("ShellGameTouch-v0", "random", 4, 1, 3)
+
+    def test_a_policy_that_needs_candidates_is_left_out_where_there_are_none(self) -> None:
+        plan = make_plan(
+            config(tasks=["RememberColor3-v0", "InterceptMedium-v0"], policies=["random", "tour"], episodes=1)
+        )
+
+        assert [job.key[:2] for job in plan.jobs] == [
+            ("RememberColor3-v0", "random"),
+            ("RememberColor3-v0", "tour"),
+            ("InterceptMedium-v0", "random"),
+        ]
+        assert plan.left_out == ("tour on InterceptMedium-v0: it needs candidates, and this task has none",)
+
+    def test_a_policy_s_own_n_action_steps_holds_where_none_is_named(self, tmp_path: Path) -> None:
+        recipe = tmp_path / "eight.yaml"
+        recipe.write_text("version: 1\ndescription: d\nadapter: random\ndefault_n_action_steps: 8\n")
+
+        plan = make_plan(config(policies=[str(recipe)], episodes=1))
+
+        assert [job.key.n_action_steps for job in plan.jobs] == [8]
+        assert [job.key.policy for job in plan.jobs] == ["eight"]
+
+    def test_an_unknown_task_is_refused_before_anything_runs(self) -> None:
+        with pytest.raises(UnknownNameError, match="Did you mean 'RememberColor3-v0'"):
+            make_plan(config(tasks=["RememberColour3-v0"]))
+
+    def test_a_task_without_instruction_is_refused_before_anything_runs(self, tmp_path: Path) -> None:
+        prompts = tmp_path / "own.yaml"
+        prompts.write_text("version: 1\ndescription: d\nsource: s\ninstructions: {ShellGameTouch: [go]}\n")
+
+        with pytest.raises(MissingInstructionError, match=r"own\.yaml: RememberColor3-v0 .*'RememberColor'"):
+            make_plan(config(prompt_set=str(prompts)))
+
+    def test_a_name_that_no_record_may_have_is_refused_before_anything_runs(self, tmp_path: Path) -> None:
+        recipe = tmp_path / "a\\b.yaml"
+        recipe.write_text("version: 1\ndescription: d\nadapter: random\n")
+
+        with pytest.raises(RecipeError, match=r"the file is called 'a\\\\b'.*Rename the file"):
+            make_plan(config(policies=[str(recipe)]))
+
+    def test_an_instruction_in_env_is_refused_because_no_policy_would_see_it(self) -> None:
+        with pytest.raises(RecipeError, match="prompt_set"):
+            make_plan(config(env={"instruction": "go"}))
+
+    def test_only_what_moves_a_result_is_compared(self) -> None:
+        base = config()
+
+        same = config(workers=3, timeouts={"step_seconds": 1.0}, max_consecutive_errors=2, description="d")
+        assert fingerprint(same) == fingerprint(base)
+        for field, value in {
+            "episodes": 5,
+            "env": {"a": 1},
+            "prompt_set": "p",
+            "render": {"wrist_mesh": "simplified"},
+        }.items():
+            assert fingerprint(config(**{field: value})) != fingerprint(base), field
+        assert {"workers", "timeouts", "name"}.isdisjoint(results_config(base))
+
+    def test_plain_data_can_be_decoded_again(self) -> None:
+        original = config(n_action_steps=[1, 2], env={"velocity_range_m_s": [0.1, 0.2]})
+
+        assert decode(EvalConfig, to_data(original), where="x") == original
+
+
+class TestQueue:
+    def test_the_first_episode_of_each_group_comes_first(self) -> None:
+        plan = make_plan(config(policies=["random", "hold"], episodes=3))
+        queue = JobQueue(plan.jobs, finished=())
+
+        order = []
+        loaded = None
+        while batch := queue.take(loaded):
+            loaded = batch.group.key
+            order += [(job.key.policy, job.key.seed) for job in batch.jobs]
+
+        assert order == [("random", 1), ("hold", 1), ("hold", 2), ("hold", 3), ("random", 2), ("random", 3)]
+
+    def test_a_worker_takes_a_group_that_nobody_has_loaded(self) -> None:
+        plan = make_plan(config(policies=["random", "hold"], episodes=3))
+        first, _, _, other, *_ = plan.jobs
+        queue = JobQueue(plan.jobs, finished={first.key, other.key})
+
+        batch = queue.take(None, taken={first.group.key})
+
+        assert batch is not None
+        assert batch.group.key == other.group.key
+
+    def test_finished_episodes_are_not_handed_out(self) -> None:
+        plan = make_plan(config(episodes=3))
+        queue = JobQueue(plan.jobs, finished={plan.jobs[1].key})
+
+        assert queue.n_batches == 2
+        batches = [batch for batch in iter(lambda: queue.take(None), None) if batch]
+        assert [[job.seed for job in batch.jobs] for batch in batches] == [[1], [3]]
+
+    def test_a_slot_is_the_seeds_own_whoever_else_is_in_the_batch(self) -> None:
+        plan = make_plan(config(episodes=5, slots_per_worker=3))
+        queue = JobQueue(plan.jobs, finished={plan.jobs[1].key})
+
+        batches = [batch for batch in iter(lambda: queue.take(None), None) if batch]
+
+        # Seeds 1 … 5 have the slots 0 1 2 0 1; seed 2 is finished.
+        assert [[(job.seed, job.slot) for job in batch.jobs] for batch in batches] == [
+            [(1, 0), (3, 2)],
+            [(4, 0), (5, 1)],
+        ]
+
+    def test_a_batch_that_failed_comes_again_one_by_one(self) -> None:
+        queue = JobQueue(make_plan(config(episodes=4, slots_per_worker=2)).jobs, finished=())
+        failed = queue.take(None)
+        assert failed is not None
+
+        queue.put_back_alone(failed)
+
+        assert (queue.n_batches, queue.n_episodes) == (3, 4)
+        order = [[job.seed for job in batch.jobs] for batch in iter(lambda: queue.take(None), None) if batch]
+        assert order == [[1], [2], [3, 4]]
+
+    def test_one_slot_leaves_no_trace_in_what_runs_are_compared_by(self) -> None:
+        assert "slots_per_worker" not in results_config(config())
+        assert results_config(config(slots_per_worker=2))["slots_per_worker"] == 2
+
+
+def test_every_task_has_its_instruction_in_the_paper_s_prompts() -> None:
+    plan = make_plan(config(tasks=list(TASKS), episodes=1))
+
+    assert all(job.group.instruction for job in plan.jobs)

@@ -1,0 +1,105 @@
+"""A report quotes the shipped audit for the tasks that it shows, and for nothing that was not audited."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.results.stored_runs import episodes, stored
+from vla_eval.audit.audit_text import render_audit
+from vla_eval.audit.evaluations import Counts, TaskAudit, verdict
+from vla_eval.results import shipped_audit as audited
+from vla_eval.results.audit_notes import audit_notes
+from vla_eval.results.shipped_audit import STRICT, protocol_of, shipped_verdicts
+from vla_eval.storage.run_folder import StoredRun
+from vla_eval.tasks.catalog import TASKS
+
+COLOR, SHELL = "RememberColor3-v0", "ShellGameTouch-v0"
+
+
+def audit(task: str, *words: str, protocol: audited.AuditProtocol = "paper", version: int = 1) -> TaskAudit:
+    won = Counts(n_episodes=30, success_once=30, success_at_end=30, first_choice=30, chance=0.3)
+    return TaskAudit(
+        task=task,
+        version=version,
+        protocol=protocol,
+        chance=0.3,
+        counts={"oracle": won},
+        verdict=words,
+        n_errors=0,
+    )
+
+
+@pytest.fixture(autouse=True)
+def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An audit of three rows ships, as the command writes it."""
+    rows = [
+        audit(COLOR, "can be toured", "body can store the cue"),
+        audit(COLOR, "needs memory", protocol="strict"),
+        audit(SHELL, "can be toured", "won by staying at the cue", version=99),
+    ]
+    monkeypatch.setattr(audited, "FILE", tmp_path / "shipped_audit.json")
+    audited.FILE.write_text(render_audit(rows, "json"), encoding="utf-8")
+    shipped_verdicts.cache_clear()
+    yield
+    shipped_verdicts.cache_clear()
+
+
+def run_of(task: str, **config: object) -> StoredRun:
+    return stored(episodes("oracle", "+", task=task), **config)
+
+
+def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -> None:
+    (note,) = audit_notes([run_of(COLOR), run_of(COLOR, env={})])
+    assert note.startswith("shortcut audit under the paper's rule, 30 episodes per control: ")
+    assert f"{COLOR}: can be toured, body can store the cue" in note
+
+
+def test_a_strict_run_gets_the_strict_verdict() -> None:
+    (note,) = audit_notes([run_of(COLOR, env={"freeze_until_choice": True, "strict_choice": True})])
+    assert "under the strict rule" in note
+    assert f"{COLOR}: needs memory" in note
+
+
+@pytest.mark.parametrize(
+    ("env", "expected"),
+    [
+        ({}, "paper"),
+        (dict(STRICT), "strict"),
+        ({"freeze_until_choice": True, "strict_choice": True}, "strict"),
+        ({"freeze_until_choice": True}, None),
+        ({"freeze_until_choice": True, "phase_gate_success": True}, None),
+        ({**STRICT, "delay_steps": 20}, None),
+        ({**STRICT, "strict_choice": False}, None),
+        ({"delay_steps": 20}, None),
+    ],
+)
+def test_only_the_very_arguments_of_the_strict_rule_are_the_strict_rule(
+    env: dict[str, object], expected: str | None
+) -> None:
+    assert protocol_of(env) == expected
+
+
+def test_nothing_is_said_of_what_was_not_audited() -> None:
+    others = [
+        run_of(COLOR, env={"delay_steps": 20}),
+        run_of(COLOR, simulator="fake"),
+        run_of(SHELL),  # audited in another version
+        run_of("RememberColor5-v0"),
+    ]
+    assert audit_notes(others) == []
+
+
+def test_the_audit_that_ships_is_of_present_tasks_and_in_the_docs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    shipped_verdicts.cache_clear()
+    rows = json.loads(audited.FILE.read_text(encoding="utf-8"))
+    counted = [{**row, "counts": {name: Counts(**c) for name, c in row["counts"].items()}} for row in rows]
+    audits = [TaskAudit(**row) for row in counted]
+    assert {audit.task for audit in audits} <= set(TASKS)
+    for one in audits:
+        assert shipped_verdicts()[one.task, one.protocol].words == tuple(one.verdict)
+        assert verdict(one.counts, one.chance) == tuple(one.verdict)  # nobody has edited it
+    docs = Path(__file__).parents[2] / "docs" / "audit.md"
+    assert render_audit(audits, "markdown") in docs.read_text(encoding="utf-8")
