@@ -9,6 +9,7 @@ import difflib
 from collections.abc import Collection, Iterable
 
 MAX_SHOWN = 200  # characters of what the user wrote that a message repeats
+MAX_NAMED = 6  # items of a list that a message names
 
 
 class VlaEvalError(Exception):
@@ -97,6 +98,13 @@ class TrainingError(VlaEvalError):
 
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
+
+
+def some_of(items: Iterable[object]) -> str:
+    """Return the first items of a list, with commas, and how many more there are."""
+    names = [str(item) for item in items]
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -199,7 +199,7 @@ def test_runs_differ_for_a_blind_arm_and_seeds_alone_decide_within_a_run() -> No
         policy.reset(
             [EpisodeStart(slot=0, task="t", seed=5, run=run_index, instruction="x", horizon_steps=60)]
         )
-        orders.append(list(policy._order[0]))  # type: ignore[attr-defined]
+        orders.append(list(policy._drawn[0]))  # type: ignore[attr-defined]
     assert orders[0] == orders[2] != orders[1]
 
 

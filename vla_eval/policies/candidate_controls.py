@@ -38,64 +38,19 @@ class VisitExpert(Protocol):
         """Return (n_actions, 7) that touch the wanted candidates, in their order or in any."""
 
 
-class ChoicePolicy(ScriptedPolicy):
-    """Goes to candidates: the right one, one drawn uniformly, or one after another."""
-
-    privileged = True
-    states = ("qvel",)
-
-    def __init__(self, context: PolicyContext, expert: CandidateExpert, mode: Mode) -> None:
-        super().__init__(context)
-        self._expert = expert
-        self._mode = mode
-        self._order: dict[int, list[int]] = {}
-
-    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Decide, without looking, where a blind arm goes (first)."""
-        super().reset(episodes)
-        for episode in episodes:
-            order = self._rng[episode.slot].permutation(self._context.n_candidates)
-            self._order[episode.slot] = [int(i) for i in order]
-
-    def act(self, window: ObservationWindow) -> ActionChunk:
-        """Hold until the choice can be made, then go."""
-        state = self.privileged_state(window)
-        if state.phase != "response":
-            return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
-        candidate = self._candidate(window, state)
-        return ActionChunk(actions=self._expert.plan(state, candidate, self._n_actions))
-
-    def _candidate(self, window: ObservationWindow, state: PrivilegedState) -> int:
-        if self._mode == "oracle":
-            assert state.target is not None  # the policy is only made for tasks with candidates
-            return state.target
-        order = self._order[window.slot]
-        if self._mode == "tour" and len(order) > 1 and self._touches(window, state, order[0]):
-            here = state.candidate_positions_m[order.pop(0)]
-            order.sort(key=lambda i: float(np.linalg.norm(state.candidate_positions_m[i] - here)))
-        return order[0]
-
-    def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:
-        at_rest = bool(np.abs(window.last.state["qvel"][:-2]).max() <= STATIC_RAD_S)
-        return at_rest and self._expert.is_done(state, candidate)
-
-
-class VisitPolicy(ScriptedPolicy):
-    """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
-
-    A blind arm knows how many were shown, and draws which ones, and their order, before it sees anything.
-    """
+class _CandidateArm[Expert](ScriptedPolicy):
+    """Holds until the choice can be made. A blind arm draws its order before it sees anything."""
 
     privileged = True
 
-    def __init__(self, context: PolicyContext, expert: VisitExpert, mode: Mode) -> None:
+    def __init__(self, context: PolicyContext, expert: Expert, mode: Mode) -> None:
         super().__init__(context)
         self._expert = expert
         self._mode = mode
         self._drawn: dict[int, list[int]] = {}
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Decide, without looking, where a blind arm goes."""
+        """Decide, without looking, where a blind arm goes (first)."""
         super().reset(episodes)
         for episode in episodes:
             order = self._rng[episode.slot].permutation(self._context.n_candidates)
@@ -106,9 +61,46 @@ class VisitPolicy(ScriptedPolicy):
         state = self.privileged_state(window)
         if state.phase != "response":
             return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
+        return ActionChunk(actions=self._go(window, state))
+
+    def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
+        """Return (n_actions, 7): the way to the candidate or candidates."""
+        raise NotImplementedError
+
+
+class ChoicePolicy(_CandidateArm[CandidateExpert]):
+    """Goes to candidates: the right one, one drawn uniformly, or one after another."""
+
+    states = ("qvel",)
+
+    def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
+        return self._expert.plan(state, self._candidate(window, state), self._n_actions)
+
+    def _candidate(self, window: ObservationWindow, state: PrivilegedState) -> int:
+        if self._mode == "oracle":
+            assert state.target is not None  # the policy is only made for tasks with candidates
+            return state.target
+        order = self._drawn[window.slot]
+        if self._mode == "tour" and len(order) > 1 and self._touches(window, state, order[0]):
+            here = state.candidate_positions_m[order.pop(0)]
+            order.sort(key=lambda i: float(np.linalg.norm(state.candidate_positions_m[i] - here)))
+        return order[0]
+
+    def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:
+        at_rest = bool(np.abs(window.last.state["qvel"][:-2]).max() <= STATIC_RAD_S)
+        return at_rest and self._expert.is_done(state, candidate)
+
+
+class VisitPolicy(_CandidateArm[VisitExpert]):
+    """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
+
+    A blind arm knows how many were shown, and draws which ones, and their order.
+    """
+
+    def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
         wanted, in_order = self._itinerary(window.slot, state)
         left = [candidate for candidate in wanted if candidate not in state.touched_candidates]
-        return ActionChunk(actions=self._expert.plan_visits(state, left, self._n_actions, in_order=in_order))
+        return self._expert.plan_visits(state, left, self._n_actions, in_order=in_order)
 
     def _itinerary(self, slot: int, state: PrivilegedState) -> tuple[list[int], bool]:
         """Return the candidates to touch, and whether in this order."""

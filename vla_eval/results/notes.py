@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
+from vla_eval.errors import MAX_NAMED, some_of
 from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
 from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
 from vla_eval.results.success_table import Row
@@ -12,7 +13,6 @@ from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
-MAX_NAMED = 6
 RENDERER = "device.render_"
 VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
@@ -54,7 +54,7 @@ def _interval_notes(rows: Sequence[Row]) -> list[str]:
     without_spread = [row for row in rows if row.n_runs > 1 and row.sem == 0]
     if without_spread:
         notes.append(
-            f"SEM is exactly 0 for {_names(_shown(row) for row in without_spread)}: all runs have the same "
+            f"SEM is exactly 0 for {some_of(_shown(row) for row in without_spread)}: all runs have the same "
             "rate. Scripted deterministic controls do not vary between runs, and more runs of them add "
             "nothing. Their interval is Wilson's over the episodes of one run."
         )
@@ -82,7 +82,7 @@ def comparison_notes(
         if row.baseline_n_action_steps not in (None, row.n_action_steps)
     ]
     if other_k:
-        notes.append(f"compared with {baseline} at another n_action_steps: {_names(other_k)}.")
+        notes.append(f"compared with {baseline} at another n_action_steps: {some_of(other_k)}.")
     return notes
 
 
@@ -101,7 +101,7 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
     )
     if missing:
         notes.append(
-            f"chance is unknown for {_names(missing)}: it has to be measured there; run `cue_blind` at the "
+            f"chance is unknown for {some_of(missing)}: it has to be measured there; run `cue_blind` at the "
             "same n_action_steps."
         )
     return notes
@@ -118,7 +118,7 @@ def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None])
     if not vague:
         return []
     return [
-        f"chance is imprecise for {_names(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
+        f"chance is imprecise for {some_of(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
         "interval in brackets). The corrected score is computed from it."
     ]
 
@@ -205,7 +205,7 @@ def _incomplete(run: StoredRun) -> list[str]:
         return []
     parts = (f"{group}: {n} of {expected}" for group, n in missing.items())
     return [
-        f"{run.path} is incomplete (episodes done, of how many): {_names(parts)}. Run the same command "
+        f"{run.path} is incomplete (episodes done, of how many): {some_of(parts)}. Run the same command "
         "again to resume."
     ]
 
@@ -237,7 +237,7 @@ def _continued_elsewhere(run: StoredRun) -> list[str]:
         return []
     return [
         f"{run.path} was resumed in another environment (--allow-environment-change); what changed: "
-        f"{_names(changed)}."
+        f"{some_of(changed)}."
     ]
 
 
@@ -252,7 +252,7 @@ def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
     differing = [name for name, values in found.items() if len(set(values)) > 1]
     if not differing:
         return []
-    return [f"the run folders were made in different environments; what differs: {_names(differing)}."]
+    return [f"the run folders were made in different environments; what differs: {some_of(differing)}."]
 
 
 def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
@@ -265,7 +265,7 @@ def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
     if not differing:
         return []
     return [
-        f"the run folders were made with different contents of {_names(differing)}; rows of the same name "
+        f"the run folders were made with different contents of {some_of(differing)}; rows of the same name "
         "are combined anyway."
     ]
 
@@ -285,12 +285,6 @@ def _shown(row: Row) -> str:
 def _place(row: Row) -> str:
     variant = f" ({row.variant})" if row.variant else ""
     return f"{row.task} K={row.n_action_steps}{variant}"
-
-
-def _names(items: Iterable[str]) -> str:
-    names = list(items)
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
 
 
 def _unique(items: Iterable[str]) -> list[str]:

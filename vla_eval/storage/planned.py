@@ -8,10 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import PurePath
 from typing import Any
 
+from vla_eval.errors import some_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.strict_json import Count, Positive, Source, as_dataclass
-
-MAX_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,11 +71,11 @@ class PlannedEpisodes:
         key, task = record.key, record.task
         tasks = _known(config.task_versions, config.tasks)
         if tasks is not None and task not in tasks:
-            return f"the tasks are {_names(tasks)}"
+            return f"the tasks are {some_of(tasks)}"
         if config.policy_names is not None and key.policy not in config.policy_names:
-            return f"the policies are {_names(config.policy_names)}"
+            return f"the policies are {some_of(config.policy_names)}"
         if config.n_action_steps is not None and key.n_action_steps not in config.n_action_steps:
-            return f"n_action_steps are {_names(config.n_action_steps)}"
+            return f"n_action_steps are {some_of(config.n_action_steps)}"
         if self.groups is not None and key[:3] not in self.groups:
             return "no such policy is run on this task with these n_action_steps"
         if config.runs is not None and key.run >= config.runs:
@@ -97,9 +96,3 @@ def _known(versions: Mapping[str, int] | None, tasks: Collection[str] | None) ->
     if versions is not None:
         return versions
     return None if tasks is None else [bare_name(task) for task in tasks]
-
-
-def _names(items: Collection[object]) -> str:
-    names = [str(item) for item in items]
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
