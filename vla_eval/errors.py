@@ -96,6 +96,26 @@ class TrainingError(VlaEvalError):
     """A fine-tuning cannot be started, continued, or has gone wrong."""
 
 
+class RemotePolicyError(VlaEvalError):
+    """Root of what goes wrong with a policy behind a socket."""
+
+
+class RemoteConnectionError(RemotePolicyError):
+    """There is no server at the address, it refused, or the connection was lost."""
+
+
+class RemoteTimeoutError(RemotePolicyError):
+    """No reply came in time. The connection is then closed: a late reply would be taken for the next one."""
+
+
+class RemoteReplyError(RemotePolicyError):
+    """A server replied with an error, or with something else than what was asked."""
+
+
+class RemoteChangedError(RemotePolicyError):
+    """A server is not what it was when the run was planned."""
+
+
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 

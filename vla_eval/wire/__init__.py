@@ -1,0 +1,1 @@
+"""Bytes and messages of a policy behind a socket. Knows no policy, no simulator and no evaluation."""

@@ -1,0 +1,250 @@
+"""Messages as msgpack with numpy arrays, as openpi's client and server write them.
+
+This file runs with Python 3.8, numpy 1.22 and msgpack 1.0, and imports nothing else: `mikasa_vla_client`
+ships it, too. What arrives may be anything: it is read, or refused with a `CodecError`.
+
+An array is a map `{b"__ndarray__": True, b"data": bytes, b"dtype": "<f4", b"shape": (2, 3)}`, a numpy scalar
+`{b"__npgeneric__": True, b"data": 1.5, b"dtype": "<f4"}`. The keys may also be text, as others write them.
+
+Source: https://github.com/Physical-Intelligence/openpi/blob/15a9616a00943ada6c20a0f158e3adb39df2ccac/
+packages/openpi-client/src/openpi_client/msgpack_numpy.py (the format; the code is not used).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any  # Any: a message may hold anything that msgpack can
+
+import msgpack
+import numpy as np
+
+MAX_MESSAGE_BYTES = 64 * 2**20
+MAX_DEPTH = 16  # maps and lists inside each other; an observation has 3
+MAX_ITEMS = 1_000_000  # of all maps and lists of a message together: an item takes up to 64 bytes of memory
+MAX_ARRAY_DIMS = 16
+
+ARRAY, SCALAR = "__ndarray__", "__npgeneric__"
+KINDS = "biufSU"  # bool, integers, floats, bytes, text: no objects, no records, no complex numbers, no times
+_DTYPE = re.compile(r"[<>|=]?[a-zA-Z?][0-9]{0,9}")
+_MAX_CODE_POINT = 0x10FFFF
+
+
+class CodecError(ValueError):
+    """A message cannot be written or read."""
+
+
+# ------------------------------------------------------------------------------------------ write
+
+
+def packb(message: Any) -> bytes:
+    """Return a message as bytes.
+
+    Args:
+        message: maps with text as keys, lists, tuples, text, bytes, numbers, None, numpy arrays and scalars.
+
+    Raises:
+        CodecError: it holds something else, or is too large.
+    """
+    try:
+        data = msgpack.packb(_plain(message, 0), use_bin_type=True)
+    except CodecError:
+        raise
+    except (ValueError, OverflowError, TypeError, MemoryError) as exc:
+        raise CodecError(f"the message cannot be packed: {exc!s:.200}") from exc
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise CodecError(_too_large(len(data)))
+    return bytes(data)
+
+
+def _plain(value: Any, depth: int) -> Any:
+    """Return what msgpack itself can write."""
+    if depth >= MAX_DEPTH and isinstance(value, (dict, list, tuple)):
+        raise CodecError(f"nesting of more than {MAX_DEPTH} levels")
+    if isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                raise CodecError(f"expected text as the key of a map, found {key!r:.80}")
+        return {key: _plain(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, depth + 1) for item in value]
+    if isinstance(value, np.ndarray):
+        _check_kind(value.dtype)
+        if value.nbytes > MAX_MESSAGE_BYTES:
+            raise CodecError(_too_large(value.nbytes))
+        # `tobytes` writes C order, whatever the order in memory.
+        return {
+            ARRAY.encode(): True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": list(value.shape),
+        }
+    if isinstance(value, np.generic):
+        _check_kind(value.dtype)
+        return {SCALAR.encode(): True, b"data": value.item(), b"dtype": value.dtype.str}
+    if value is None or isinstance(value, (bool, int, float, str, bytes)):
+        return value
+    raise CodecError(f"expected plain data or arrays, found {type(value).__name__}")
+
+
+# ------------------------------------------------------------------------------------------ read
+
+
+def unpackb(data: Any) -> Any:
+    """Return the message that bytes hold; arrays in it are new, writable and in this machine's byte order.
+
+    Args:
+        data: bytes, or another buffer.
+
+    Raises:
+        CodecError: it is no such message, or a message that is refused.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise CodecError(_too_large(len(data)))
+    budget = _Budget()
+    try:
+        message = msgpack.unpackb(
+            data,
+            raw=False,
+            strict_map_key=True,  # text or bytes
+            object_pairs_hook=budget.read_map,
+            list_hook=budget.read_list,
+            ext_hook=_refuse_extension,
+        )
+    except CodecError:
+        raise
+    except RecursionError:
+        raise CodecError(f"nesting of more than {MAX_DEPTH} levels") from None
+    except (ValueError, TypeError, OverflowError, MemoryError, msgpack.UnpackException) as exc:
+        raise CodecError(f"the bytes are no message in msgpack: {exc!s:.200}") from exc
+    _check_nesting(message)
+    return message
+
+
+class _Budget:
+    """Builds maps and lists as they are read, and counts their items."""
+
+    def __init__(self) -> None:
+        self._n_items = 0
+
+    def _count(self, n_items: int) -> None:
+        self._n_items += n_items + 1
+        if self._n_items > MAX_ITEMS:
+            raise CodecError(f"more than {MAX_ITEMS} items; expected large data as arrays")
+
+    def read_list(self, items: list[Any]) -> list[Any]:
+        self._count(len(items))
+        return items
+
+    def read_map(self, pairs: list[tuple[Any, Any]]) -> Any:
+        self._count(len(pairs))
+        message: dict[str, Any] = {}
+        for key, value in pairs:
+            name = _text(key)
+            if name in message:
+                raise CodecError(f"the key {name!r:.80} twice in one map")
+            message[name] = value
+        if ARRAY in message:
+            return _read_array(message)
+        return _read_scalar(message) if SCALAR in message else message
+
+
+def _text(key: Any) -> str:
+    if isinstance(key, str):
+        return key
+    try:
+        return bytes(key).decode("utf-8")
+    except UnicodeDecodeError:
+        raise CodecError(f"expected text as the key of a map, found {key!r:.80}") from None
+
+
+def _read_array(fields: dict[str, Any]) -> np.ndarray[Any, Any]:
+    data, shape = fields.get("data"), fields.get("shape")
+    dtype = _read_dtype(fields.get("dtype"))
+    if not isinstance(data, bytes):
+        raise CodecError(f"an array: expected its data as bytes, found {type(data).__name__}")
+    if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in shape):
+        raise CodecError(f"an array: expected its shape as a list of numbers ≥ 0, found {shape!r:.80}")
+    # numpy multiplies the sizes that are not 0, also of an array without elements.
+    if len(shape) > MAX_ARRAY_DIMS or math.prod(n for n in shape if n) * dtype.itemsize > MAX_MESSAGE_BYTES:
+        raise CodecError(f"an array: the shape {shape!r:.80} of {dtype.str} is too large")
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise CodecError(
+            f"an array: expected {math.prod(shape) * dtype.itemsize} bytes for the shape {shape!r:.80} of "
+            f"{dtype.str}, found {len(data)}"
+        )
+    _check_content(data, dtype)
+    array = np.frombuffer(data, dtype=dtype) if data else np.empty(0, dtype=dtype)
+    return array.reshape(shape).astype(dtype.newbyteorder("="))  # `astype` copies
+
+
+def _check_content(data: bytes, dtype: np.dtype[Any]) -> None:
+    """Refuse bytes that no value of this type has, which numpy would not notice."""
+    if dtype.kind == "b" and data and np.frombuffer(data, dtype=np.uint8).max() > 1:
+        raise CodecError("an array: expected 0 or 1 for a bool")
+    if dtype.kind == "U" and data:
+        code_points = np.frombuffer(data, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if code_points.max() > _MAX_CODE_POINT:
+            raise CodecError("an array: expected text, found a number that is no character")
+
+
+def _read_scalar(fields: dict[str, Any]) -> Any:
+    value: Any = fields.get("data")
+    dtype = _read_dtype(fields.get("dtype"))
+    expected: Any = {"b": bool, "i": int, "u": int, "f": (float, int), "S": bytes, "U": str}[dtype.kind]
+    is_number_for_bool = dtype.kind != "b" and isinstance(value, bool)
+    if not isinstance(value, expected) or is_number_for_bool:
+        raise CodecError(f"a numpy scalar of {dtype.str}: found {value!r:.80}")
+    if dtype.kind in "iu" and not np.iinfo(dtype).min <= value <= np.iinfo(dtype).max:
+        raise CodecError(f"a numpy scalar of {dtype.str}: {value} is out of its range")
+    with np.errstate(over="ignore"):  # a large number becomes infinite, as it does in an array
+        return dtype.newbyteorder("=").type(value)
+
+
+def _read_dtype(text: Any) -> np.dtype[Any]:
+    if isinstance(text, bytes):
+        text = text.decode("ascii", errors="replace")
+    # Only names of one simple type: numpy also takes records and shapes in such a text.
+    if not isinstance(text, str) or not _DTYPE.fullmatch(text):
+        raise CodecError(f"an array: expected a dtype like '<f4', found {text!r:.80}")
+    try:
+        dtype = np.dtype(text)
+    except (TypeError, ValueError) as exc:
+        raise CodecError(f"an array: there is no dtype {text!r:.80}") from exc
+    _check_kind(dtype)
+    if dtype.itemsize == 0:
+        raise CodecError(f"an array: the dtype {text!r:.80} has no size")
+    return dtype
+
+
+def _check_kind(dtype: np.dtype[Any]) -> None:
+    if dtype.kind not in KINDS or dtype.hasobject:
+        raise CodecError(
+            f"arrays of dtype {dtype.str!s:.40} are refused; expected bool, integers, floats or text"
+        )
+
+
+def _check_nesting(message: Any) -> None:
+    """Refuse deep nesting, and what is no plain data; without recursion."""
+    level = [message]
+    for _ in range(MAX_DEPTH):
+        below: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                below.extend(value.values())
+            elif isinstance(value, list):
+                below.extend(value)
+            elif isinstance(value, msgpack.Timestamp):
+                raise CodecError("expected plain data or arrays, found a time")
+        level = [value for value in below if isinstance(value, (dict, list, msgpack.Timestamp))]
+        if not level:
+            return
+    raise CodecError(f"nesting of more than {MAX_DEPTH} levels")
+
+
+def _refuse_extension(code: int, _data: bytes) -> Any:
+    raise CodecError(f"expected plain data or arrays, found an extension of msgpack (type {code})")
+
+
+def _too_large(n_bytes: int) -> str:
+    return f"a message of {n_bytes} bytes, expected at most {MAX_MESSAGE_BYTES} (64 MiB)"

@@ -1,0 +1,275 @@
+"""What a policy server says of itself in its first message, and what a client may send it because of that.
+
+A server of openpi's says little or nothing: then a value is unknown, which is not the same as none.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple  # Any: a server may say anything
+
+import numpy as np
+
+from vla_eval.errors import RemoteReplyError
+from vla_eval.strict_json import shown
+
+PROTOCOL = "openpi+1"
+SUPPORTS = ("reset", "observe", "seed", "row")
+
+MAX_ACTIONS = 10_000  # of one reply
+MAX_IMAGE_PX = 4096
+MAX_SERVER_ROWS = 4096
+MAX_COUNT = 2**31
+MAX_NUMBERS_SHOWN = 64  # of an array among what a server says; of a larger one, the digest is recorded
+
+
+class CameraImage(NamedTuple):
+    """How a server wants the image of a camera: the key in a request, and its size, None if unknown."""
+
+    key: str
+    height_px: int | None
+    width_px: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerMetadata:
+    """What a server says of itself and of its policy. None: it does not say.
+
+    Attributes:
+        protocol: `openpi+1` if it is a server of this wire; a field that is None then means: there is none.
+        name: the policy's name.
+        weights_known: whether it says which weights the policy has.
+        weights_sha256: digest of the weights; None for a policy without weights, or if not known.
+        recipe_sha256: digest of the policy's recipe.
+        chunk_size: actions of one reply.
+        control_mode, action_dims, control_hz: what the actions are for; `action_dims` are their names.
+        cameras: our name of a camera -> how its image is sent.
+        state_key, state_dims: key and names of the proprioceptive vector.
+        state_layouts: name of a layout -> names of its numbers, for every layout that the server accepts.
+        prompt_key: key of the instruction.
+        needs_every_frame: whether the policy must see each control step.
+        needs_session_id: whether requests must name their session.
+        batch_max: rows of a shared pass; see `EpisodeStart.row`.
+        supports: which of `reset`, `observe`, `seed` and `row` may be sent.
+        versions: package -> version, at the server.
+        n_sessions: sessions that it has at the moment.
+        other: what else it says.
+    """
+
+    protocol: str | None = None
+    name: str | None = None
+    weights_known: bool = False
+    weights_sha256: str | None = None
+    recipe_sha256: str | None = None
+    chunk_size: int | None = None
+    control_mode: str | None = None
+    action_dims: tuple[str, ...] | None = None
+    control_hz: float | None = None
+    cameras: Mapping[str, CameraImage] | None = None
+    state_key: str | None = None
+    state_dims: tuple[str, ...] | None = None
+    state_layouts: Mapping[str, tuple[str, ...]] | None = None
+    prompt_key: str | None = None
+    needs_every_frame: bool | None = None
+    needs_session_id: bool | None = None
+    batch_max: int | None = None
+    supports: tuple[str, ...] = ()
+    versions: Mapping[str, str] | None = None
+    n_sessions: int | None = None
+    other: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is a server of this wire, and not only one of openpi's."""
+        return self.protocol == PROTOCOL
+
+    @property
+    def takes_sessions(self) -> bool:
+        """Whether requests may hold `endpoint` and `session_id`.
+
+        RoboArena's servers want them in every request; they announce them by `needs_session_id` alone.
+        """
+        return self.is_ours or self.needs_session_id is not None
+
+    @property
+    def takes_reset(self) -> bool:
+        """Whether an episode begins with a request `reset`."""
+        return "reset" in self.supports or (not self.is_ours and self.needs_session_id is not None)
+
+    def to_wire(self) -> dict[str, Any]:
+        """Return the first message of a server of this wire."""
+        message: dict[str, Any] = {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if one.name not in ("weights_known", "other")
+        }
+        if not self.weights_known:
+            del message["weights_sha256"]
+        if self.cameras is not None:
+            message["cameras"] = {name: image._asdict() for name, image in self.cameras.items()}
+        if self.state_layouts is not None:
+            message["state_layouts"] = {name: list(dims) for name, dims in self.state_layouts.items()}
+        message["versions"] = None if self.versions is None else dict(self.versions)
+        plain = {key: list(value) if isinstance(value, tuple) else value for key, value in message.items()}
+        return {**self.other, **plain}
+
+    def identity(self) -> dict[str, Any]:
+        """Return what is compared when a run is resumed, as JSON can hold it: all but the number of sessions.
+
+        What the server does not say is left out.
+        """
+        message = {key: value for key, value in self.to_wire().items() if key != "n_sessions"}
+        unsaid = () if self.is_ours else [key for key, value in message.items() if value is None]
+        return {key: _as_json(value) for key, value in message.items() if key not in unsaid}
+
+    @classmethod
+    def from_wire(cls, message: object, *, where: str) -> "ServerMetadata":
+        """Read the first message of a server.
+
+        Args:
+            message: what the server sent, decoded.
+            where: its address, for messages.
+
+        Raises:
+            RemoteReplyError: it is no map, or a field that is known has another type.
+        """
+        if not isinstance(message, Mapping):
+            raise RemoteReplyError(
+                f"{where}: expected a map as the first message (what the server says of itself), found "
+                f"{shown(message)}. Check that a policy server answers at this address."
+            )
+        read = {
+            name: _read(message[name], name, reader, where=where)
+            for name, reader in _READERS.items()
+            if message.get(name) is not None
+        }
+        other = {key: value for key, value in message.items() if key not in _READERS}
+        metadata = cls(**read, weights_known="weights_sha256" in message, other=other)
+        if not metadata.is_ours and (metadata.protocol or "").startswith("openpi+"):
+            raise RemoteReplyError(
+                f"{where}: the server speaks '{metadata.protocol:.40}', this program '{PROTOCOL}'. Use the "
+                f"same version of mikasa-vla-eval at both ends."
+            )
+        return metadata
+
+
+def _read(value: object, name: str, reader: "_Reader", *, where: str) -> Any:
+    read = reader.read(value)
+    if read is None:
+        raise RemoteReplyError(
+            f"{where}: the server says '{name}': {shown(value)}; expected {reader.expected}. Correct what "
+            f"the server says of itself."
+        )
+    return read
+
+
+# ---------------------------------------------------------------- readers: None for what does not fit
+
+
+class _Reader(NamedTuple):
+    expected: str
+    read: Callable[[Any], Any]
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) and value else None
+
+
+def _flag(value: Any) -> bool | None:
+    return bool(value) if isinstance(value, bool | np.bool_) else None
+
+
+def _count(least: int, most: int) -> Callable[[Any], int | None]:
+    def read(value: Any) -> int | None:
+        is_number = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return int(value) if is_number and least <= value <= most else None
+
+    return read
+
+
+def _rate(value: Any) -> float | None:
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return float(value) if is_number and 0 < value < float("inf") else None
+
+
+def _names(value: Any) -> tuple[str, ...] | None:
+    is_list = isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
+    return tuple(value) if is_list else None
+
+
+def _layouts(value: Any) -> dict[str, tuple[str, ...]] | None:
+    if not isinstance(value, Mapping):
+        return None
+    read = {name: _names(dims) for name, dims in value.items()}
+    return (
+        {name: dims for name, dims in read.items() if dims is not None} if None not in read.values() else None
+    )
+
+
+def _texts(value: Any) -> dict[str, str] | None:
+    is_map = isinstance(value, Mapping) and all(isinstance(item, str) for item in value.values())
+    return dict(value) if is_map else None
+
+
+def _cameras(value: Any) -> dict[str, CameraImage] | None:
+    if not isinstance(value, Mapping):
+        return None
+    read = {name: _camera(image) for name, image in value.items()}
+    return (
+        {name: image for name, image in read.items() if image is not None}
+        if None not in read.values()
+        else None
+    )
+
+
+def _camera(value: Any) -> CameraImage | None:
+    if not isinstance(value, Mapping) or _text(value.get("key")) is None:
+        return None
+    sizes = [value.get(name) for name in ("height_px", "width_px")]
+    height_px, width_px = (None if size is None else _count(1, MAX_IMAGE_PX)(size) for size in sizes)
+    if (height_px is None, width_px is None) != (sizes[0] is None, sizes[1] is None):
+        return None
+    return CameraImage(value["key"], height_px, width_px)
+
+
+_READERS = {
+    "protocol": _Reader("text", _text),
+    "name": _Reader("text", _text),
+    "weights_sha256": _Reader("text", _text),
+    "recipe_sha256": _Reader("text", _text),
+    "chunk_size": _Reader(f"a number from 1 to {MAX_ACTIONS}", _count(1, MAX_ACTIONS)),
+    "control_mode": _Reader("text", _text),
+    "action_dims": _Reader("a list of names", _names),
+    "control_hz": _Reader("a number > 0", _rate),
+    "cameras": _Reader("a map of cameras, each with 'key', 'height_px' and 'width_px'", _cameras),
+    "state_key": _Reader("text", _text),
+    "state_dims": _Reader("a list of names", _names),
+    "state_layouts": _Reader("a map of lists of names", _layouts),
+    "prompt_key": _Reader("text", _text),
+    "needs_every_frame": _Reader("true or false", _flag),
+    "needs_session_id": _Reader("true or false", _flag),
+    "batch_max": _Reader(f"a number from 1 to {MAX_SERVER_ROWS}", _count(1, MAX_SERVER_ROWS)),
+    "supports": _Reader("a list of names", _names),
+    "versions": _Reader("a map of texts", _texts),
+    "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),
+}
+
+
+def _as_json(value: Any) -> Any:
+    """Return a value as JSON can hold it; a large array as its digest."""
+    if isinstance(value, Mapping):
+        return {str(key): _as_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_json(item) for item in value]
+    if isinstance(value, np.generic):
+        return _as_json(value.item())
+    if isinstance(value, np.ndarray):
+        if value.size <= MAX_NUMBERS_SHOWN:
+            return _as_json(value.tolist())
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
