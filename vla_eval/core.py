@@ -81,6 +81,8 @@ class EpisodeStart:
         run: which of several independent runs (training seeds) this is, from 0.
         instruction: the language instruction.
         horizon_steps: the episode ends after so many control steps.
+        row: the episode's row in a forward pass that it shares with others. A network gives a row the same
+            bits only in the same place of a pass of the same size, so that the plan fixes it.
     """
 
     slot: int
@@ -89,6 +91,7 @@ class EpisodeStart:
     run: int
     instruction: str
     horizon_steps: int
+    row: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

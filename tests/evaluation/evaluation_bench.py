@@ -99,6 +99,8 @@ class Policy:
         self.fails_at, self.slots = fails_at, {}
 
     def reset(self, episodes):
+        with (HERE / "rows").open("a") as file:
+            file.write(" ".join(f"{e.seed}:{e.row}" for e in episodes) + "\\n")
         for e in episodes:
             self.slots[e.slot] = {"seed": e.seed, "n": 0, "rng": np.random.default_rng([e.seed, e.run])}
 

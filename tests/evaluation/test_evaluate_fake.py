@@ -32,6 +32,15 @@ class TestSlots:
         passes = (bench.folder / "passes").read_text().split()
         assert passes == ["1"] * 12 * 12 + (["4"] * 12 + ["2"] * 12) * 2
 
+    def test_a_policy_is_given_the_row_that_an_episodes_seed_has(self, bench: Bench) -> None:
+        bench.write_policy("pair_policy:make")
+
+        bench.run("out", slots_per_worker=4)
+
+        # Seeds 1 … 6 in four rows, four episodes side by side and then two.
+        rows = (bench.folder / "rows").read_text().splitlines()
+        assert rows == ["1:0 2:1 3:2 4:3", "5:0 6:1"]
+
     def test_an_error_is_the_error_of_one_episode_and_not_of_its_neighbours(self, bench: Bench) -> None:
         bench.write_policy("pair_policy:make")
         bench.run("alone")

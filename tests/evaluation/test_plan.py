@@ -134,6 +134,11 @@ class TestQueue:
             [(4, 0), (5, 1)],
         ]
 
+    def test_in_the_worker_an_episodes_row_of_a_pass_is_its_slot(self) -> None:
+        plan = make_plan(config(episodes=5, slots_per_worker=3))
+
+        assert [(job.slot, job.row) for job in plan.jobs] == [(0, 0), (1, 1), (2, 2), (0, 0), (1, 1)]
+
     def test_a_batch_that_failed_comes_again_one_by_one(self) -> None:
         queue = JobQueue(make_plan(config(episodes=4, slots_per_worker=2)).jobs, finished=())
         failed = queue.take(None)

@@ -44,6 +44,8 @@ class EpisodeGroup:
         env: the environment, before it is known which cameras the policy needs.
         rollout: how the episodes are run.
         instruction: the language instruction.
+        n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
+            policy is in it.
     """
 
     key: GroupKey
@@ -52,6 +54,7 @@ class EpisodeGroup:
     env: EnvSettings
     rollout: RolloutSettings
     instruction: str
+    n_rows: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,14 +64,16 @@ class EpisodeJob:
     Attributes:
         group: what it shares with others.
         run, seed: which of them it is.
-        slot: where in a worker it runs. Fixed by the plan, since a network that infers for several
-            episodes in one pass gives a row the same bits only in the same place.
+        slot: where in a worker it runs.
+        row: where in a forward pass it is computed, see `EpisodeStart.row`. Slot and row are fixed by the
+            seed, so that no result depends on workers or order.
     """
 
     group: EpisodeGroup
     run: int
     seed: int
     slot: int = 0
+    row: int = 0
 
     @property
     def key(self) -> EpisodeKey:
@@ -135,7 +140,11 @@ def make_plan(config: EvalConfig) -> Plan:
     return Plan(
         jobs=tuple(
             EpisodeJob(
-                group=group, run=run, seed=config.seed_start + index, slot=index % config.slots_per_worker
+                group=group,
+                run=run,
+                seed=config.seed_start + index,
+                slot=index % config.slots_per_worker,
+                row=index % group.n_rows,
             )
             for group in groups
             for run in range(config.runs)
@@ -229,4 +238,5 @@ def _groups(
                 stop_at_success=config.stop_at_success,
             ),
             instruction=instruction,
+            n_rows=config.slots_per_worker,
         )

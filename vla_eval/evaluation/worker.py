@@ -96,6 +96,7 @@ class EpisodeRunner:
                 run=job.run,
                 instruction=group.instruction,
                 horizon_steps=env.spec.horizon_steps,
+                row=job.row,
             )
             for job in batch.jobs
         ]

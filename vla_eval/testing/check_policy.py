@@ -65,7 +65,13 @@ def _episode(
     """Return the chunks of one episode per seed, predicted side by side."""
     starts = [
         EpisodeStart(
-            slot=slot, task="check", seed=seed, run=0, instruction=instruction, horizon_steps=HORIZON_STEPS
+            slot=slot,
+            task="check",
+            seed=seed,
+            run=0,
+            instruction=instruction,
+            horizon_steps=HORIZON_STEPS,
+            row=slot,
         )
         for slot, seed in enumerate(seeds)
     ]
