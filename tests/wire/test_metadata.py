@@ -17,6 +17,7 @@ OURS: dict[str, Any] = {
     "weights_sha256": "ab" * 32,
     "recipe_sha256": "cd" * 32,
     "chunk_size": 8,
+    "n_action_steps": 4,
     "control_mode": "pd_ee_delta_pose",
     "action_dims": ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"],
     "control_hz": 20.0,

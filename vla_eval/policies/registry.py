@@ -37,6 +37,7 @@ POLICIES = {
     "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot:make_lerobot",
     "openvla": "vla_eval.policies.openvla_paper:make_openvla",
+    "remote": "vla_eval.policies.remote.policy:make_remote",
 }
 
 

@@ -37,17 +37,19 @@ class CodecError(ValueError):
 # ------------------------------------------------------------------------------------------ write
 
 
-def packb(message: Any) -> bytes:
+def packb(message: Any, text_markers: bool = False) -> bytes:
     """Return a message as bytes.
 
     Args:
         message: maps with text as keys, lists, tuples, text, bytes, numbers, None, numpy arrays and scalars.
+        text_markers: write the markers of arrays as text, and scalars as plain numbers, for programs that
+            read nothing else.
 
     Raises:
         CodecError: it holds something else, or is too large.
     """
     try:
-        data = msgpack.packb(_plain(message, 0), use_bin_type=True)
+        data = msgpack.packb(_plain(message, 0, text_markers), use_bin_type=True)
     except CodecError:
         raise
     except (ValueError, OverflowError, TypeError, MemoryError) as exc:
@@ -57,7 +59,7 @@ def packb(message: Any) -> bytes:
     return bytes(data)
 
 
-def _plain(value: Any, depth: int) -> Any:
+def _plain(value: Any, depth: int, text_markers: bool) -> Any:
     """Return what msgpack itself can write."""
     if depth >= MAX_DEPTH and isinstance(value, (dict, list, tuple)):
         raise CodecError(f"nesting of more than {MAX_DEPTH} levels")
@@ -65,26 +67,30 @@ def _plain(value: Any, depth: int) -> Any:
         for key in value:
             if not isinstance(key, str):
                 raise CodecError(f"expected text as the key of a map, found {key!r:.80}")
-        return {key: _plain(item, depth + 1) for key, item in value.items()}
+        return {key: _plain(item, depth + 1, text_markers) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item, depth + 1) for item in value]
-    if isinstance(value, np.ndarray):
-        _check_kind(value.dtype)
-        if value.nbytes > MAX_MESSAGE_BYTES:
-            raise CodecError(_too_large(value.nbytes))
-        # `tobytes` writes C order, whatever the order in memory.
-        return {
-            ARRAY.encode(): True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": list(value.shape),
-        }
-    if isinstance(value, np.generic):
-        _check_kind(value.dtype)
-        return {SCALAR.encode(): True, b"data": value.item(), b"dtype": value.dtype.str}
+        return [_plain(item, depth + 1, text_markers) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _marked(value, text_markers)
     if value is None or isinstance(value, (bool, int, float, str, bytes)):
         return value
     raise CodecError(f"expected plain data or arrays, found {type(value).__name__}")
+
+
+def _marked(value: Any, text_markers: bool) -> Any:
+    """Return an array or a numpy scalar as a map with a marker."""
+    _check_kind(value.dtype)
+    if value.nbytes > MAX_MESSAGE_BYTES:
+        raise CodecError(_too_large(value.nbytes))
+    fields: dict[str, Any]
+    if isinstance(value, np.ndarray):
+        # `tobytes` writes C order, whatever the order in memory.
+        fields = {ARRAY: True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
+    elif text_markers:
+        return value.item()
+    else:
+        fields = {SCALAR: True, "data": value.item(), "dtype": value.dtype.str}
+    return fields if text_markers else {key.encode(): item for key, item in fields.items()}
 
 
 # ------------------------------------------------------------------------------------------ read

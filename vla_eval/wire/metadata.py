@@ -42,6 +42,7 @@ class ServerMetadata:
         weights_sha256: digest of the weights; None for a policy without weights, or if not known.
         recipe_sha256: digest of the policy's recipe.
         chunk_size: actions of one reply.
+        n_action_steps: actions executed per inference, where the evaluation names no number.
         control_mode, action_dims, control_hz: what the actions are for; `action_dims` are their names.
         cameras: our name of a camera -> how its image is sent.
         state_key, state_dims: key and names of the proprioceptive vector.
@@ -62,6 +63,7 @@ class ServerMetadata:
     weights_sha256: str | None = None
     recipe_sha256: str | None = None
     chunk_size: int | None = None
+    n_action_steps: int | None = None
     control_mode: str | None = None
     action_dims: tuple[str, ...] | None = None
     control_hz: float | None = None
@@ -238,6 +240,7 @@ _READERS = {
     "weights_sha256": _Reader("text", _text),
     "recipe_sha256": _Reader("text", _text),
     "chunk_size": _Reader(f"a number from 1 to {MAX_ACTIONS}", _count(1, MAX_ACTIONS)),
+    "n_action_steps": _Reader(f"a number from 1 to {MAX_ACTIONS}", _count(1, MAX_ACTIONS)),
     "control_mode": _Reader("text", _text),
     "action_dims": _Reader("a list of names", _names),
     "control_hz": _Reader("a number > 0", _rate),

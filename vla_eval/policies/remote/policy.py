@@ -1,0 +1,162 @@
+"""The adapter `remote`: a policy behind a socket, asked once per inference.
+
+The chunk queue is at this end. All requests of an inference are sent before the first answer is awaited, so
+that one worker with several slots fills a batch at the server. After any error the connections are closed.
+"""
+
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from typing import Any  # Any: what a recipe holds, and what a server sends
+
+import numpy as np
+
+from vla_eval.config.files import digest_of
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.errors import RemoteChangedError, SpecMismatchError
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.remote.actions import as_rows, converted
+from vla_eval.policies.remote.connecting import connect_client
+from vla_eval.policies.remote.fit import Fit, fit
+from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
+from vla_eval.specs import ActionSpec, PolicySpec
+from vla_eval.wire.addresses import split_urls
+from vla_eval.wire.client import PolicyClient
+
+SESSION_BYTES = 8
+
+
+class RemotePolicy:
+    """Asks a server for chunks; a session of the server per slot."""
+
+    def __init__(
+        self,
+        *,
+        spec: PolicySpec,
+        clients: Mapping[int, PolicyClient],
+        fit: Fit,
+        settings: RemoteSettings,
+        action: ActionSpec,
+    ) -> None:
+        """Keep the connections.
+
+        Args:
+            spec: what the policy reads and returns.
+            clients: slot -> connection; the same one for all slots where the server can tell them apart.
+            fit: how observations become requests.
+            settings: the recipe.
+            action: what actions mean here.
+        """
+        self._spec = spec
+        self._clients = clients
+        self._fit = fit
+        self._settings = settings
+        self._action = action
+        # Names nothing but a session: no result depends on it.
+        prefix = f"{os.getpid()}-{secrets.token_hex(SESSION_BYTES)}"
+        self._sessions = {slot: f"{prefix}-{slot}" for slot in clients}
+        self._instructions: dict[int, str] = {}
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy reads and how long its chunks are."""
+        return self._spec
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin an episode in the session of each slot.
+
+        Raises:
+            RemotePolicyError: the server is gone, silent, or replies with something else.
+        """
+        for start in episodes:
+            self._instructions[start.slot] = start.instruction
+            self._clients[start.slot].ask_reset(self._sessions[start.slot], start)
+        for start in episodes:
+            self._clients[start.slot].take_reset(self._sessions[start.slot])
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Ask for one chunk; see `act_batch`."""
+        return self.act_batch([window])[0]
+
+    def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
+        """Ask for the chunks of several episodes; the order of the answers is that of the windows.
+
+        Raises:
+            RemotePolicyError: the server is gone, silent, or replies with something else.
+        """
+        for window in windows:
+            client, session = self._clients[window.slot], self._sessions[window.slot]
+            *earlier, last = window.frames
+            instruction = self._instructions[window.slot]
+            for frame in earlier:
+                client.observe(session, self._fit.request(frame, instruction), step=frame.step)
+            client.ask_infer(session, self._fit.request(last, instruction), step=last.step)
+        return [
+            self._chunk(self._clients[window.slot].take_infer(self._sessions[window.slot]))
+            for window in windows
+        ]
+
+    def close(self) -> None:
+        """Close the connections."""
+        for client in {id(client): client for client in self._clients.values()}.values():
+            client.close()
+
+    def _chunk(self, actions: Any) -> ActionChunk:
+        rows = as_rows(actions)
+        shape = (self._spec.chunk_size, len(self._action.dims))
+        is_sound = isinstance(rows, np.ndarray) and rows.shape == shape and rows.dtype == np.float32
+        if self._settings.actions is not None and is_sound and np.isfinite(rows).all():
+            rows = converted(rows, self._settings.actions, self._action)
+        return ActionChunk(actions=rows)  # the loop refuses what is not sound
+
+
+def make_remote(
+    context: PolicyContext, *, url: str, identity_sha256: str | None = None, **args: Any
+) -> RemotePolicy:
+    """Connect to a policy server.
+
+    Args:
+        context: what every adapter gets.
+        url: `ws://HOST:PORT`; of several with commas, the one with the fewest sessions is taken.
+        identity_sha256: digest of what the server said of itself when the run was planned.
+        **args: the other fields of `RemoteSettings`.
+
+    Raises:
+        RecipeError: an argument is unknown or wrong.
+        RemotePolicyError: there is no server, or it is none of a policy.
+        RemoteChangedError: the server is not what it was when the run was planned.
+        SpecMismatchError: server, recipe and environment do not fit together.
+    """
+    where = f"policy '{context.name}'"
+    settings = remote_settings({"url": url, **args}, where=where)
+    client = connect_client(split_urls(url), settings, connect_seconds=settings.connect_seconds)
+    clients = {0: client.client}
+    try:
+        metadata, where = client.client.metadata, f"{where}, {client.url}"
+        if identity_sha256 not in (None, digest_of(metadata.identity())):
+            raise RemoteChangedError(
+                f"{where}: the server is not what it was when the run was planned: other weights, another "
+                f"policy or other versions. Start the former one again, or use another --out for the new one."
+            )
+        fitted = fit(settings, metadata, context.env, where=where)
+        can_observe = client.client.shares_connection and "observe" in metadata.supports
+        if fitted.reads == "every" and context.chunking.n_action_steps > 1 and not can_observe:
+            raise SpecMismatchError(
+                f"{where}: the policy must see each control step, and the server takes no frames between "
+                f"inferences. Use --n-action-steps 1."
+            )
+        for slot in range(1, context.n_slots):
+            shared = client.client.shares_connection
+            clients[slot] = client.client if shared else client.another(settings)
+    except BaseException:
+        for one in clients.values():
+            one.close()
+        raise
+    spec = PolicySpec(
+        name=context.name,
+        reads=fitted.reads,
+        cameras=tuple(fitted.cameras),
+        states=fitted.states,
+        chunk_size=fitted.chunk_size,
+    )
+    return RemotePolicy(spec=spec, clients=clients, fit=fitted, settings=settings, action=context.env.action)

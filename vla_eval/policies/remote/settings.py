@@ -1,0 +1,142 @@
+"""The arguments of a `policies/remote_*.yaml`: where the server is, and how both ends' names correspond."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal  # Any: what a recipe holds
+
+from vla_eval.bounds import MAX_SECONDS, check_bounds, require
+from vla_eval.config.decoding import decode
+from vla_eval.config.files import digest_of, to_data
+from vla_eval.errors import RecipeError
+from vla_eval.wire.metadata import MAX_ACTIONS, MAX_IMAGE_PX, MAX_SERVER_ROWS
+
+ADAPTER = "remote"
+DEFAULT_KEY_ENV = "MIKASA_VLA_API_KEY"
+PLACE_FIELDS = ("url", "timeout_seconds", "connect_seconds", "api_key_env")
+"""Where a policy is and how long it is waited for: no part of what it is."""
+
+Dialect = Literal["openpi", "vla_eval"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraSettings:
+    """How the image of a camera is sent.
+
+    Attributes:
+        key: its name in a request.
+        height_px, width_px: the size that the server wants; None: as the server says, else the camera's.
+        resize: how to make that size of another one: `pad` keeps the proportions and fills with black at two
+            sides, `plain` does not keep them. None: another size is an error.
+    """
+
+    key: str
+    height_px: int | None = None
+    width_px: int | None = None
+    resize: Literal["pad", "plain"] | None = None
+
+    def __post_init__(self) -> None:
+        require(bool(self.key), "cameras.key", self.key, "the name of the image in a request")
+        check_bounds(self, {"height_px": (1, MAX_IMAGE_PX), "width_px": (1, MAX_IMAGE_PX)}, prefix="cameras.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionSettings:
+    """What the server's actions mean, where it is something else than at this environment.
+
+    Attributes:
+        gripper: which value of the last number opens and closes.
+        rotation: how the second three numbers describe a turn.
+        position_unit_m: what 1 means in the first three numbers; None: as here.
+        rotation_unit_rad: what 1 means in the second three; None: as here.
+    """
+
+    gripper: Literal["open_positive", "close_positive", "open_01", "close_01"] = "open_positive"
+    rotation: Literal["euler_xyz", "axis_angle"] = "euler_xyz"
+    position_unit_m: float | None = None
+    rotation_unit_rad: float | None = None
+
+    def __post_init__(self) -> None:
+        bounds = {"position_unit_m": (1e-4, 10.0), "rotation_unit_rad": (1e-4, 10.0)}
+        check_bounds(self, bounds, prefix="actions.")
+        has_unit = self.rotation_unit_rad is not None
+        require(
+            self.rotation == "euler_xyz" or has_unit,
+            "actions.rotation_unit_rad",
+            None,
+            "a number: without its unit an axis-angle cannot be converted",
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoteSettings:
+    """The arguments of the adapter `remote`; `docs/remote.md` has the table.
+
+    Attributes:
+        url: `ws://HOST:PORT`; several with commas are servers of the same policy.
+        dialect: `openpi`, or `vla_eval` for the model servers of allenai's vla-evaluation-harness.
+        cameras: our name of a camera -> how it is sent; None: as the server says.
+        state: key in a request -> layout; None: as the server says. Empty: no state is sent.
+        prompt_key: key of the instruction; None: as the server says, else `prompt`.
+        chunk_size: actions of one reply; None: as the server says.
+        reads: whether the policy must see each control step; None: as the server says.
+        actions: what the server's actions mean; None: the same as here.
+        batch_max: rows of a pass at the server; None: as the server says.
+        timeout_seconds: how long a reply is waited for.
+        connect_seconds: how long a worker waits for a server that does not listen yet.
+        api_key_env: the environment variable with the API key.
+    """
+
+    url: str
+    dialect: Dialect = "openpi"
+    cameras: dict[str, CameraSettings] | None = None
+    state: dict[str, str] | None = None
+    prompt_key: str | None = None
+    chunk_size: int | None = None
+    reads: Literal["last", "every"] | None = None
+    actions: ActionSettings | None = None
+    batch_max: int | None = None
+    timeout_seconds: float = 120.0
+    connect_seconds: float = 30.0
+    api_key_env: str | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            {
+                "chunk_size": (1, MAX_ACTIONS),
+                "batch_max": (1, MAX_SERVER_ROWS),
+                "timeout_seconds": (0.001, MAX_SECONDS),
+                "connect_seconds": (0.0, MAX_SECONDS),
+            },
+        )
+
+    @property
+    def api_key(self) -> str | None:
+        """The API key; None if there is none.
+
+        Raises:
+            RecipeError: the recipe names a variable that is not set.
+        """
+        key = os.environ.get(self.api_key_env or DEFAULT_KEY_ENV)
+        if self.api_key_env is not None and not key:
+            raise RecipeError(
+                f"api_key_env: the environment variable {self.api_key_env:.80} is not set. Put the server's "
+                f"API key into it."
+            )
+        return key or None
+
+
+def remote_settings(args: Mapping[str, Any], *, where: str) -> RemoteSettings:
+    """Read the arguments of a recipe strictly.
+
+    Raises:
+        RecipeError: a field is unknown, missing, or has a value that is not allowed.
+    """
+    return decode(RemoteSettings, args, where=where)
+
+
+def settings_digest(settings: RemoteSettings) -> str:
+    """Return the digest of what moves a result: neither where the server is nor how long it may take."""
+    data = to_data(settings)
+    return digest_of({name: value for name, value in data.items() if name not in PLACE_FIELDS})
