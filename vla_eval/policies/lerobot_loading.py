@@ -5,6 +5,7 @@ answer a failed load with random weights. Here every parameter is compared with 
 Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is set.
 """
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,6 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
-from safetensors.torch import load_file
 from torch import Tensor
 
 import vla_eval.policies.memory.configuration_memory  # importing it registers
@@ -40,13 +40,20 @@ from vla_eval.policies.checkpoint import (
     read_json,
 )
 from vla_eval.policies.config_check import check_config, check_features
+from vla_eval.policies.empty_weights import empty_weights
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.weight_file import WeightFile
 from vla_eval.policies.weights import check_same, put_weights
 
 # Fields that make a constructor fetch weights which the checkpoint is about to replace.
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
+
+BUILT_EMPTY = frozenset(
+    {"pi0", "pi05", "pi0_fast", "smolvla", "mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"}
+)
+"""Types whose constructors do not compute with their weights: they are built without memory for them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +220,13 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
     """
-    return fill_policy(make_empty_policy(config, **kwargs), folder, options).to(config.device)
+    return fill_policy(make_unfilled_policy(config, **kwargs), folder, options).to(config.device)
+
+
+def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:
+    """Return a policy that is about to be filled, or only counted: large ones have no memory for weights."""
+    with empty_weights() if config.type in BUILT_EMPTY else contextlib.nullcontext():
+        return make_empty_policy(config, **kwargs)
 
 
 def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: Sequence[str] = ()) -> Any:
@@ -237,6 +250,7 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
         where=str(folder / WEIGHTS_FILE),
         cast=options.dtype is not None,
         may_be_new=may_be_new,
+        device=options.device,
     )
     return policy
 
@@ -262,18 +276,13 @@ def begin_from(policy: Any, base: Path) -> None:
     begin()
 
 
-def read_weights(path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a safetensors file.
+def read_weights(path: Path) -> WeightFile:
+    """Return the tensors of a safetensors file, which are read one at a time.
 
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    try:
-        return dict(load_file(path))
-    except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{path}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
-        ) from exc
+    return WeightFile(path)
 
 
 def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
@@ -288,7 +297,7 @@ def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
             f"not there. Name its folder with `base_checkpoint` in the recipe's args."
         )
     file = folder / ADAPTER_WEIGHTS_FILE
-    config, weights = read_adapter_config(folder / ADAPTER_CONFIG_FILE), read_weights(file)
+    config, weights = read_adapter_config(folder / ADAPTER_CONFIG_FILE), dict(read_weights(file))
     # What the adapter was trained with in full comes with it: the base need not have it.
     names = config.modules_to_save or ()
     beside = [start for start in getattr(policy, "new_in_finetuning", ()) if start.split(".")[-2] in names]

@@ -1,0 +1,87 @@
+"""A safetensors file read one tensor at a time, so that a checkpoint is never in memory twice.
+
+Knows only files and tensors. A tensor that is read is a copy: the file is mapped only while it is copied.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any  # safetensors is untyped
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from vla_eval.errors import CheckpointError
+
+DTYPES: Mapping[str, torch.dtype] = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "U8": torch.uint8,
+    "BOOL": torch.bool,
+}
+"""Types of numbers by safetensors' names."""
+
+
+class WeightFile(Mapping[str, Tensor]):
+    """The tensors of a file by name; each access reads one.
+
+    Args:
+        path: of the file; its header is read and checked at once.
+
+    Raises:
+        CheckpointError: it is missing or damaged, or has a type of numbers that no policy has.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with safe_open(path, framework="pt") as file:
+                self._described = {name: _described(file.get_slice(name)) for name in list(file.keys())}
+        except Exception as exc:  # safetensors raises its own class, which is no public name
+            raise self._damaged(exc) from exc
+
+    def described(self) -> Mapping[str, Tensor]:
+        """Return the tensors without values, on torch's `meta` device: shape and type of each."""
+        return self._described
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Read one tensor; the result shares no memory with the file."""
+        if name not in self._described:
+            raise KeyError(name)
+        try:
+            with safe_open(self._path, framework="pt") as file:
+                tensor: Tensor = file.get_tensor(name).clone()
+        except Exception as exc:  # as above
+            raise self._damaged(exc) from exc
+        return tensor
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self._described)
+
+    def __len__(self) -> int:
+        """Return the number of tensors."""
+        return len(self._described)
+
+    def _damaged(self, exc: Exception) -> CheckpointError:
+        return CheckpointError(
+            f"{self._path}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
+        )
+
+
+def describe(weights: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """Return tensors of the same names, shapes and types; those of a file have no values."""
+    return weights.described() if isinstance(weights, WeightFile) else weights
+
+
+def _described(part: Any) -> Tensor:
+    kind = part.get_dtype()
+    if kind not in DTYPES:
+        raise ValueError(f"numbers of type {kind}; known are {', '.join(DTYPES)}")
+    return torch.empty(part.get_shape(), dtype=DTYPES[kind], device="meta")
