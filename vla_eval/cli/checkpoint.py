@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli import checkpoint_openvla, checkpoint_spatialvla
+from vla_eval.cli import checkpoint_fetch, checkpoint_openvla, checkpoint_spatialvla
 from vla_eval.cli.checkpoint_arguments import add_gripper
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
+fetch: get a published base from the Hub, check it, and convert it where needed.
 convert-octo, convert-openvla, convert-spatialvla: make a LeRobot checkpoint of an original one. merge: put a
-LoRA adapter into its base. Nothing is downloaded."""
+LoRA adapter into its base. Only fetch downloads anything."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -35,6 +36,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
     convert.add_argument("--dataset-name", metavar="NAME", help="whose statistics, where there are several")
     add_gripper(convert)
+    checkpoint_fetch.add_parsers(actions)
     checkpoint_openvla.add_parsers(actions)
     checkpoint_spatialvla.add_parsers(actions)
     for sub in (verify, convert):
@@ -44,7 +46,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 def run(args: argparse.Namespace) -> int:
     """Do it; the result goes to standard output."""
     with contextlib.redirect_stdout(sys.stderr):  # some policies print while they are made
-        if args.action in (checkpoint_openvla.CONVERT, checkpoint_openvla.MERGE):
+        if args.action == checkpoint_fetch.FETCH:
+            lines = checkpoint_fetch.run(args)
+        elif args.action in (checkpoint_openvla.CONVERT, checkpoint_openvla.MERGE):
             lines = checkpoint_openvla.run(args)
         elif args.action == checkpoint_spatialvla.CONVERT:
             lines = checkpoint_spatialvla.run(args)

@@ -15,6 +15,7 @@ from pathlib import Path
 from vla_eval.config.decoding import decode
 from vla_eval.config.shipped import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.policies.bases import how_to_get
 from vla_eval.policies.checkpoint_json import get_text
 from vla_eval.policies.checkpoint_json import read_json as read_json  # where most look for it
 
@@ -24,7 +25,9 @@ ADAPTER_WEIGHTS_FILE = "adapter_model.safetensors"
 ADAPTER_CONFIG_FILE = "adapter_config.json"
 PREPROCESSOR_FILE, POSTPROCESSOR_FILE = "policy_preprocessor.json", "policy_postprocessor.json"
 TOKENIZER_FOLDER, ACTION_TOKENIZER_FOLDER = "tokenizer", "action_tokenizer"
+VLM_FOLDER = "vlm"  # configuration and processor of SmolVLA's language model, without weights
 FACTS_FILE = "mikasa_training.json"
+BASE_FILE = "mikasa_base.json"  # where a base that was fetched came from
 MODEL_FOLDER = "pretrained_model"
 # Where a checkpoint may lie below the folder that was named: lerobot's layout, then that of our runs.
 INSIDE = (
@@ -38,7 +41,7 @@ FACTS_VERSION = 1
 """Of `mikasa_training.json`. Raise it when a field changes its meaning."""
 CHUNK_BYTES = 1 << 20
 # How the model was trained does not change what it is; the rest is for people.
-NOT_HASHED = frozenset({"train_config.json", "README.md", ".gitattributes"})
+NOT_HASHED = frozenset({"train_config.json", "README.md", ".gitattributes", BASE_FILE})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,17 +93,19 @@ def find_checkpoint(path: Path) -> Path:
     else:
         names = sorted(entry.name for entry in path.iterdir())
         found = ", ".join(names[:8]) or "an empty folder"
+    command = how_to_get(path)
+    hint = command or did_you_mean(str(path), list_checkpoints())
     raise CheckpointError(
         f"{path!s:.300}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder "
         f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) "
-        f"are never loaded: convert them to safetensors.{did_you_mean(str(path), list_checkpoints())}"
+        f"are never loaded: convert them to safetensors.{hint}"
     )
 
 
 def list_checkpoints() -> list[str]:
     """Return the names in `checkpoints/`, the user's and the package's."""
     entries = [entry for folder in search_folders(SHIPPED_FOLDER) for entry in folder.glob("*/")]
-    return sorted({entry.name for entry in entries})
+    return sorted({entry.name for entry in entries if not entry.name.startswith(".")})
 
 
 def weights_file(folder: Path) -> Path | None:

@@ -31,6 +31,7 @@ from torch import Tensor
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
 from vla_eval.features import StateKind
+from vla_eval.policies.bases import first_fetch
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot_inputs import (
@@ -202,9 +203,10 @@ def make_lerobot(
     """
     if checkpoint is None:
         raise CheckpointError(
-            f"policy '{context.name}' has no weights: its recipe says how to fine-tune it. Run `mikasa-vla "
-            f"finetune --policy {context.name} --dataset DIR --out RUN`, then `mikasa-vla eval --policy "
-            f"RUN`; or name a folder with `checkpoint` in the recipe's args."
+            f"policy '{context.name}' has no weights: its recipe says how to fine-tune it."
+            f"{first_fetch(context.name)} Run `mikasa-vla finetune --policy {context.name} --dataset DIR "
+            "--out RUN`, then `mikasa-vla eval --policy RUN`; or name a folder with `checkpoint` in the "
+            "recipe's args."
         )
     options = LoadOptions(
         device=choose_device(device), dtype=dtype, tokenizer=tokenizer, base_checkpoint=base_checkpoint

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -16,6 +17,7 @@ from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     TOKENIZER_FOLDER,
+    VLM_FOLDER,
 )
 from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
 from vla_eval.policies.processor_door import processors_through_the_door
@@ -101,9 +103,11 @@ def tokenizer_overrides(
 
 
 def own_tokenizers(folder: Path, tokenizer: str | None) -> dict[str, str]:
-    """Return the tokenizers that a policy itself loads (π0-FAST), by its configuration's fields."""
+    """Return what a policy itself loads, by its configuration's fields: tokenizers, SmolVLA's description."""
     found = {"text_tokenizer_name": _tokenizer(folder, tokenizer)}
-    actions = folder / ACTION_TOKENIZER_FOLDER
+    vlm, actions = folder / VLM_FOLDER, folder / ACTION_TOKENIZER_FOLDER
+    if vlm.is_dir():
+        found["vlm_model_name"] = str(vlm)
     if actions.is_dir():
         found["action_tokenizer_name"] = str(actions)
     return {name: value for name, value in found.items() if value is not None}
@@ -114,8 +118,10 @@ def _tokenizer(folder: Path, named: str | None) -> str | None:
         if not Path(named).is_dir():
             raise CheckpointError(f"tokenizer: expected a folder, found nothing at {named}.")
         return named
-    own = folder / TOKENIZER_FOLDER
-    return str(own) if own.is_dir() else None
+    for own in (folder / TOKENIZER_FOLDER, folder / VLM_FOLDER):
+        if own.is_dir():
+            return str(own)
+    return None
 
 
 def step_names(path: Path) -> tuple[str, ...]:
@@ -136,6 +142,13 @@ def save_tokenizers(preprocessor: Any, folder: Path) -> None:
         action_tokenizer: Any = getattr(step, "action_tokenizer", None)
         if hasattr(action_tokenizer, "save_pretrained"):
             action_tokenizer.save_pretrained(folder / ACTION_TOKENIZER_FOLDER)
+
+
+def save_vlm_files(config: Any, folder: Path) -> None:
+    """Keep SmolVLA's description of its language model and its processor beside the weights, as above."""
+    source = Path(str(getattr(config, "vlm_model_name", "")))
+    if source.name == VLM_FOLDER and source.is_dir():
+        shutil.copytree(source, folder / VLM_FOLDER, dirs_exist_ok=True)
 
 
 def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:

@@ -12,9 +12,17 @@ from safetensors import safe_open
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError, InvalidActionError
-from vla_eval.policies.checkpoint import checkpoint_sha256, weights_file
-from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.policies.checkpoint import WEIGHTS_FILE, checkpoint_sha256, weights_file
+from vla_eval.policies.lerobot_loading import (
+    LoadedPolicy,
+    LoadOptions,
+    load_checkpoint,
+    make_unfilled_policy,
+    read_config,
+    read_weights,
+)
 from vla_eval.policies.lerobot_types import chunk_size, history, noise_shape
+from vla_eval.policies.weights import check_fit
 
 INSTRUCTION = "pick the cube"
 
@@ -53,6 +61,49 @@ class Verified:
             f"statistics   {', '.join(self.statistics) or 'none needed'}",
             f"forward pass {' × '.join(map(str, self.chunk))} actions, all finite",
         ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Structure:
+    """What a checkpoint's header and its configuration say of each other, in agreement.
+
+    Attributes:
+        kind: lerobot's name of the policy's type.
+        n_tensors: in the file.
+        n_parameters: of the model; shared ones once.
+    """
+
+    kind: str
+    n_tensors: int
+    n_parameters: int
+
+    def line(self) -> str:
+        """Return a line for a person."""
+        return (
+            f"{self.kind}, {self.n_tensors} tensors with the names and shapes of the network, none missing, "
+            f"none left over; {self.n_parameters:,} parameters"
+        )
+
+
+def check_structure(folder: Path) -> Structure:
+    """Compare the names and shapes of a whole model's weights with the network, without loading them.
+
+    A base needs no statistics: a fine-tuning gives it those of its dataset. Types may differ from the
+    configuration's, since a recipe chooses the precision.
+
+    Raises:
+        CheckpointError: the configuration is refused, or tensors are missing, unexpected or of another shape.
+    """
+    config = read_config(folder, LoadOptions(device="cpu"))
+    policy = make_unfilled_policy(config)
+    file = folder / WEIGHTS_FILE
+    weights = read_weights(file)
+    check_fit(policy, weights, where=str(file), cast=True)
+    return Structure(
+        kind=config.type,
+        n_tensors=len(weights),
+        n_parameters=sum(x.numel() for x in policy.parameters()),
+    )
 
 
 def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:

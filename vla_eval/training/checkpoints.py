@@ -9,7 +9,7 @@ from lerobot.common import train_utils
 
 from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
-from vla_eval.policies.lerobot_processors import save_tokenizers
+from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.run_folder import LAST, point
 
@@ -46,6 +46,7 @@ def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[
     )
     write_facts(partial / MODEL_FOLDER, job.facts)
     save_tokenizers(parts["preprocessor"], partial / MODEL_FOLDER)
+    save_vlm_files(job.policy, partial / MODEL_FOLDER)
     _sync(partial)
     os.replace(partial, folder)
     point(folder.parent / LAST, folder.name)
