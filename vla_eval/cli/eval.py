@@ -57,7 +57,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         **many,
         dest="policies",
         metavar="P",
-        help="names in policies/, files, or folders of checkpoints",
+        help="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server",
     )
     parser.add_argument(
         "--n-action-steps",

@@ -155,6 +155,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
         options=options_of(config),
         command=command,
         normalization=dict(plan.normalization),
+        servers=dict(plan.servers),
     )
 
 

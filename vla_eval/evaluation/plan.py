@@ -4,7 +4,7 @@ Every mistake in a configuration that can be found without starting a simulator 
 first episode. Knows nothing of processes or files of results.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,16 +13,19 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, digest_of, to_data
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.config.prompts import load_prompts, sentences_of
+from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
-from vla_eval.policies.recipe import load_policy_recipe
+from vla_eval.policies.recipe import bare_policy, load_policy_recipe
 from vla_eval.policies.registry import check_adapter
+from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.policies.remote.survey import survey
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
+from vla_eval.wire.metadata import ServerMetadata
 
 
 class GroupKey(NamedTuple):
@@ -45,7 +48,7 @@ class EpisodeGroup:
         rollout: how the episodes are run.
         instruction: the language instruction.
         n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
-            policy is in it.
+            policy is in it, else what its server says.
     """
 
     key: GroupKey
@@ -90,6 +93,7 @@ class Plan:
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
             policies, and the datasets that these were trained on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
+        servers: policy behind a socket -> what its server says of itself.
         task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
@@ -99,6 +103,7 @@ class Plan:
     jobs: tuple[EpisodeJob, ...]
     recipe_hashes: Mapping[str, str]
     normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    servers: Mapping[str, Mapping[str, Any]]  # Any: plain data
     task_versions: Mapping[str, int]
     policy_names: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -115,6 +120,7 @@ def make_plan(config: EvalConfig) -> Plan:
         TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
             tasks with candidates, and one of the tasks has none.
         CheckpointError: the weights that a recipe names are not there, or not whole.
+        RemotePolicyError: a policy server is not there, or is none of a policy.
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
@@ -122,6 +128,11 @@ def make_plan(config: EvalConfig) -> Plan:
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
     prompts = load_prompts(config.prompt_set)
+    servers = {
+        policy.name: survey(policy.value.args, policy=policy.name)
+        for policy in policies
+        if policy.value.adapter == REMOTE_ADAPTER
+    }
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
@@ -132,7 +143,7 @@ def make_plan(config: EvalConfig) -> Plan:
             if policy.value.needs_candidates and task.candidates is None:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
-            groups.extend(_groups(config, task, policy, instruction))
+            groups.extend(_groups(config, task, policy, instruction, servers.get(policy.name)))
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, n_groups=len(groups))
@@ -150,22 +161,13 @@ def make_plan(config: EvalConfig) -> Plan:
             for run in range(config.runs)
             for index in range(config.episodes)
         ),
-        recipe_hashes={
-            f"prompts/{prompts.name}": prompts.sha256,
-            **{f"policies/{policy.name}": policy.sha256 for policy in policies},
-            **{
-                name: digest
-                for policy in policies
-                for name, digest in checkpoint_hashes(
-                    policy.value.adapter, policy.value.args, policy=policy.name
-                ).items()
-            },
-        },
+        recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization={
             policy.name: notes
             for policy in policies
             if (notes := normalization_notes(policy.value.adapter, policy.value.args))
         },
+        servers={name: server.identity() for name, server in servers.items()},
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
         left_out=tuple(left_out),
@@ -173,11 +175,28 @@ def make_plan(config: EvalConfig) -> Plan:
     )
 
 
+def _recipe_hashes(
+    prompts: Recipe[PromptRecipe],
+    policies: Sequence[Recipe[PolicyRecipe]],
+    servers: Mapping[str, ServerMetadata],
+) -> dict[str, str]:
+    """Return the digests of all files that results depend on, see `Plan`."""
+    hashes = {f"prompts/{prompts.name}": prompts.sha256}
+    hashes |= {f"policies/{policy.name}": policy.sha256 for policy in policies}
+    for policy in policies:
+        hashes |= checkpoint_hashes(policy.value.adapter, policy.value.args, policy=policy.name)
+    for name, server in servers.items():
+        if server.weights_sha256 is not None:
+            hashes[f"checkpoints/{name}"] = server.weights_sha256
+    return hashes
+
+
 def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     """Return the part of a configuration that results depend on; compared when a run is resumed."""
     data: dict[str, Any] = to_data(config)
     if config.slots_per_worker == 1:  # so that runs of versions without the field can be resumed
         del data["slots_per_worker"]
+    data["policies"] = [bare_policy(name) for name in data["policies"]]
     return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
 
 
@@ -217,13 +236,21 @@ def _refuse_doubles(kind: str, names: list[str]) -> None:
 
 
 def _groups(
-    config: EvalConfig, task: TaskSpec, policy: Recipe[PolicyRecipe], instruction: str
+    config: EvalConfig,
+    task: TaskSpec,
+    policy: Recipe[PolicyRecipe],
+    instruction: str,
+    server: ServerMetadata | None,
 ) -> Iterable[EpisodeGroup]:
+    args, n_rows = policy.value.args, config.slots_per_worker
+    if server is not None:
+        args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
+        n_rows = server.batch_max or n_rows
     for n_action_steps in config.n_action_steps or (policy.value.default_n_action_steps,):
         yield EpisodeGroup(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=policy.value.adapter,
-            args=policy.value.args,
+            args=args,
             env=EnvSettings(
                 task=task.id,
                 kwargs=config.env,
@@ -238,5 +265,5 @@ def _groups(
                 stop_at_success=config.stop_at_success,
             ),
             instruction=instruction,
-            n_rows=config.slots_per_worker,
+            n_rows=n_rows,
         )

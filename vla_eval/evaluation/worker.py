@@ -18,7 +18,14 @@ from typing import NamedTuple
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, Policy, SimEnv
 from vla_eval.envs.factory import describe_device, make_env
-from vla_eval.errors import InvalidActionError, RecipeError, VlaEvalError
+from vla_eval.errors import (
+    InvalidActionError,
+    RecipeError,
+    RemoteConnectionError,
+    RemoteReplyError,
+    RemoteTimeoutError,
+    VlaEvalError,
+)
 from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob
 from vla_eval.policies.context import PolicyContext
@@ -33,6 +40,9 @@ from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
 from vla_eval.workers.messages import DeviceFound, Failed, describe_error
 
 logger = logging.getLogger(__name__)
+
+PASSING_ERRORS = (InvalidActionError, RemoteConnectionError, RemoteReplyError, RemoteTimeoutError)
+"""Errors of a setup that are no mistake of the user's: a policy server may soon be there again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +83,7 @@ class EpisodeRunner:
             try:
                 env, policy = self._prepare(job.jobs[0])
             except VlaEvalError as exc:
-                refused = not isinstance(exc, InvalidActionError)
+                refused = not isinstance(exc, PASSING_ERRORS)
                 raise
             return self._run(env, policy, job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen

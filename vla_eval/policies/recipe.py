@@ -1,9 +1,10 @@
-"""A policy by its name: a recipe in `policies/`, or a folder that holds a LeRobot checkpoint.
+"""A policy by its name: a recipe in `policies/`, a folder that holds a LeRobot checkpoint, or an address.
 
-Knows nothing of models: a folder is looked at, never loaded.
+Knows nothing of models: a folder is looked at, never loaded; a server is asked what it is.
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from vla_eval.config.files import Recipe, find_recipe, list_recipes, load_recipe
@@ -18,6 +19,8 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.checkpoint_json import get_count, get_text
 from vla_eval.policies.config_check import MAX_ACTIONS
+from vla_eval.policies.remote.survey import moved, remote_recipe
+from vla_eval.wire.addresses import named_server
 
 LEROBOT_ADAPTER = "lerobot"
 BIG_CHECKPOINT_BYTES = 1 << 30  # of such policies one worker is enough for a GPU, and too much for most CPUs
@@ -29,21 +32,40 @@ def policy_name(name: str) -> str:
     Raises:
         UnknownNameError: there is no such recipe, and no such folder.
         CheckpointError: it is a folder without a checkpoint.
+        RemotePolicyError: it is an address, and there is no policy server.
     """
+    server = named_server(name)
+    if server is not None and server.recipe is None:
+        return remote_recipe(server.urls).name
+    name = name if server is None else bare_policy(name)
     return checkpoint_name(Path(name)) if is_folder(name) else find_recipe("policies", name).stem
 
 
+def bare_policy(name: str) -> str:
+    """Return the recipe of `RECIPE@ws://…`, since the address moves no result; other names as they are."""
+    server = named_server(name)
+    return name if server is None or server.recipe is None else server.recipe
+
+
 def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
-    """Return the recipe of a policy, or one for the checkpoint in a folder.
+    """Return the recipe of a policy, or one for the checkpoint in a folder or for the server at an address.
 
     Args:
         name: the name of a recipe, its file, or a folder: a fine-tuning run, a checkpoint in it, or a
-            LeRobot checkpoint. The recipe's digest is then that of the checkpoint's files.
+            LeRobot checkpoint. The recipe's digest is then that of the checkpoint's files. Or the address of
+            a policy server, `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
 
     Raises:
         UnknownNameError, RecipeError: see `load_recipe`.
         CheckpointError: it is a folder without a checkpoint.
+        RemotePolicyError: it is an address, and there is no policy server.
     """
+    server = named_server(name)
+    if server is not None and server.recipe is None:
+        return remote_recipe(server.urls)
+    if server is not None:
+        recipe = load_recipe("policies", bare_policy(name), PolicyRecipe)
+        return replace(recipe, value=moved(recipe, server.urls))
     if not is_folder(name):
         return load_recipe("policies", name, PolicyRecipe)
     folder = find_checkpoint(Path(name))

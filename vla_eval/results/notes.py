@@ -153,7 +153,7 @@ def _error_notes(rows: Sequence[Row]) -> list[str]:
 
 def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
     """Return the notes on the run folders."""
-    notes = [(str(run.path), note) for run in runs for note in _no_evidence(run)]
+    notes = [(str(run.path), note) for run in runs for note in (*_no_evidence(run), *_unknown_weights(run))]
     doubles = "with the same trajectory as in another run folder; each is counted once."
     notes += [(path, f"{_number(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
     notes += [
@@ -180,6 +180,21 @@ def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
         else:
             told += [f"{path}: {note}" for path in paths]
     return told
+
+
+def _unknown_weights(run: StoredRun) -> list[str]:
+    """Name the policies behind sockets whose servers do not say which weights they have."""
+    unknown = [
+        name
+        for name, server in run.description.servers.items()
+        if not (isinstance(server, Mapping) and "weights_sha256" in server)
+    ]
+    if not unknown:
+        return []
+    return [
+        f"weights unknown: the server of {some_of(unknown)} does not say which weights the policy has, so "
+        "that no change of them would be noticed."
+    ]
 
 
 def _no_evidence(run: StoredRun) -> list[str]:

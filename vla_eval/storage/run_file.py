@@ -38,6 +38,7 @@ class RunDescription:
         command: what the user typed.
         normalization: learned policy -> by which statistics it normalises; recorded only, since the digest
             of the weights in `recipes` covers them.
+        servers: policy behind a socket -> what its server says of itself; compared on resume.
     """
 
     name: str
@@ -47,6 +48,7 @@ class RunDescription:
     options: Mapping[str, JsonValue]
     command: str
     normalization: Mapping[str, JsonValue] = field(default_factory=dict)
+    servers: Mapping[str, JsonValue] = field(default_factory=dict)
 
 
 class Change(NamedTuple):
@@ -136,7 +138,7 @@ class RunFile:
         return PlannedEpisodes(config=planned_config(self.description.config, _source(folder)), groups=groups)
 
     def check_unchanged(self, new: RunDescription, where: Path) -> None:
-        """Raise `RunChangedError` if the configuration or a recipe is not what it was."""
+        """Raise `RunChangedError` if the configuration, a recipe or a policy server is not what it was."""
         old = self.description
         changes = (
             *find_changes(old.config, new.config, prefix="config"),
@@ -146,6 +148,11 @@ class RunFile:
             raise RunChangedError(
                 f"{where}: this run was started with another configuration:\n{_listed(changes)}\n"
                 f"Use another --out for the new configuration, or restore the old one to continue this run."
+            )
+        if changes := find_changes(old.servers, new.servers, prefix="servers"):
+            raise RunChangedError(
+                f"{where}: this run was started with another policy at the server:\n{_listed(changes)}\n"
+                f"Start the former policy there again to continue this run, or use another --out."
             )
 
     def with_session(self, session: Session) -> "RunFile":

@@ -83,7 +83,7 @@ class OpenpiClient:
         return self._metadata.is_ours
 
     def ask_reset(self, session: str, start: EpisodeStart) -> None:
-        """Begin an episode in a session; a server without resets is told nothing."""
+        """Begin an episode in a session; a server without resets gets nothing."""
         # A session may have several episodes of one seed, of different runs or tasks.
         self._episodes[session] = f"{start.task}/{start.run}/{start.seed}"
         metadata = self._metadata

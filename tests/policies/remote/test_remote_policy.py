@@ -332,9 +332,12 @@ def test_an_answer_for_somebody_else_is_refused(change: dict[str, Any], problem:
 
 
 def test_an_answer_without_actions_is_refused() -> None:
-    with remote(
-        answering(lambda one: {"session_id": one["session_id"], "step": 0, "message": "no"})
-    ) as policy, pytest.raises(RemoteReplyError, match="no"):
+    with (
+        remote(
+            answering(lambda one: {"session_id": one["session_id"], "step": 0, "message": "no"})
+        ) as policy,
+        pytest.raises(RemoteReplyError, match="no"),
+    ):
         run(policy, 7)
 
 
@@ -364,9 +367,12 @@ def test_actions_of_another_shape_or_type_are_refused_as_of_any_policy(actions: 
 
 def test_conversion_leaves_what_is_not_sound_for_the_loop_to_refuse() -> None:
     wrong = np.full((CHUNK_SIZE, 7), np.nan, dtype=np.float32)
-    with remote(
-        answering(lambda one: echo(one, actions=wrong)), actions={"gripper": "close_positive"}
-    ) as policy, pytest.raises(InvalidActionError, match="nan"):
+    with (
+        remote(
+            answering(lambda one: echo(one, actions=wrong)), actions={"gripper": "close_positive"}
+        ) as policy,
+        pytest.raises(InvalidActionError, match="nan"),
+    ):
         run(policy, 7)
 
 

@@ -42,7 +42,7 @@ class RemotePolicy:
 
         Args:
             spec: what the policy reads and returns.
-            clients: slot -> connection; the same one for all slots where the server can tell them apart.
+            clients: slot -> connection; the same one for all slots where the server can distinguish them.
             fit: how observations become requests.
             settings: the recipe.
             action: what actions mean here.

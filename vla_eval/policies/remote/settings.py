@@ -9,7 +9,7 @@ from vla_eval.bounds import MAX_SECONDS, check_bounds, require
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.errors import RecipeError
-from vla_eval.wire.metadata import MAX_ACTIONS, MAX_IMAGE_PX, MAX_SERVER_ROWS
+from vla_eval.wire.metadata import MAX_ACTIONS, MAX_IMAGE_PX
 
 ADAPTER = "remote"
 DEFAULT_KEY_ENV = "MIKASA_VLA_API_KEY"
@@ -81,7 +81,6 @@ class RemoteSettings:
         chunk_size: actions of one reply; None: as the server says.
         reads: whether the policy must see each control step; None: as the server says.
         actions: what the server's actions mean; None: the same as here.
-        batch_max: rows of a pass at the server; None: as the server says.
         timeout_seconds: how long a reply is waited for.
         connect_seconds: how long a worker waits for a server that does not listen yet.
         api_key_env: the environment variable with the API key.
@@ -95,7 +94,6 @@ class RemoteSettings:
     chunk_size: int | None = None
     reads: Literal["last", "every"] | None = None
     actions: ActionSettings | None = None
-    batch_max: int | None = None
     timeout_seconds: float = 120.0
     connect_seconds: float = 30.0
     api_key_env: str | None = None
@@ -105,7 +103,6 @@ class RemoteSettings:
             self,
             {
                 "chunk_size": (1, MAX_ACTIONS),
-                "batch_max": (1, MAX_SERVER_ROWS),
                 "timeout_seconds": (0.001, MAX_SECONDS),
                 "connect_seconds": (0.0, MAX_SECONDS),
             },
