@@ -90,30 +90,44 @@ def test_a_broken_environment_is_noticed(fault: str, sentence: str) -> None:
 
 
 class BrokenPolicy:
-    """Draws from a generator that survives a reset, or changes what it is shown, or reuses its buffer."""
+    """A policy that sums up what it sees, with one promise broken."""
 
     def __init__(self, fault: str) -> None:
         self.spec = PolicySpec(name="broken", reads="last", cameras=(), states=("qpos",), chunk_size=2)
         self.fault = fault
         self._rng = np.random.default_rng(0)
         self._buffer = np.zeros((2, 7), dtype=np.float32)
+        self._sums: dict[int, float] = {}
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        pass
+        if self.fault == "others":
+            self._sums.clear()
+        for episode in episodes:
+            if self.fault != "kept" or episode.slot not in self._sums:
+                self._sums[self._key(episode.slot)] = 0.0
+
+    def _key(self, slot: int) -> int:
+        return 0 if self.fault == "mixed" else slot
 
     def act(self, window: ObservationWindow) -> ActionChunk:
+        key = self._key(window.slot)
+        self._sums[key] = self._sums.get(key, 0.0) + float(window.last.state["qpos"].sum())
         if self.fault == "writes":
             window.last.state["qpos"][:] = 0
         if self.fault == "buffer":
             return ActionChunk(actions=self._buffer)
-        drawn = self._rng.uniform(-1, 1, (2, 7)) if self.fault == "past" else np.zeros((2, 7))
-        return ActionChunk(actions=drawn.astype(np.float32))
+        if self.fault == "past":
+            return ActionChunk(actions=self._rng.uniform(-1, 1, (2, 7)).astype(np.float32))
+        return ActionChunk(actions=np.full((2, 7), self._sums[key], dtype=np.float32))
 
 
 @pytest.mark.parametrize(
     ("fault", "sentence"),
     [
-        ("past", "the same actions after another episode"),
+        ("past", r"the same actions after another episode\. Forget everything of a slot"),
+        ("kept", r"the same actions after another episode\. Forget everything of a slot"),
+        ("mixed", r"beside another episode\. Keep your state by `window\.slot`"),
+        ("others", r"when another episode begins .* Keep your state by `window\.slot`"),
         ("writes", "leaves the observations as they are"),
         ("buffer", "must not share a buffer"),
     ],
@@ -122,3 +136,12 @@ def test_a_broken_policy_is_noticed(fault: str, sentence: str) -> None:
     env: Any = make_env(FAKE)
     with pytest.raises(ConformanceError, match=sentence):
         check_policy(lambda: BrokenPolicy(fault), env.spec)
+
+
+def test_a_policy_with_memory_by_slot_passes_and_the_check_says_what_it_tried() -> None:
+    env: Any = make_env(FAKE)
+    said: list[str] = []
+    met = check_policy(lambda: BrokenPolicy("none"), env.spec, report=said.append)
+    assert met == said
+    assert "The same episode seed and observations give the same actions beside another episode." in met
+    assert "A chunk is float32 of shape (2, 7) and finite." in met

@@ -1,6 +1,7 @@
 """Does a policy fulfil the contract of `Policy`?"""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,38 +12,154 @@ from vla_eval.testing.claims import claim
 N_INFERENCES = 3
 HORIZON_STEPS = 60
 
+SAME = "The same episode seed and observations give the same actions"
+FORGET = (
+    "Forget everything of a slot in `reset`; draw random numbers from a generator seeded by `episode.seed`."
+)
+BY_SLOT = "Keep your state by `window.slot`: `reset` begins the given slots only."
+
+Observe = Callable[[int, int], Observation]
+
+
+@dataclass(slots=True, kw_only=True)
+class _Episode:
+    """An episode in a slot; it begins when the others have had so many inferences."""
+
+    slot: int
+    seed: int
+    begins_after: int = 0
+    chunks: list[ActionChunk] = field(default_factory=list)
+
 
 def check_policy(
     make: Callable[[], Policy],
     env: EnvSpec,
     *,
-    observe: Callable[[int, int], Observation] | None = None,
+    observe: Observe | None = None,
     instruction: str = "pick up the red cube",
-) -> None:
+    report: Callable[[str], None] = lambda requirement: None,
+) -> list[str]:
     """Raise `ConformanceError` unless the policies that `make` returns fulfil the contract.
 
     Args:
-        make: returns a new policy of the same weights at each call.
+        make: returns a new policy of the same weights at each call, for two slots.
         env: the environment in which the policy will be run.
         observe: (seed, step) -> an observation, for a policy that needs more than noise in the declared
             shapes (privileged ones do).
         instruction: the instruction that the policy gets.
+        report: called with each requirement that is met, as soon as that is known.
+
+    Returns:
+        The requirements, all of which are met.
 
     Raises:
         SpecMismatchError: the policy needs what the environment does not provide.
+        ConformanceError: a requirement is not met.
     """
+    met: list[str] = []
+
+    def note(requirement: str) -> None:
+        met.append(requirement)
+        report(requirement)
+
     policy = make()
-    check_compatible(policy.spec, env)
-    look = observe or (lambda seed, step: _noise(policy.spec, env, seed, step))
-    alone = {seed: _episode(policy, policy.spec, look, [seed], instruction)[0] for seed in (1, 2)}
-    for chunks in alone.values():
-        for chunk in chunks:
-            _check_chunk(chunk, policy.spec, env)
-    _claim_equal(alone[1], _episode(policy, policy.spec, look, [1], instruction)[0], "after another episode")
-    _claim_equal(alone[1], _episode(make(), policy.spec, look, [1], instruction)[0], "in a new policy")
-    together = _episode(policy, policy.spec, look, [2, 1], instruction)
-    _claim_equal(alone[2], together[0], "beside another episode")
-    _claim_equal(alone[1], together[1], "beside another episode")
+    spec = policy.spec
+    check_compatible(spec, env)
+    note(f"{env.task} provides what it reads: {', '.join((*spec.cameras, *spec.states)) or 'nothing'}.")
+    runs = _Runs(spec, env, observe, instruction)
+    alone = [runs.run(policy, _Episode(slot=slot, seed=seed))[0] for slot, seed in enumerate((2, 1))]
+    note(f"A chunk is float32 of shape {runs.chunk_shape} and finite.")
+    note("It leaves the observations as they are.")
+    note("No two chunks share a buffer.")
+
+    def same(found: Sequence[_Episode], where: str, advice: str) -> None:
+        for episode in found:
+            expected = alone[episode.slot].chunks
+            pairs = zip(expected, episode.chunks, strict=True)
+            equal = all(np.array_equal(a.actions, b.actions) for a, b in pairs)
+            claim(equal, f"{SAME} {where}.", advice=advice)
+        note(f"{SAME} {where}.")
+
+    def first() -> _Episode:
+        return _Episode(slot=0, seed=2)
+
+    def second(begins_after: int = 0) -> _Episode:
+        return _Episode(slot=1, seed=1, begins_after=begins_after)
+
+    same(runs.run(policy, first()), "after another episode", FORGET)
+    runs.run(policy, _Episode(slot=1, seed=3))
+    same(runs.run(policy, second()), "after another episode in the same slot", FORGET)
+    same(runs.run(make(), second()), "in a new policy", FORGET)
+    same(runs.run(policy, first(), second()), "beside another episode", BY_SLOT)
+    meanwhile = runs.run(policy, first(), second(begins_after=1))
+    same(meanwhile, "when another episode begins or ends meanwhile", BY_SLOT)
+    return met
+
+
+class _Runs:
+    """Runs episodes of a policy without a simulator."""
+
+    def __init__(self, spec: PolicySpec, env: EnvSpec, observe: Observe | None, instruction: str) -> None:
+        self.chunk_shape = (spec.chunk_size, len(env.action.dims))
+        self._spec, self._instruction = spec, instruction
+        self._observe = observe or (lambda seed, step: _noise(spec, env, seed, step))
+
+    def run(self, policy: Policy, *episodes: _Episode) -> Sequence[_Episode]:
+        """Fill in the chunks of the episodes, which are predicted side by side."""
+        for turn in range(N_INFERENCES + max(episode.begins_after for episode in episodes)):
+            begins = [one for one in episodes if one.begins_after == turn]
+            if begins:
+                policy.reset([self._start(episode) for episode in begins])
+            due = [one for one in episodes if one.begins_after <= turn and len(one.chunks) < N_INFERENCES]
+            for episode, chunk in zip(due, self._act(policy, due), strict=True):
+                self._check(chunk, earlier=episode.chunks)
+                episode.chunks.append(chunk)
+        return episodes
+
+    def _start(self, episode: _Episode) -> EpisodeStart:
+        return EpisodeStart(
+            slot=episode.slot,
+            row=episode.slot,
+            task="check",
+            seed=episode.seed,
+            run=0,
+            instruction=self._instruction,
+            horizon_steps=HORIZON_STEPS,
+        )
+
+    def _act(self, policy: Policy, due: Sequence[_Episode]) -> list[ActionChunk]:
+        windows = [self._window(episode) for episode in due]
+        before = [_bytes(window) for window in windows]
+        if isinstance(policy, BatchPolicy):
+            chunks = policy.act_batch(windows)
+        else:
+            chunks = [policy.act(window) for window in windows]
+        unchanged = [_bytes(window) for window in windows] == before
+        claim(unchanged, "A policy leaves the observations as they are.", advice="Change a copy.")
+        return chunks
+
+    def _window(self, episode: _Episode) -> ObservationWindow:
+        size = self._spec.chunk_size
+        step = len(episode.chunks) * size
+        first = max(step - size + 1, 0) if self._spec.reads == "every" else step
+        frames = tuple(self._observe(episode.seed, s) for s in range(first, step + 1))
+        return ObservationWindow(slot=episode.slot, frames=frames)
+
+    def _check(self, chunk: ActionChunk, *, earlier: Sequence[ActionChunk]) -> None:
+        actions = chunk.actions
+        claim(
+            actions.shape == self.chunk_shape and actions.dtype == np.float32,
+            f"A chunk is float32 of shape {self.chunk_shape}.",
+            f"{actions.dtype} of shape {actions.shape}",
+            advice="The shape is (chunk_size, dimensions of an action).",
+        )
+        claim(bool(np.isfinite(actions).all()), "Actions are finite.")
+        shared = any(np.shares_memory(one.actions, actions) for one in earlier)
+        claim(
+            not shared,
+            "Two chunks must not share a buffer: the first would change.",
+            advice="Return a new array each time.",
+        )
 
 
 def _noise(spec: PolicySpec, env: EnvSpec, seed: int, step: int) -> Observation:
@@ -55,68 +172,5 @@ def _noise(spec: PolicySpec, env: EnvSpec, seed: int, step: int) -> Observation:
     )
 
 
-def _episode(
-    policy: Policy,
-    spec: PolicySpec,
-    look: Callable[[int, int], Observation],
-    seeds: Sequence[int],
-    instruction: str,
-) -> list[list[ActionChunk]]:
-    """Return the chunks of one episode per seed, predicted side by side."""
-    starts = [
-        EpisodeStart(
-            slot=slot,
-            task="check",
-            seed=seed,
-            run=0,
-            instruction=instruction,
-            horizon_steps=HORIZON_STEPS,
-            row=slot,
-        )
-        for slot, seed in enumerate(seeds)
-    ]
-    policy.reset(starts)
-    chunks: list[list[ActionChunk]] = [[] for _ in seeds]
-    for index in range(N_INFERENCES):
-        windows = [_window(spec, look, start, index) for start in starts]
-        before = [_bytes(window) for window in windows]
-        if isinstance(policy, BatchPolicy):
-            answers = policy.act_batch(windows)
-        else:
-            answers = [policy.act(window) for window in windows]
-        claim([_bytes(w) for w in windows] == before, "A policy leaves the observations as they are.")
-        for slot, answer in enumerate(answers):
-            for earlier in chunks[slot]:
-                shared = np.shares_memory(earlier.actions, answer.actions)
-                claim(not shared, "Two chunks must not share a buffer: the first would change.")
-            chunks[slot].append(answer)
-    return chunks
-
-
-def _window(
-    spec: PolicySpec, look: Callable[[int, int], Observation], start: EpisodeStart, index: int
-) -> ObservationWindow:
-    step = index * spec.chunk_size
-    first = max(step - spec.chunk_size + 1, 0) if spec.reads == "every" else step
-    return ObservationWindow(
-        slot=start.slot, frames=tuple(look(start.seed, s) for s in range(first, step + 1))
-    )
-
-
 def _bytes(window: ObservationWindow) -> list[bytes]:
     return [a.tobytes() for f in window.frames for group in (f.images, f.state) for a in group.values()]
-
-
-def _check_chunk(chunk: ActionChunk, spec: PolicySpec, env: EnvSpec) -> None:
-    expected = (spec.chunk_size, len(env.action.dims))
-    claim(
-        chunk.actions.shape == expected and chunk.actions.dtype == np.float32,
-        f"A chunk is float32 of shape {expected}.",
-        f"{chunk.actions.dtype} of shape {chunk.actions.shape}",
-    )
-    claim(bool(np.isfinite(chunk.actions).all()), "Actions are finite.")
-
-
-def _claim_equal(first: Sequence[ActionChunk], second: Sequence[ActionChunk], where: str) -> None:
-    same = all(np.array_equal(a.actions, b.actions) for a, b in zip(first, second, strict=True))
-    claim(same, f"The same episode seed and observations give the same actions {where}.")

@@ -6,16 +6,17 @@ from vla_eval.core import Observation
 from vla_eval.errors import ConformanceError
 
 
-def claim(kept: bool, promise: str, found: str = "") -> None:
+def claim(kept: bool, promise: str, found: str = "", *, advice: str = "") -> None:
     """Raise `ConformanceError` unless the requirement is met.
 
     Args:
         kept: whether it is met.
         promise: the requirement as a sentence.
         found: what was found instead.
+        advice: how to meet it, as a sentence.
     """
     if not kept:
-        raise ConformanceError(f"{promise}{f' Found: {found}.' if found else ''}")
+        raise ConformanceError(f"{promise}{f' Found: {found}.' if found else ''}{advice and f' {advice}'}")
 
 
 def same_observation(first: Observation, second: Observation) -> bool:
