@@ -1,0 +1,33 @@
+"""`python -m mikasa_vla_client ws://HOST:PORT`: check a server, print what holds."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import Sequence
+
+from mikasa_vla_client.check import CheckFailedError, check_remote
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check; return 0 if every requirement is met, otherwise 1."""
+    parser = argparse.ArgumentParser(
+        prog="mikasa_vla_client", description=check_remote.__doc__.splitlines()[0]
+    )
+    parser.add_argument("url", metavar="URL", help="ws://HOST:PORT of the server")
+    parser.add_argument("--api-key-env", metavar="VAR", help="variable that holds the server's key")
+    args = parser.parse_args(argv)
+    try:
+        key = os.environ[args.api_key_env] if args.api_key_env else None
+        check_remote(args.url, api_key=key, report=lambda claim: print("ok  " + claim, flush=True))
+    except KeyError:
+        parser.error(f"--api-key-env: the variable {args.api_key_env} is not set")
+    except CheckFailedError as exc:
+        print(exc, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+"""One connection to a policy server, and episodes of noise over it, for `check.py`.
+
+This file runs with Python 3.8, numpy 1.22 and websockets 13, and imports nothing else but the codec beside
+it: `mikasa_vla_client` ships it, too. It knows no policy and no simulator.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from dataclasses import dataclass
+from typing import Any, Dict, List, Mapping, Sequence
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.sync.client import connect
+
+from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
+
+N_INFERENCES = 3
+HORIZON_STEPS = 60
+PROMPT, TASK = "pick up the red cube", "RememberColor3-v0"
+
+Message = Dict[str, Any]  # Any: whatever a message may hold
+Chunks = List["np.ndarray[Any, Any]"]
+
+
+class CheckFailedError(Exception):
+    """A server does not keep the protocol, or cannot be reached."""
+
+
+class RefusedError(Exception):
+    """The server answered with a text, as it does for an error."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a server says of itself, as far as it is needed here."""
+
+    chunk_size: int
+    n_dims: int
+    cameras: Mapping[str, tuple[int, int]]  # key -> height, width
+    state_key: str | None
+    layouts: Mapping[str, int]  # name -> how many numbers
+    prompt_key: str
+    needs_every_frame: bool
+    batch_max: int
+    supports: Sequence[str]
+
+    def observation(self, seed: int, step: int, layout: str | None = None) -> Message:
+        """Return noise in the announced shapes."""
+        rng = np.random.default_rng((seed, step))
+        sizes = self.cameras.items()
+        frame: Message = {key: rng.integers(0, 256, (*size, 3), dtype=np.uint8) for key, size in sizes}
+        if self.state_key is not None and self.layouts:
+            n_numbers = self.layouts[layout or next(iter(self.layouts))]
+            frame[self.state_key] = rng.uniform(-1, 1, n_numbers).astype(np.float32)
+        return {**frame, self.prompt_key: PROMPT}
+
+
+class Server:
+    """The server that is checked; `facts` and `alone` are filled in as they become known."""
+
+    def __init__(self, url: str, api_key: str | None, timeout_seconds: float) -> None:
+        self.url, self.timeout_seconds = url, timeout_seconds
+        self._headers = {} if api_key is None else {"Authorization": "Api-Key " + api_key}
+        self.facts: Any = None
+        self.alone: dict[int, Chunks] = {}
+
+    def connect(self) -> Connection:
+        """Open a connection and read the first message."""
+        options: dict[str, Any] = {"ping_interval": None, "proxy": None}
+        accepted = inspect.signature(connect).parameters  # websockets 13 has neither
+        options = {name: value for name, value in options.items() if name in accepted}
+        try:
+            opened = contextlib.ExitStack()
+            socket = opened.enter_context(
+                connect(
+                    self.url,
+                    additional_headers=self._headers,
+                    compression=None,
+                    max_size=MAX_MESSAGE_BYTES,
+                    open_timeout=self.timeout_seconds,
+                    **options,
+                )
+            )
+        except (OSError, InvalidHandshake, InvalidURI, TimeoutError) as exc:
+            raise self.failed(f"no connection: {exc or type(exc).__name__}. Start the server first.") from exc
+        try:
+            return Connection(self, socket, opened)
+        except RefusedError as exc:
+            raise self.failed(f"expected a map as the first message, found the text: {exc}") from exc
+
+    def first_message(self) -> Message:
+        """Return what the server says of itself."""
+        with self.connect() as connection:
+            return connection.metadata
+
+    def failed(self, message: str) -> CheckFailedError:
+        """Return the error with the server's address."""
+        return CheckFailedError(f"{self.url}: {message}")
+
+    def expect(self, holds: bool, requirement: str, found: str) -> None:
+        """Raise `CheckFailedError` unless a requirement is met."""
+        if not holds:
+            raise self.failed(f"{requirement} Found: {found}.")
+
+
+class Connection:
+    """One connection; replies for another session than the one asked for are kept."""
+
+    def __init__(self, server: Server, socket: Any, opened: contextlib.ExitStack) -> None:
+        self._server, self._socket, self._opened = server, socket, opened
+        self._kept: dict[str, list[Message]] = {}
+        self.metadata = self.receive()
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def send(self, message: Any) -> None:
+        """Send a map, or bytes and text as they are."""
+        with contextlib.suppress(ConnectionClosed):  # why it was closed, `receive` says
+            self._socket.send(packb(message) if isinstance(message, dict) else message)
+
+    def receive(self, session_id: str | None = None) -> Message:
+        """Return the next reply, or the next one for this session."""
+        kept = self._kept.get(session_id or "")
+        if kept:
+            return kept.pop(0)
+        while True:
+            reply = self._receive()
+            other = reply.get("session_id")
+            if session_id is None or other == session_id or not isinstance(other, str):
+                return reply
+            self._kept.setdefault(other, []).append(reply)
+
+    def _receive(self) -> Message:
+        try:
+            data = self._socket.recv(timeout=self._server.timeout_seconds)
+        except TimeoutError as exc:
+            seconds = self._server.timeout_seconds
+            raise self._server.failed(f"no reply within {seconds:g} s.") from exc
+        except ConnectionClosed as exc:
+            raise self._server.failed(f"the connection was closed without a message: {exc}.") from exc
+        if isinstance(data, str):
+            raise RefusedError(data)
+        try:
+            reply = unpackb(data)
+        except CodecError as exc:
+            raise self._server.failed(f"expected msgpack with arrays as openpi packs them: {exc}.") from exc
+        self._server.expect(isinstance(reply, dict), "A message is a map.", type(reply).__name__)
+        return dict(reply)
+
+
+class Episode:
+    """One episode in one session: reset, then an inference every `chunk_size` steps."""
+
+    def __init__(self, server: Server, connection: Connection, seed: int, session_id: str = "a") -> None:
+        self._server, self._facts, self._connection = server, server.facts, connection
+        self._seed, self._session_id = seed, session_id
+        self._next = 0
+        self.chunks: Chunks = []
+
+    def begin(self) -> None:
+        """Reset the session."""
+        facts: Message = {"task": TASK, "seed": self._seed, "run": 0, "horizon_steps": HORIZON_STEPS}
+        row = {"row": self._seed % self._facts.batch_max} if "row" in self._facts.supports else {}
+        about = {self._facts.prompt_key: PROMPT, **facts, **row}
+        self._connection.send({"endpoint": "reset", "session_id": self._session_id, **about})
+        reply = self._reply()
+        self._server.expect(
+            reply.get("status") == "reset", "The reply to `reset` has 'status': 'reset'.", shown(reply)
+        )
+
+    def ask(self, layout: str | None = None) -> None:
+        """Send the frames since the last inference, then the newest one with the request."""
+        step = self._next * self._facts.chunk_size
+        named = {"session_id": self._session_id}
+        if self._facts.needs_every_frame:
+            for past in range(max(step - self._facts.chunk_size + 1, 0), step):
+                frame = self._facts.observation(self._seed, past, layout)
+                self._connection.send({**frame, **named, "step": past, "endpoint": "observe"})
+        frame = self._facts.observation(self._seed, step, layout)
+        self._connection.send({**frame, **named, "step": step, "endpoint": "infer"})
+
+    def answer(self) -> None:
+        """Read the reply, check it, and keep its actions."""
+        reply, facts, expect = self._reply(), self._facts, self._server.expect
+        step = self._next * facts.chunk_size
+        echo = (reply.get("session_id"), reply.get("step"))
+        requirement = "A reply repeats `session_id` and `step` of its request; `observe` has no reply."
+        expect(echo == (self._session_id, step), requirement, f"{echo}, expected {(self._session_id, step)}")
+        expect(isinstance(reply.get("server_timing"), dict), "A reply has `server_timing`.", shown(reply))
+        chunk, shape = reply.get("actions"), (facts.chunk_size, facts.n_dims)
+        is_chunk = isinstance(chunk, np.ndarray) and chunk.dtype == np.float32 and chunk.shape == shape
+        expect(is_chunk, f"`actions` is float32 of shape {shape}.", shown(chunk))
+        expect(bool(np.isfinite(np.asarray(chunk)).all()), "Actions are finite.", "values that are not")
+        self.chunks.append(np.asarray(chunk))
+        self._next += 1
+
+    def _reply(self) -> Message:
+        try:
+            return self._connection.receive(self._session_id)
+        except RefusedError as exc:
+            raise self._server.failed(f"a request that keeps the protocol was refused: {exc}") from exc
+
+
+def run_episodes(episodes: Sequence[Episode]) -> list[Chunks]:
+    """Run episodes side by side, all requests of a round before its replies; each begins a round later."""
+    for turn in range(N_INFERENCES + len(episodes) - 1):
+        if turn < len(episodes):
+            episodes[turn].begin()
+        running = [one for k, one in enumerate(episodes) if k <= turn < k + N_INFERENCES]
+        for episode in running:
+            episode.ask()
+        for episode in running:
+            episode.answer()
+    return [episode.chunks for episode in episodes]
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message: short, and of an array type and shape."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} of shape {value.shape}"
+    if isinstance(value, dict):
+        return "a map with " + (", ".join(sorted(map(str, value))) or "nothing")[:120]
+    return repr(value)[:120]
