@@ -18,6 +18,7 @@ VERBS = (
     "eval",
     "report",
     "compare",
+    "check",
     "audit",
     "view",
     "record",

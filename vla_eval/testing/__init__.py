@@ -1,4 +1,4 @@
-"""Conformance checks for environments, policies and tasks, for us and for third parties.
+"""Conformance checks for environments, policies, tasks and policy servers, for us and for third parties.
 
 Each check raises `ConformanceError` with the requirement that is violated. If it returns, all requirements
 are met. The checks need no test framework:

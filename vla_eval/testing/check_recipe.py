@@ -1,0 +1,83 @@
+"""Does a policy that is named as `eval` takes it fulfil the contract? Without a simulator.
+
+Most policies are given noise. A privileged one reads the true state of the world, which noise is not: it is
+given what the fake simulator shows while the arm holds still.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.core import Observation
+from vla_eval.envs.fake import FakeEnv
+from vla_eval.errors import ConformanceError
+from vla_eval.evaluation.plan import make_plan
+from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.testing.check_policy import check_policy
+
+N_SLOTS = 2  # as many episodes as the check runs side by side
+
+
+def check_recipe(policy: str, *, task: str, report: Callable[[str], None]) -> list[str]:
+    """Check a policy by its name, its recipe's file or its checkpoint's folder.
+
+    Args:
+        policy: what `eval --policy` takes.
+        task: the task whose cameras, states and actions it is given.
+        report: called with each requirement that is met, as soon as that is known.
+
+    Returns:
+        The requirements, all of which are met.
+
+    Raises:
+        ConformanceError: a requirement is not met.
+        VlaEvalError: there is no such policy or task, or the policy cannot be made.
+    """
+    config = EvalConfig(
+        name="check",
+        tasks=(task,),
+        policies=(policy,),
+        episodes=1,
+        slots_per_worker=N_SLOTS,
+        simulator="fake",
+    )
+    jobs = make_plan(config).jobs
+    group = jobs[0].group
+    shown = _Shown(replace(group.env, cameras=(), privileged=True))
+    facts = EnvFacts(shown.spec, shown.n_candidates)
+    made = [make_policy(group, facts)]  # given to the check first: weights take long to load
+    return check_policy(
+        lambda: made.pop() if made else make_policy(group, facts),
+        facts.spec,
+        observe=shown.observe if made[0].spec.privileged else None,
+        instruction=group.instruction,
+        report=report,
+    )
+
+
+class _Shown:
+    """What the fake simulator shows of an episode in which the arm holds still."""
+
+    def __init__(self, settings: EnvSettings) -> None:
+        self._settings = settings
+        self._seen: dict[int, list[Observation]] = {}
+        env = FakeEnv(settings)
+        self.spec = env.spec
+        self.n_candidates = env.reset({0: 1}, render=False)[0].status.n_candidates
+
+    def observe(self, seed: int, step: int) -> Observation:
+        """Return the observation after so many control steps."""
+        if seed not in self._seen:
+            env = FakeEnv(self._settings)
+            results = [env.reset({0: seed}, render=False)[0]]
+            for _ in range(self.spec.horizon_steps):
+                results.append(env.step({0: env.hold_action(0)}, render=frozenset())[0])
+            self._seen[seed] = [result.observation for result in results]
+        seen = self._seen[seed]
+        if step >= len(seen):
+            raise ConformanceError(
+                f"the check needs step {step}, but an episode of {self.spec.task} has {len(seen) - 1} steps. "
+                f"Name a task with a longer episode with --task."
+            )
+        return seen[step]
