@@ -12,6 +12,7 @@ from vla_eval.config.prompts import instruction_for, load_prompts
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
+from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 Row = Sequence[str]
@@ -24,6 +25,7 @@ READY, TO_TRAIN, FROM_BASE = (
     "to fine-tune, from scratch",
     "to fine-tune, from a published base",
 )
+REMOTE = "behind a socket: needs a server"
 FOR_TESTS, ADAPTERS = "for tests: tiny, with random weights", "adapters without a recipe of their own"
 TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
 RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe]
@@ -88,7 +90,8 @@ def _chance(chance: float | None) -> str:
 
 def _policies() -> Groups:
     groups: dict[str, list[Row]] = {
-        heading: [] for heading in (BASELINES, READY, TO_TRAIN, FROM_BASE, FOR_TESTS, ADAPTERS, BROKEN)
+        heading: []
+        for heading in (BASELINES, READY, TO_TRAIN, FROM_BASE, REMOTE, FOR_TESTS, ADAPTERS, BROKEN)
     }
     recipes = list_recipes("policies")
     for name in recipes:
@@ -104,6 +107,8 @@ def _policies() -> Groups:
 
 def _group(name: str, recipe: PolicyRecipe) -> str:
     """Return the heading that a policy is listed under: what has to be done before it is evaluated."""
+    if recipe.adapter == REMOTE_ADAPTER:
+        return REMOTE
     if recipe.finetune is None:
         return READY if "checkpoint" in recipe.args else BASELINES
     if name.endswith(TINY_SUFFIX):
