@@ -34,9 +34,10 @@ GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
 MAX_ITEMS = 100
-CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5}
-SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5}
-BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75)}
+RULES = {"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False}
+CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5, **RULES}
+SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0, **RULES}
+BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
 CAMERAS = tuple(
     CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
     for name in ("base_camera", "hand_camera")
@@ -82,8 +83,9 @@ class FakeEnv:
     """Implements `SimEnv`; `n_renders` counts the observations that were rendered.
 
     Args:
-        settings: `kwargs` may hold `horizon_steps`; `n_items`, `n_shown`, `cue_steps`, `delay_steps` for
-            tasks with candidates; `velocity_range_m_s` for the others.
+        settings: `kwargs` may hold `horizon_steps` and `swap_cue`; `n_items`, `n_shown`, `cue_steps`,
+            `delay_steps`, `swap_order`, `show_cue`, `freeze_until_choice`, `strict_choice` for tasks with
+            candidates; `velocity_range_m_s` for the others.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
@@ -95,8 +97,7 @@ class FakeEnv:
         check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
         for name, value in settings.kwargs.items():
-            hint = tuple[float, ...] if name == "velocity_range_m_s" else int
-            check_argument(hint, value, name=name, task=task.id)
+            check_argument(_argument_type(name), value, name=name, task=task.id)
         _check_ranges(arguments, where=task.id)
         self._n_items: int = arguments.get("n_items", 0)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
@@ -105,6 +106,11 @@ class FakeEnv:
         self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
         self._cue_steps: int = arguments.get("cue_steps", 0)
         self._response_step: int = self._cue_steps + arguments.get("delay_steps", 0)
+        self._swap_cue: int = arguments["swap_cue"]
+        self._swap_order: int = arguments.get("swap_order", 0)
+        self._shows_cue: bool = arguments.get("show_cue", True)
+        self._is_frozen: bool = arguments.get("freeze_until_choice", False)
+        self._is_strict: bool = arguments.get("strict_choice", False)
         self._settings = settings
         self._episodes: dict[int, _Episode] = {}
         self.n_renders = 0
@@ -125,15 +131,19 @@ class FakeEnv:
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         """Execute one control step in each of the given slots; see `SimEnv`."""
+        executed: dict[int, FloatArray] = {}
         for slot, action in actions.items():
-            self._advance(self._episodes[slot], np.clip(action.astype(np.float64), -1, 1))
+            executed[slot] = self._executed(slot, action)
+            self._advance(self._episodes[slot], executed[slot].astype(np.float64))
         return {
-            slot: replace(
-                self._result(slot, render=slot in render),
-                executed_action=np.clip(action, -1, 1).astype(np.float32),
-            )
-            for slot, action in actions.items()
+            slot: replace(self._result(slot, render=slot in render), executed_action=executed[slot])
+            for slot in actions
         }
+
+    def _executed(self, slot: int, action: FloatArray) -> FloatArray:
+        if self._is_frozen and self._episodes[slot].step < self._response_step:
+            return self.hold_action(slot)
+        return np.clip(action, -1, 1).astype(np.float32)
 
     def hold_action(self, slot: int) -> FloatArray:
         """Return the action that moves neither point nor gripper."""
@@ -156,14 +166,25 @@ class FakeEnv:
             candidates_m=candidates,
             targets=self._draw_targets(rng),
             ball_m=np.array([rng.uniform(-0.1, 0.1), -0.6, CANDIDATE_Z_M]),
-            ball_velocity_m_s=np.array([0.0, rng.uniform(*self._speeds_m_s), 0.0]),
+            ball_velocity_m_s=np.array([0.0, self._swapped_m_s(rng.uniform(*self._speeds_m_s)), 0.0]),
             goal_m=np.array([rng.uniform(0.15, 0.2), 0.3, 0.0]),
         )
 
     def _draw_targets(self, rng: np.random.Generator) -> tuple[int, ...]:
         if self._n_items and self._n_shown == 1:
-            return (int(rng.integers(self._n_items)),)
-        return tuple(int(i) for i in rng.permutation(self._n_items)[: self._n_shown])
+            return ((int(rng.integers(self._n_items)) + self._swap_cue) % self._n_items,)
+        drawn = rng.permutation(self._n_items)
+        shown = [int(i) for i in drawn[: self._n_shown]]
+        if shown and self._swap_cue:
+            shown[0] = int(drawn[self._n_shown + self._swap_cue - 1])
+        if self._swap_order:
+            shown[0], shown[self._swap_order] = shown[self._swap_order], shown[0]
+        return tuple(shown)
+
+    def _swapped_m_s(self, drawn_m_s: float) -> float:
+        least, most = self._speeds_m_s
+        half = (most - least) / 2 if self._swap_cue else 0.0
+        return drawn_m_s + half if drawn_m_s < least + half else drawn_m_s - half
 
     def _advance(self, episode: _Episode, action: Vector) -> None:
         moved = action[:3] * M_PER_STEP
@@ -211,20 +232,22 @@ class FakeEnv:
             success = bool(np.linalg.norm((episode.ball_m - episode.goal_m)[:2]) <= GOAL_RADIUS_M)
         else:
             success = self._touched(episode) in episode.targets and self._is_complete(episode)
+        n_wrong = sum(choice not in episode.targets for choice in episode.touched)
+        is_lost = self._is_strict and n_wrong > 0
         status = TaskStatus(
             phase=self._phase(episode),
-            success=success,
-            fail=False,
+            success=success and not is_lost,
+            fail=is_lost,
             target=_only(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=self._chance(),
             candidate_places=places_from_right(episode.candidates_m[:, :2]),
             n_candidates=self._n_items,
             first_choice=episode.touched[0] if episode.touched else None,
-            n_wrong_choices=sum(choice not in episode.targets for choice in episode.touched),
+            n_wrong_choices=n_wrong,
         )
         return StepResult(
-            observation=self._observe(episode, render=render), status=status, reward=float(success)
+            observation=self._observe(episode, render=render), status=status, reward=float(status.success)
         )
 
     def _observe(self, episode: _Episode, *, render: bool) -> Observation:
@@ -256,7 +279,7 @@ class FakeEnv:
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
         picture = rng.integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
-        in_cue = self._phase(episode) == "cue" and episode.targets
+        in_cue = self._shows_cue and self._phase(episode) == "cue" and episode.targets
         picture[:8] = 20 * (episode.targets[0] + 1) if in_cue else 0
         return picture
 
@@ -282,6 +305,12 @@ class FakeEnv:
         )
 
 
+def _argument_type(name: str) -> Any:  # Any: a type annotation
+    if name == "velocity_range_m_s":
+        return tuple[float, ...]
+    return bool if isinstance(RULES.get(name), bool) else int
+
+
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them
     if task.candidates is None:
         return BALL_DEFAULTS
@@ -295,6 +324,14 @@ def _check_ranges(arguments: Mapping[str, Any], *, where: str) -> None:  # Any: 
         raise TaskArgumentError(
             f"{where}: n_items={n_items}, n_shown={n_shown}: expected 1 ≤ n_shown ≤ n_items ≤ {MAX_ITEMS}."
         )
+    several = n_shown > 1 or "swap_order" in arguments
+    most = {
+        "swap_cue": 1 if n_items == 1 else n_items - n_shown if several else n_items - 1,
+        "swap_order": n_shown - 1,
+    }
+    for name, largest in most.items():
+        if not 0 <= arguments.get(name, 0) <= largest:
+            raise TaskArgumentError(f"{where}: {name}={arguments[name]}: expected 0 to {largest}.")
     speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
     if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
         raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")

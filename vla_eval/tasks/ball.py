@@ -68,9 +68,23 @@ class RollingBallEnv(OnePhaseEnv):
         start_m = (layout.uniform(*SPAWN_X_M), layout.uniform(*SPAWN_Y_M), self._ball_start_z_m())
         self._sample_goal(env, layout, lane_x_m=start_m[0])
         motion = self.episode_generator(env, Stream.MOTION)
-        velocity_m_s = (motion.uniform(*SIDE_VELOCITY_M_S), motion.uniform(*self.velocity_range_m_s), 0.0)
+        side_m_s = motion.uniform(*SIDE_VELOCITY_M_S)
+        velocity_m_s = (side_m_s, self._swapped_m_s(motion.uniform(*self.velocity_range_m_s)), 0.0)
         self._start[env] = torch.tensor(start_m)
         self._initial_velocity[env] = torch.tensor(velocity_m_s)
+
+    def n_swaps(self) -> int:
+        """Return 1: a speed half of the range away; 0 if there is only one speed."""
+        least, most = self.velocity_range_m_s
+        return int(most > least)
+
+    def _swapped_m_s(self, drawn_m_s: float) -> float:
+        """Return the drawn speed, or with `swap_cue` the one that is half of the range away."""
+        if not self.swap_cue:
+            return drawn_m_s
+        least, most = self.velocity_range_m_s
+        half = (most - least) / 2
+        return drawn_m_s + half if drawn_m_s < least + half else drawn_m_s - half
 
     def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
         """Draw the ball's goal, if it has one, after its start has been drawn."""

@@ -8,18 +8,26 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
+from mani_skill.utils.structs import Actor
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
-from vla_eval.tasks.items import Item, build_item
+from vla_eval.tasks.items import Item, build_decoy, build_item
 from vla_eval.tasks.layout import Plane, jittered, slot_centres_m
 
 UPRIGHT_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
 
 class ItemChoiceEnv(ChoiceEnv):
-    """N items that lie, in the response phase, at N places in random order."""
+    """N items that lie, in the response phase, at N places in random order.
+
+    If the cue is swapped, decoys show it: kinematic copies of the items without collision shapes. The items
+    themselves are moved as for the drawn cue, but are invisible until the response phase. So the physics is
+    that of the cue as drawn, to the last bit: an item that has been shown settles in another way when it
+    appears again (measured: by up to 0.3 µm and 7e-6). On the GPU simulator, whose results are not
+    reproducible to the last bit, the items themselves are swapped.
+    """
 
     def __init__(self, *args: Any, items: tuple[Item, ...], **kwargs: Any) -> None:
         """Take the items and build the scene."""
@@ -39,6 +47,18 @@ class ItemChoiceEnv(ChoiceEnv):
         self.candidates = [
             build_item(self.scene, item, initial_pose=self._parking_pose(item)) for item in self.items
         ]
+        uses_decoys = self.is_swapped() and not self.gpu_sim_enabled
+        self.decoys = [self._build_decoy(item) for item in self.items] if uses_decoys else []
+
+    def _build_decoy(self, item: Item) -> Actor:
+        return build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
+
+    def is_swapped(self) -> bool:
+        """Return whether another cue than the drawn one is shown."""
+        return self.swap_cue > 0
+
+    def _decoy_parking_pose(self, item: Item) -> sapien.Pose:
+        return self.parking_pose(f"{item.name}_decoy", half_height_m=item.shape.rest_height_m)
 
     def _parking_pose(self, item: Item) -> sapien.Pose:
         return self.parking_pose(item.name, half_height_m=item.shape.rest_height_m)
@@ -58,21 +78,48 @@ class ItemChoiceEnv(ChoiceEnv):
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         super()._on_episode_start(mask)
         self._park_all(mask)
+        self._set_visible(mask, not self.decoys)
 
     def _park_all(self, mask: torch.Tensor) -> None:
         if not bool(mask.any()):  # most steps: one check for all items, not one per item
             return
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
+        for item, decoy in zip(self.items, self.decoys, strict=False):  # of no decoys or of all
+            self.move(decoy, mask, self._decoy_parking_pose(item))
 
-    def _show_in_middle(self, mask: torch.Tensor, shown: torch.Tensor) -> None:
-        """Move the items of these indices, (B,), to the centre of the table where the mask holds."""
+    def _show_in_middle(self, mask: torch.Tensor, drawn: torch.Tensor, shown: torch.Tensor) -> None:
+        """Move items to the centre of the table where the mask holds.
+
+        Args:
+            mask: (B,) bool.
+            drawn: (B,) indices of the items to move.
+            shown: (B,) indices of the items to be seen there; others than `drawn` if the cue is swapped.
+        """
         if not bool(mask.any()):
             return
-        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
-            self.move(actor, mask & (shown == index), sapien.Pose(p=[0, 0, item.shape.rest_height_m]))
+        for index, item in enumerate(self.items):
+            middle = sapien.Pose(p=[0, 0, item.shape.rest_height_m])
+            self._show_item(index, middle, moved=mask & (drawn == index), seen=mask & (shown == index))
+
+    def _show_item(self, index: int, pose: sapien.Pose, *, moved: torch.Tensor, seen: torch.Tensor) -> None:
+        """Move an item where `moved` (B,) holds, so that it is seen where `seen` (B,) holds."""
+        self.move(self.candidates[index], moved if self.decoys else seen, pose)
+        if self.decoys:
+            self.move(self.decoys[index], seen, pose)
+
+    def _set_visible(self, mask: torch.Tensor, visible: bool) -> None:
+        """Let the items be seen or not, if there are decoys: on the CPU simulator, with one environment."""
+        if not self.decoys or not bool(mask.any()):
+            return
+        for actor in self.candidates:
+            for entity in actor._objs:
+                body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+                if body is not None:  # without a renderer there is none
+                    body.visibility = float(visible)
 
     def _reveal_all(self, mask: torch.Tensor) -> None:
+        self._set_visible(mask, True)
         self.reveal(mask, torch.tensor(UPRIGHT_WXYZ, device=self.device))
 
 

@@ -8,7 +8,7 @@ drops when it is revealed. Knows nothing of phases or of which item is right.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
@@ -181,6 +181,20 @@ class Item(NamedTuple):
 
 def build_item(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) -> Actor:
     """Build the dynamic actor of an item."""
+    builder = _item_builder(scene, item)
+    builder.initial_pose = initial_pose
+    return builder.build(name=item.name)
+
+
+def build_decoy(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) -> Actor:
+    """Build a kinematic actor that looks like an item and touches nothing."""
+    builder = _item_builder(scene, item)
+    builder.collision_records = []
+    builder.initial_pose = initial_pose
+    return builder.build_kinematic(name=f"{item.name}_decoy")
+
+
+def _item_builder(scene: ManiSkillScene, item: Item) -> Any:  # ManiSkill is untyped
     builder = scene.create_actor_builder()
     rgba = [*(channel / 255 for channel in item.color.rgb), 1.0]
     material = sapien.render.RenderMaterial(base_color=rgba) if scene.can_render() else None
@@ -196,5 +210,4 @@ def build_item(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) 
             radius, half_length = part.size
             builder.add_cylinder_collision(pose, radius, half_length)
             builder.add_cylinder_visual(pose, radius, half_length, material=material)
-    builder.initial_pose = initial_pose
-    return builder.build(name=item.name)
+    return builder

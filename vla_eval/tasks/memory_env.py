@@ -61,6 +61,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     Args:
         cue_steps: control steps during which the cue is shown; a pair is a range to draw from per episode.
         delay_steps: control steps between the cue and the choice; also takes a pair.
+        swap_cue: 0 to `n_swaps()`; which other cue is shown instead of the drawn one. It has its own right
+            answer. Whatever else is drawn for the seed stays the same: places, noise, durations.
         freeze_until_choice: hold arm and gripper width until the response phase, whatever the action.
         phase_gate_success: success counts only in the response phase (the official code has no gate).
         static_threshold_rad_s: the arm is at rest if no joint moves faster.
@@ -89,6 +91,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         robot_uids: str = "panda_wristcam",
         cue_steps: StepRange = 5,
         delay_steps: StepRange = 5,
+        swap_cue: int = 0,
         freeze_until_choice: bool = False,
         phase_gate_success: bool = True,
         static_threshold_rad_s: float = 0.2,
@@ -99,6 +102,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         """Check the arguments and build the scene."""
         self.cue_steps_range = step_range("cue_steps", cue_steps)
         self.delay_steps_range = step_range("delay_steps", delay_steps)
+        self.swap_cue = self._checked_swap("swap_cue", swap_cue, most=self.n_swaps())
         self.freeze_until_choice = freeze_until_choice
         self.phase_gate_success = phase_gate_success
         self.static_threshold_rad_s = static_threshold_rad_s
@@ -114,6 +118,16 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             on_cpu = kwargs.get("sim_backend", "auto") in CPU_BACKENDS and kwargs.get("num_envs", 1) == 1
             reconfiguration_freq = 1 if on_cpu else 0
         super().__init__(*args, robot_uids=robot_uids, reconfiguration_freq=reconfiguration_freq, **kwargs)
+
+    def n_swaps(self) -> int:
+        """Return how many other cues the same scene could have; `swap_cue` selects one of them."""
+        raise NotImplementedError
+
+    def _checked_swap(self, name: str, swap: int, *, most: int) -> int:
+        if isinstance(swap, bool) or not isinstance(swap, int) or not 0 <= swap <= most:
+            other = "as the cue has no other value with these arguments" if most == 0 else "0 for no swap"
+            raise TaskArgumentError(f"{name}={swap!r}: expected 0 to {most}, {other}.")
+        return swap
 
     # ---------------------------------------------------------------- scene
 

@@ -56,15 +56,24 @@ class RememberEnv(ItemChoiceEnv):
         """Set the threshold of these tasks and build the scene."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        super()._load_scene(options)
+        self._drawn = torch.zeros_like(self._target)
+
     def _sample_episode(self, env: int) -> None:
-        self._target[env] = int(self.episode_generator(env, Stream.TARGET).integers(self.n_items))
+        self._drawn[env] = int(self.episode_generator(env, Stream.TARGET).integers(self.n_items))
+        self._target[env] = (self._drawn[env] + self.swap_cue) % self.n_items
         self._sample_slots(env)
+
+    def n_swaps(self) -> int:
+        """Return how many other items could be shown."""
+        return self.n_items - 1
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
         cue_begins = mask & (step == 0) & (self._cue_end_step > 0) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
-        self._show_in_middle(cue_begins, self._target)
+        self._show_in_middle(cue_begins, self._drawn, self._target)
         self._park_all(cue_ends)
         self._reveal_all(choice_begins)
         return bool((cue_begins | cue_ends | choice_begins).any())

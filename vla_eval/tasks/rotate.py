@@ -124,11 +124,26 @@ class RotateEnv(OnePhaseEnv):
     def _draw_angle_rad(self, rng: np.random.Generator) -> float:
         least, most = self.angle_range_rad
         share = rng.uniform()
+        by_sign = self.signed and not self.official_signs
+        if self.swap_cue and not by_sign:
+            share = (share + 0.5) % 1
         angle = least + share * (most - least)
         if not self.signed:
             return angle
         positive = share > OFFICIAL_SIGN_SPLIT if self.official_signs else rng.integers(2) == 1
+        if self.swap_cue and by_sign:
+            positive = not positive
         return angle if positive else -angle
+
+    def n_swaps(self) -> int:
+        """Return 1: the angle could be half of the range away, or have the other sign.
+
+        0 if an angle could then be right for both: the tolerances of the two must not overlap.
+        """
+        least, most = self.angle_range_rad
+        if self.signed:
+            return int(most <= math.pi - self.angle_threshold_rad)
+        return int((most - least) / 2 >= 2 * self.angle_threshold_rad)
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         zero = torch.zeros_like(self._first_yaw)

@@ -64,7 +64,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     Arguments: `n_items` 2 to 9 cubes, `n_shown` 1 to `n_items`, `cue_steps` (for each cube, or for all
     together), `gap_steps` of empty table between two of them, `dwell_steps`, `cube_half_size_m`, and
-    those of `ChoiceEnv` and `MemoryTableEnv`. `strict_choice` ends the episode at the first mistake.
+    those of `ChoiceEnv` and `MemoryTableEnv`. `swap_cue` shows another cube instead of the first one;
+    `swap_order` k exchanges the first cube and the one k later, if they are shown one after another (the
+    right answer changes only if the order counts). `strict_choice` ends the episode at the first mistake.
 
     Chance level: for L of N, 1 / C(N, L); in order, 1 / (N (N - 1) … (N - L + 1)).
 
@@ -84,6 +86,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         n_shown: int = 3,
         gap_steps: int = 0,
         dwell_steps: int = 1,
+        swap_order: int = 0,
         goal_threshold_m: float = TOUCH_RADIUS_M,
         cube_half_size_m: float = CUBE_HALF_SIZE_M,
         phase_gate_success: bool = True,
@@ -102,6 +105,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
                 "the official code. Remove this argument."
             )
         self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
+        most = n_shown - 1 if self.ONE_BY_ONE else 0
+        self.swap_order = self._checked_swap("swap_order", swap_order, most=most)
         self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
         shape = cube(cube_half_size_m)
         items = tuple(Item(shape, color) for color in COLORS[:n_items])
@@ -124,16 +129,32 @@ class SeveralColorsEnv(ItemChoiceEnv):
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
         self._sequence = torch.zeros(self.num_envs, self.n_shown, dtype=torch.long, device=self.device)
+        self._drawn_sequence = torch.zeros_like(self._sequence)
         self._is_shown = torch.zeros_like(self._touch_rank, dtype=torch.bool)
+        self._is_drawn = torch.zeros_like(self._is_shown)
         self._near = torch.full_like(self._target, -1)
         self._near_steps = torch.zeros_like(self._target)
 
     def _sample_episode(self, env: int) -> None:
-        drawn = self.episode_generator(env, Stream.TARGET).permutation(self.n_items)[: self.n_shown]
-        self._sequence[env] = torch.as_tensor(drawn)
-        self._is_shown[env] = False
-        self._is_shown[env, self._sequence[env]] = True
+        drawn = self.episode_generator(env, Stream.TARGET).permutation(self.n_items)
+        shown = drawn[: self.n_shown].copy()
+        if self.swap_cue:
+            shown[0] = drawn[self.n_shown + self.swap_cue - 1]
+        shown[[0, self.swap_order]] = shown[[self.swap_order, 0]]
+        self._drawn_sequence[env] = torch.as_tensor(drawn[: self.n_shown])
+        self._sequence[env] = torch.as_tensor(shown)
+        for flags, sequence in ((self._is_drawn, self._drawn_sequence), (self._is_shown, self._sequence)):
+            flags[env] = False
+            flags[env, sequence[env]] = True
         self._sample_slots(env)
+
+    def is_swapped(self) -> bool:
+        """Return whether other cubes than the drawn ones are shown, or in another order."""
+        return super().is_swapped() or self.swap_order > 0
+
+    def n_swaps(self) -> int:
+        """Return how many cubes that are not shown could be shown instead of the first one."""
+        return self.n_items - self.n_shown
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         super()._on_episode_start(mask)
@@ -155,10 +176,11 @@ class SeveralColorsEnv(ItemChoiceEnv):
     def _show_together(self, mask: torch.Tensor) -> None:
         if not bool(mask.any()):
             return
-        for index, (item, actor) in enumerate(zip(self.items, self.candidates, strict=True)):
+        for index, item in enumerate(self.items):
             x, y = bunch_place_m(index, self.n_items)
             place = sapien.Pose(p=[x, y, item.shape.rest_height_m])
-            self.move(actor, mask & self._is_shown[:, index], place)
+            moved, seen = mask & self._is_drawn[:, index], mask & self._is_shown[:, index]
+            self._show_item(index, place, moved=moved, seen=seen)
 
     def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Show or hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
@@ -169,7 +191,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         begins = mask & (since == 0)
         ends = mask & (since == turn_steps - self.gap_steps)
         self._park_all((begins & (step > 0)) | ends)
-        self._show_in_middle(begins, self._of_sequence(turn.long()))
+        drawn = self._drawn_sequence.gather(1, turn.long()[:, None])[:, 0]
+        self._show_in_middle(begins, drawn, self._of_sequence(turn.long()))
         return begins | ends
 
     def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:

@@ -87,12 +87,17 @@ class ShellGameEnv(ChoiceEnv):
         return torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device)
 
     def _sample_episode(self, env: int) -> None:
-        self._target[env] = int(self.episode_generator(env, Stream.TARGET).integers(N_MUGS))
+        drawn = int(self.episode_generator(env, Stream.TARGET).integers(N_MUGS))
+        self._target[env] = (drawn + self.swap_cue) % N_MUGS
         layout = self.episode_generator(env, Stream.LAYOUT)
         x, y = layout.uniform(-LAYOUT_HALF_RANGE_M, LAYOUT_HALF_RANGE_M, 2)
         for index in range(N_MUGS):
             place = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
             self._slots[env, index] = torch.tensor(place, dtype=torch.float32)
+
+    def n_swaps(self) -> int:
+        """Return at how many other places the ball could lie."""
+        return N_MUGS - 1
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         super()._on_episode_start(mask)

@@ -201,7 +201,9 @@ class ShellGamePickEnv(ShellGameMoveEnv):
 
     def _mug_orientation_wxyz(self) -> torch.Tensor:
         quaternions = torch.tensor([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], device=self.device)
-        return quaternions[self._target] if self.official_mug_yaws else quaternions[-1]
+        # The handles belong to the scene: with `swap_cue` they stay as they were drawn.
+        drawn = (self._target - self.swap_cue) % N_MUGS
+        return quaternions[drawn] if self.official_mug_yaws else quaternions[-1]
 
     def _is_grasped(self) -> torch.Tensor:
         grasped = torch.stack([self.agent.is_grasping(actor) for actor in self.candidates], dim=1)

@@ -116,11 +116,16 @@ class TakeItBackEnv(OnePhaseEnv):
 
     def _sample_episode(self, env: int) -> None:
         layout = self.episode_generator(env, Stream.LAYOUT)
-        band_m = START_BANDS_Y_M[int(self.episode_generator(env, Stream.TARGET).integers(3))]
+        drawn = int(self.episode_generator(env, Stream.TARGET).integers(len(START_BANDS_Y_M)))
+        band_m = START_BANDS_Y_M[(drawn + self.swap_cue) % len(START_BANDS_Y_M)]
         x, y = layout.uniform(*START_X_M), band_m + layout.uniform(0, START_BAND_WIDTH_M)
         self._first_place[env] = torch.tensor((x, y, self.cube_half_size_m))
         goal_m = (layout.uniform(*GOAL_X_M), layout.uniform(*GOAL_Y_M), DISC_Z_M)
         self._goal_position[env] = torch.tensor(goal_m)
+
+    def n_swaps(self) -> int:
+        """Return in how many other bands the cube could lie."""
+        return len(START_BANDS_Y_M) - 1
 
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         self._goal_reached[mask] = False
