@@ -150,7 +150,10 @@ class Policy(Protocol):
         """What the policy reads and how long its chunks are."""
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Begin these episodes: forget all else that was known of their slots."""
+        """Begin these episodes: forget all else that was known of their slots.
+
+        A probe also calls it in mid-episode (`RolloutSettings.reset_policy_at_step`), with the same start.
+        """
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Decide on the actions from the last observation of the window on."""

@@ -37,12 +37,15 @@ class RolloutSettings:
             result; for checking exactly that.
         stop_at_success: end an episode at its first success; success_at_end is then unknown.
         steps_after_success: with `stop_at_success`, continue for this many control steps.
+        reset_policy_at_step: reset the policy in mid-episode: at the first inference at or after this
+            control step it is reset for the episode, and is given no frame of an earlier step. None: never.
     """
 
     chunking: ChunkingSpec
     eager_rendering: bool = False
     stop_at_success: bool = False
     steps_after_success: int = 0
+    reset_policy_at_step: int | None = None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -52,6 +55,7 @@ class _Running:
     log: EpisodeLog
     executor: ChunkExecutor
     window: list[Observation]
+    reset_policy_at_step: int | None
     done: bool = False
 
     @property
@@ -133,6 +137,7 @@ class _Loop:
                 log=EpisodeLog.begin(start, results[start.slot]),
                 executor=ChunkExecutor(self.settings.chunking),
                 window=[results[start.slot].observation],
+                reset_policy_at_step=self.settings.reset_policy_at_step,
             )
             for start in episodes
         ]
@@ -143,6 +148,8 @@ class _Loop:
         if not due:
             return
         policy, spec = self.policy, self.policy.spec
+        for episode in due:
+            self._reset_in_mid_episode(episode)
         windows = [_window(episode, spec) for episode in due]
         self.heartbeat("inference")
         if isinstance(policy, BatchPolicy):
@@ -156,6 +163,15 @@ class _Loop:
             episode.window.clear()
             for observer in self.observers:
                 observer.on_inference(episode.start, episode.step, chunk)
+
+    def _reset_in_mid_episode(self, episode: _Running) -> None:
+        """Let the policy forget what was before a step, once, if the settings ask for it."""
+        first_step = episode.reset_policy_at_step
+        if first_step is None or episode.step < first_step:
+            return
+        self.policy.reset([episode.start])
+        episode.window = [frame for frame in episode.window if frame.step >= first_step]
+        episode.reset_policy_at_step = None
 
     def step(self, active: Sequence[_Running]) -> None:
         """Execute one control step in each running episode."""

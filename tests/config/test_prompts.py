@@ -30,14 +30,22 @@ def test_the_paper_s_sentences(task: str, sentence: str) -> None:
     assert instruction_for(task_spec(task)) == sentence
 
 
-@pytest.mark.parametrize("prompts", ["paper", "paraphrased"])
-def test_every_task_has_a_sentence_in_both_of_the_sets_for_all(prompts: str) -> None:
+@pytest.mark.parametrize("prompts", ["paper", "paraphrased", "other_task", "no_content"])
+def test_every_task_has_a_sentence_in_each_of_the_sets_for_all(prompts: str) -> None:
     assert all(instruction_for(spec, prompts) for spec in TASKS.values())
 
 
 def test_a_paraphrase_says_it_in_other_words() -> None:
     for spec in TASKS.values():
         assert instruction_for(spec, "paraphrased") != instruction_for(spec)
+
+
+def test_the_sentence_of_another_task_is_the_paper_s_of_another_family() -> None:
+    of_sentence = {instruction_for(spec): spec for spec in TASKS.values()}
+    for spec in TASKS.values():
+        other = of_sentence[instruction_for(spec, "other_task")]
+        assert other.entry_point.split(":")[0] != spec.entry_point.split(":")[0], spec.id
+    assert {instruction_for(spec, "no_content") for spec in TASKS.values()} == {"Do the task"}
 
 
 def test_the_later_official_wording_is_a_set_of_its_own() -> None:

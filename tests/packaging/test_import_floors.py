@@ -13,7 +13,7 @@ from collections.abc import Sequence
 FOREIGN = ("torch", "sapien", "mani_skill", "lerobot", "cv2", "rerun")
 OF_THE_PAGE = ("matplotlib", "jinja2")  # half a second; only who writes a page waits for them
 
-CHEAP_ROOMS = ("config", "storage", "workers", "wire", "results", "evaluation", "audit", "cli")
+CHEAP_ROOMS = ("config", "storage", "workers", "wire", "results", "evaluation", "audit", "probe", "cli")
 """What `--help`, `list`, `report` and the start of `eval` import; import-linter holds the rest."""
 ALSO_CHEAP = (
     "envs.factory",

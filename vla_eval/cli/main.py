@@ -20,6 +20,7 @@ VERBS = (
     "compare",
     "check",
     "audit",
+    "probe",
     "view",
     "record",
     "replay",

@@ -9,6 +9,7 @@ from vla_eval.bounds import (
     MAX_PROCESSES,
     MAX_SECONDS,
     MAX_SLOTS,
+    MAX_STEPS,
     check_bounds,
     check_seeds,
     require,
@@ -57,6 +58,7 @@ class EvalConfig:
     simulator: Simulator = "maniskill"
     sim_backend: SimBackend = "cpu"
     stop_at_success: bool = False
+    reset_policy_at_step: int | None = None
     eager_rendering: bool = False
     slots_per_worker: int = 1
     workers: int | Literal["auto"] = "auto"
@@ -74,6 +76,7 @@ class EvalConfig:
                 "slots_per_worker": (1, MAX_SLOTS),
                 "max_consecutive_errors": (1, MAX_EPISODES),
                 "workers": (1, MAX_PROCESSES),
+                "reset_policy_at_step": (1, MAX_STEPS),
             },
         )
         check_seeds(self.seed_start, self.episodes)

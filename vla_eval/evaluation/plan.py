@@ -194,9 +194,12 @@ def _recipe_hashes(
 def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     """Return the part of a configuration that results depend on; compared when a run is resumed."""
     data: dict[str, Any] = to_data(config)
-    if config.slots_per_worker == 1:  # so that runs of versions without the field can be resumed
+    # So that runs of versions without these fields can be resumed.
+    if config.slots_per_worker == 1:
         del data["slots_per_worker"]
     data["policies"] = [bare_policy(name) for name in data["policies"]]
+    if config.reset_policy_at_step is None:
+        del data["reset_policy_at_step"]
     return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
 
 
@@ -263,6 +266,7 @@ def _groups(
                 chunking=config.chunking.at(n_action_steps),
                 eager_rendering=config.eager_rendering,
                 stop_at_success=config.stop_at_success,
+                reset_policy_at_step=config.reset_policy_at_step,
             ),
             instruction=instruction,
             n_rows=n_rows,

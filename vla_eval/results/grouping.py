@@ -15,7 +15,10 @@ from vla_eval.storage.planned import bare_name
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 
-VARIANT_FIELDS = ("env", "chunking", "render", "stop_at_success", "prompt_set", "simulator", "sim_backend")
+VARIANT_FIELDS = (
+    *("env", "chunking", "render", "stop_at_success", "reset_policy_at_step", "prompt_set", "simulator"),
+    "sim_backend",
+)
 """Fields of a configuration that affect success rates and are not part of an episode's key."""
 
 POLICY_NAMES = "policy_names"  # the policies' names in records, in the configuration of a run

@@ -263,22 +263,23 @@ _LATEX = str.maketrans(
 
 def _latex(table: Table, columns: Sequence[Column], figures: Sequence[PaperFigure] | None) -> str:
     lines = ["% needs \\usepackage{booktabs}"]
-    lines += _latex_table(
+    lines += latex_table(
         [column.title for column in columns],
         [[column.cell(row) for column in columns] for row in table.rows],
         [column.is_number for column in columns],
     )
-    lines += [f"\\par\\smallskip{{\\footnotesize {_escaped(note)}\\par}}" for note in table.notes]
+    lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in table.notes]
     if figures:
-        lines += ["", f"\\par\\medskip\\textbf{{{_escaped(PAPER_TITLE)}}}\\par\\smallskip"]
-        lines += _latex_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER)
-        lines.append(f"\\par\\smallskip{{\\footnotesize Source: {_escaped(paper_table.SOURCE)}.\\par}}")
+        lines += ["", f"\\par\\medskip\\textbf{{{latex_text(PAPER_TITLE)}}}\\par\\smallskip"]
+        lines += latex_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER)
+        lines.append(f"\\par\\smallskip{{\\footnotesize Source: {latex_text(paper_table.SOURCE)}.\\par}}")
     elif figures is not None:
         lines.append(f"\\par\\smallskip{{\\footnotesize {NOT_IN_PAPER}\\par}}")
     return "\n".join(lines)
 
 
-def _latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]) -> list[str]:
+def latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]) -> list[str]:
+    """Return the lines of a table for the package booktabs, with a rule where the first column changes."""
     lines = [f"\\begin{{tabular}}{{{''.join('r' if number else 'l' for number in is_number)}}}", "\\toprule"]
     lines += [_latex_row(titles), "\\midrule"]
     for above, row in zip((None, *rows), rows, strict=False):
@@ -289,12 +290,13 @@ def _latex_table(titles: list[str], rows: list[list[str]], is_number: list[bool]
 
 
 def _latex_row(cells: list[str]) -> str:
-    row = " & ".join(re.sub("^-(?=[0-9])", "$-$", _escaped(cell)) for cell in cells)
+    row = " & ".join(re.sub("^-(?=[0-9])", "$-$", latex_text(cell)) for cell in cells)
     # The rule or row above would read a bracket or a star as its own argument.
     return f"{'{}' if row.startswith(('[', '*')) else ''}{row} \\\\"
 
 
-def _escaped(text: str) -> str:
+def latex_text(text: str) -> str:
+    """Return text as LaTeX shows it, with what is in backticks set as code."""
     parts = [
         part.translate(_LATEX) for part in re.split("`([^`]*)`", one_line(text))
     ]  # every second one was code

@@ -1,0 +1,246 @@
+"""The command `probe` and its plan, on the fake simulator: the controls are part of every probe."""
+
+import csv
+import inspect
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vla_eval.cli.main import main
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import RecipeError
+from vla_eval.probe.interventions import ProbeSettings, plan_probe
+from vla_eval.probe.phases import CUE_STEPS, default_delay_steps, inferences, phases_of
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.memory_env import MemoryTableEnv
+from vla_eval.tasks.register import env_class
+
+FAKE = ["--set", "simulator=fake", "--workers", "1"]
+N = 9
+PLACE_MODULE = """
+from vla_eval.core import ActionChunk
+from vla_eval.oracles.hover import CUBES
+from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
+
+class OnePlace(ScriptedPolicy):
+    privileged = True
+
+    def act(self, window):
+        state = self.privileged_state(window)
+        if state.phase != "response":
+            return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions))
+        rightmost = int(state.candidate_positions_m[:, 1].argmin())
+        return ActionChunk(actions=CUBES.plan(state, rightmost, self._n_actions))
+
+def make(context):
+    return OnePlace(context)
+"""
+REQUIRED = {
+    *("task", "policy", "n_action_steps", "intervention", "level", "n_pairs", "sensitivity"),
+    *("warranted_choice", "reliability", "success_once", "ci_low", "ci_high", "chance"),
+}
+
+
+@pytest.fixture
+def one_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A policy that always goes to the rightmost place."""
+    (tmp_path / "one_place_policy.py").write_text(PLACE_MODULE)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    recipe = tmp_path / "one_place.yaml"
+    recipe.write_text(json.dumps({"version": 1, "description": "d", "adapter": "one_place_policy:make"}))
+    return str(recipe)
+
+
+def probe(out: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    command = ["probe", *arguments, *FAKE, "--episodes", str(N), "--out", str(out), "--format", "json"]
+    assert main(command) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def rows_of(found: dict[str, Any], intervention: str) -> dict[str, dict[str, Any]]:
+    return {row["policy"]: row for row in found["rows"] if row["intervention"] == intervention}
+
+
+def test_controls_follow_the_swapped_cue_as_far_as_they_know_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], one_place: str
+) -> None:
+    arguments = ("--task", "RememberColor3-v0", "--policy", one_place, "--probe", "swap")
+    paper = rows_of(probe(tmp_path / "paper", capsys, *arguments), "swap")
+    assert {row["n_pairs"] for row in paper.values()} == {N}
+    for policy in ("oracle", "body_memory"):
+        assert (paper[policy]["n_warranted_choice"], paper[policy]["n_sensitivity"]) == (N, N)
+        assert paper[policy]["reliability"] == 1.0
+    for policy in ("one_place", "cue_blind"):
+        assert (paper[policy]["n_warranted_choice"], paper[policy]["n_sensitivity"]) == (0, 0)
+        assert paper[policy]["actions_changed"] == 0.0
+        # One of three cues is followed by luck: in 18 episodes, 1 to 12 with a probability above 0.99.
+        assert 0 < paper[policy]["matched_world_value"] <= 12 / 18
+    assert paper["cue_blind"]["chance"] == pytest.approx(1 / 3)
+
+    rule = ("--set", "env.freeze_until_choice=true", "--set", "env.strict_choice=true")
+    strict = rows_of(probe(tmp_path / "strict", capsys, *arguments, *rule), "swap")
+    assert strict["oracle"]["n_warranted_choice"] == N
+    assert (strict["body_memory"]["n_warranted_choice"], strict["body_memory"]["n_sensitivity"]) == (0, 0)
+
+
+def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--task", "ChainOfColors3-v0", "--policy", "oracle", "--delay", "0", "12"]
+    arguments += ["--probe", "swap,order,blank,delay,reset", "--no-controls"]
+    found = probe(tmp_path, capsys, *arguments)
+    assert [(row["intervention"], row["level"]) for row in found["rows"]] == [
+        ("none", None),
+        ("swap", 1),
+        ("order", 1),
+        ("blank", None),
+        ("delay", 0),
+        ("delay", 12),
+        ("reset", 15),  # three cubes for five steps each
+        ("reset", 20),
+    ]
+    assert found["rows"][0]["cue_inference_steps"] == list(range(15))
+    assert all(set(row) >= REQUIRED for row in found["rows"])
+    assert found["rows"][0]["sensitivity"] is None
+    assert found["rows"][2]["warranted_choice"] == 1.0
+    (curve,) = found["retention"]
+    assert [point["delay_steps"] for point in curve["points"]] == [0, 5, 12]
+    assert (curve["half_life_steps"], curve["half_life_state"]) == (None, "beyond_longest_delay")
+    assert "follows both orders in 9 of 9 pairs" in found["sentences"][0]
+    assert "after a delay of 12 steps in 9 of 9" in found["sentences"][0]
+    assert "half-life more than 12 steps" in found["sentences"][0]
+
+    again = ["probe", *arguments, *FAKE, "--episodes", str(N), "--out", str(tmp_path), "--format"]
+    shown = {}
+    for style in ("markdown", "csv", "latex"):
+        assert main([*again, style]) == 0
+        output = capsys.readouterr()
+        shown[style] = output.out
+        assert output.err.count(f"all {N} episodes are there") == 8
+    assert shown["markdown"].splitlines()[2].startswith("| ChainOfColors3-v0 | oracle | 1 | none | 9 | — |")
+    table = list(csv.DictReader(io.StringIO(shown["csv"])))
+    assert (len(table), table[0]["sensitivity"], table[1]["sensitivity"]) == (8, "", "1.0")
+    assert "\\toprule" in shown["latex"]
+
+
+def test_a_task_without_phases_is_probed_by_its_cue_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = probe(tmp_path, capsys, "--task", "InterceptMedium-v0", "--policy", "random")
+    assert list(rows_of(found, "none")) == ["random", "oracle", "cue_blind"]
+    assert {row["intervention"] for row in found["rows"]} == {"none", "swap"}
+    oracle = rows_of(found, "swap")["oracle"]
+    assert (oracle["change_of"], oracle["p_value"]) == ("actions", None)
+    assert oracle["sensitivity"] == 1.0
+    assert rows_of(found, "swap")["random"]["sensitivity"] == 0.0  # the same draws in both worlds
+
+
+def test_a_drop_that_the_oracle_shares_is_one_of_chunk_and_phase(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A chunk of 60 is predicted before the response and never replaced."""
+    task = ("--task", "RememberColor3-v0", "--policy", "oracle", "--no-controls")
+    found = probe(tmp_path, capsys, *task, "--probe", "swap", "--n-action-steps", "1", "60")
+    assert [(row["n_action_steps"], row["n_late_steps"]) for row in found["rows"]] == [
+        *((1, 0), (1, 0)),
+        *((60, 50), (60, 50)),  # the response begins at step 10
+    ]
+    (note,) = [note for note in found["notes"] if "swap 1: at K = 60" in note]
+    assert "(50 steps late)" in note
+    assert "in 0 of 9 instead of 9 of 9 at K = 1: chunk and phase explain" in note
+
+
+def config(**fields: Any) -> EvalConfig:
+    return EvalConfig(**{"name": "x", "tasks": ("RememberColor3-v0",), "policies": ("hold",), **fields})
+
+
+def test_horizons_follow_the_delay() -> None:
+    probe = plan_probe(config(), ProbeSettings(probes=("delay",), delays=(0, 5, 320)))
+    env = {world.level: world.config.env for world in probe.worlds}
+    # 60 steps with a delay of 5, which is the world as drawn.
+    assert env == {
+        None: {"delay_steps": 5},
+        0: {"delay_steps": 0, "horizon_steps": 55},
+        320: {"delay_steps": 320, "horizon_steps": 375},
+    }
+    shells = plan_probe(
+        config(tasks=("ShellGameTouch-v0",)), ProbeSettings(probes=("delay",), delays=(0, 40))
+    )
+    assert [world.config.env for world in shells.worlds] == [
+        {"delay_steps": 0},
+        {"delay_steps": 40, "horizon_steps": 130},
+    ]
+
+
+def test_a_short_cue_shortens_the_horizon_for_each_item() -> None:
+    probe = plan_probe(config(tasks=("ChainOfColors3-v0",)), ProbeSettings(probes=("cue",), cues=(1, 5)))
+    (_, short) = probe.worlds
+    # 120 steps with three cubes for 5 steps each; 3 * 4 fewer.
+    assert (short.config.env["cue_steps"], short.config.env["horizon_steps"]) == (1, 108)
+
+
+@pytest.mark.parametrize(
+    ("k", "in_cue", "n_late"),
+    # The response begins at step 10; inferences at 0, 4, 8, 12 and at 0, 8, 16.
+    [(1, (0, 1, 2, 3, 4), 0), (4, (0, 4), 2), (8, (0,), 6), (10, (0,), 0)],
+)
+def test_what_a_chunk_lets_a_policy_see_of_the_cue(k: int, in_cue: tuple[int, ...], n_late: int) -> None:
+    phases = phases_of(task_spec("RememberColor3-v0"), {})
+    assert phases is not None and not isinstance(phases, str)
+    assert inferences(phases, k) == (in_cue, n_late)
+    assert phases_of(task_spec("TakeItBack-v0"), {}) is None
+    assert phases_of(task_spec("RememberColor3-v0"), {"cue_steps": (1, 5)}) == "cue_steps"
+
+
+def test_instructions_are_prompt_sets_other_than_that_of_the_evaluation() -> None:
+    settings = ProbeSettings(probes=("instruction",))
+    worlds = plan_probe(config(prompt_set="paraphrased"), settings).worlds
+    assert [(world.level, world.config.prompt_set) for world in worlds] == [
+        (None, "paraphrased"),
+        ("other_task", "other_task"),
+        ("no_content", "no_content"),
+    ]
+
+
+def test_a_reset_is_at_the_end_of_the_cue_and_of_the_delay_if_no_step_is_named() -> None:
+    def steps(task: str, *named: int, **env: Any) -> list[int | None]:
+        settings = ProbeSettings(probes=("reset",), reset_steps=named)
+        worlds = plan_probe(config(tasks=(task,), env=env), settings).worlds
+        return [world.config.reset_policy_at_step for world in worlds]
+
+    assert steps("RememberColor3-v0") == [None, 5, 10]
+    assert steps("ShellGameTouch-v0") == [None, 5]
+    assert steps("SeqOfColors5-v0", gap_steps=2) == [None, 33, 38]  # 5 * 5 + 4 * 2, and a delay of 5
+    assert steps("RememberColor3-v0", 7) == [None, 7]
+
+
+def test_mistakes_are_said_before_anything_is_run(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(RecipeError, match=r"env\.swap_cue: a probe sets this argument itself"):
+        plan_probe(config(env={"swap_cue": 1}), ProbeSettings())
+    with pytest.raises(RecipeError, match="needs phases of a fixed length"):
+        plan_probe(config(env={"delay_steps": [1, 5]}), ProbeSettings())
+    with pytest.raises(RecipeError, match=r"nothing to run .*it has no delay"):
+        plan_probe(config(tasks=("TakeItBack-v0",)), ProbeSettings(probes=("delay",)))
+    assert main(["probe", "--task", "RememberColor3-v0", "--policy", "hold", "--probe", "swapp"]) == 1
+    assert "Did you mean 'swap'?" in capsys.readouterr().err
+    assert main(["probe", "--task", "RememberColor3-v0", "--policy", "hold", "--delay", "-1"]) == 1
+    assert "--delay -1: expected a whole number ≥ 0" in capsys.readouterr().err
+
+
+def test_the_default_phases_are_those_of_the_simulator() -> None:
+    for task, spec in TASKS.items():
+        if spec.candidates is None:
+            continue
+        defaults = {}
+        for cls in reversed(env_class(task_spec(task)).__mro__):
+            if issubclass(cls, MemoryTableEnv):
+                parameters = inspect.signature(cls.__init__).parameters
+                defaults |= {name: parameter.default for name, parameter in parameters.items()}
+        assert (defaults["cue_steps"], defaults["delay_steps"]) == (CUE_STEPS, default_delay_steps(spec)), (
+            task
+        )

@@ -1,0 +1,236 @@
+"""The evaluations of a probe: one per task and world, on the same seeds.
+
+A *world* is the task with one thing changed: the cue, the length of the delay, the policy's memory. Knows
+nothing of records or statistics.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import RecipeError
+from vla_eval.probe.phases import Phases, default_delay_steps, phases_of
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
+
+Intervention = Literal["none", "swap", "order", "blank", "cue", "delay", "reset", "instruction"]
+PROBES: tuple[Intervention, ...] = ("swap", "order", "blank", "cue", "delay", "reset", "instruction")
+DEFAULT_PROBES: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
+DEFAULT_DELAYS = (0, 5, 10, 20, 40, 80, 160, 320)
+DEFAULT_CUES = (1, 2, 3)
+DEFAULT_INSTRUCTIONS = ("paraphrased", "other_task", "no_content")
+
+Level = int | str | None
+"""By how much a world is changed: a number, or a name; None where there is nothing to count."""
+
+CONTROLS = ("oracle", "cue_blind")
+CONTROLS_OF_ONE = ("body_memory",)
+"""Controls that need a single right candidate."""
+
+OWN_ARGUMENTS = ("swap_cue", "swap_order", "show_cue")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeSettings:
+    """What a probe changes.
+
+    Attributes:
+        probes: which interventions.
+        swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
+        delays: values of `env.delay_steps`.
+        cues: values of `env.cue_steps`.
+        instructions: prompt sets.
+        reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
+            of the response if that is later.
+        controls: whether the controls are run with the policies.
+    """
+
+    probes: tuple[Intervention, ...] = DEFAULT_PROBES
+    swaps: tuple[int, ...] = (1,)
+    delays: tuple[int, ...] = DEFAULT_DELAYS
+    cues: tuple[int, ...] = DEFAULT_CUES
+    instructions: tuple[str, ...] = DEFAULT_INSTRUCTIONS
+    reset_steps: tuple[int, ...] = ()
+    controls: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class World:
+    """One evaluation of a probe.
+
+    Attributes:
+        task: task id.
+        intervention: what is changed; `none` for the world that the others are compared with.
+        level: by how much: the swap's number, a number of steps, the step of a reset, or a prompt set.
+        config: the evaluation of this task; its name is the run folder's.
+    """
+
+    task: str
+    intervention: Intervention
+    level: Level
+    config: EvalConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probe:
+    """The evaluations of a probe, and what makes no sense for a task, for a message."""
+
+    worlds: tuple[World, ...]
+    left_out: tuple[str, ...]
+
+
+def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
+    """Return the evaluations that a probe consists of.
+
+    Args:
+        config: tasks, policies, seeds and all that is the same in every world.
+        settings: what is changed.
+
+    Raises:
+        UnknownNameError: a task that is not in the catalogue.
+        RecipeError: the configuration sets what the probe sets itself, or nothing can be probed.
+    """
+    _refuse_own_arguments(config)
+    worlds: list[World] = []
+    left_out: list[str] = []
+    for task in config.tasks:
+        spec = task_spec(task)
+        of_task = _Task(spec=spec, config=config, settings=settings)
+        changed: list[World] = []
+        for probe in settings.probes:
+            found = of_task.worlds(probe)
+            changed += found
+            if not found:
+                left_out.append(f"{probe} on {spec.id}: {WHY_NOT[probe]}")
+        if changed:
+            worlds += [of_task.world("none", None, {}), *changed]
+    if not worlds:
+        raise RecipeError(f"--probe: there is nothing to run ({'; '.join(left_out)}).")
+    return Probe(worlds=tuple(worlds), left_out=tuple(left_out))
+
+
+WHY_NOT: Mapping[Intervention, str] = {
+    "swap": "no other cue was asked for",
+    "order": "its cue is not shown one item after another",
+    "blank": "it has no cue phase",
+    "cue": "it has no cue phase",
+    "delay": "it has no delay",
+    "instruction": "the only prompt set that was named is that of the evaluation",
+    "reset": "it has no phases; name the steps with --reset-at",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Task:
+    """One task of a probe."""
+
+    spec: TaskSpec
+    config: EvalConfig
+    settings: ProbeSettings
+
+    def worlds(self, probe: Intervention) -> list[World]:
+        """Return the worlds of one intervention; none where it makes no sense."""
+        has_phases, settings = self.spec.candidates is not None, self.settings
+        if probe == "swap":
+            return [self.world(probe, swap, {"swap_cue": swap}) for swap in settings.swaps]
+        if probe == "order":
+            swaps = settings.swaps if self.spec.shows_one_by_one else ()
+            return [self.world(probe, swap, {"swap_order": swap}) for swap in swaps]
+        if probe == "blank":
+            return [self.world(probe, None, {"show_cue": False})] if has_phases else []
+        if probe == "cue":
+            return self._of_lengths(probe, "cue_steps", settings.cues) if has_phases else []
+        if probe == "delay":
+            return self._of_lengths(probe, "delay_steps", settings.delays) if has_phases else []
+        if probe == "reset":
+            return [self._resetting(step) for step in self._reset_steps()]
+        names = [name for name in settings.instructions if name != self.config.prompt_set]
+        return [self._instructed(name) for name in names]
+
+    def _of_lengths(self, probe: Intervention, argument: str, lengths: tuple[int, ...]) -> list[World]:
+        """Return the worlds in which a phase has another length, with as many steps for the response."""
+        phases = self._phases()
+        usual = phases.cue_steps if probe == "cue" else phases.delay_steps
+        n_times = phases.n_in_turn if probe == "cue" else 1
+        return [
+            self.world(
+                probe,
+                length,
+                {argument: length, "horizon_steps": phases.horizon_steps + n_times * (length - usual)},
+            )
+            for length in sorted(set(lengths) - {usual})
+        ]
+
+    def _resetting(self, step: int) -> World:
+        world = self.world("reset", step, {})
+        return replace(world, config=replace(world.config, reset_policy_at_step=step))
+
+    def _instructed(self, prompt_set: str) -> World:
+        world = self.world("instruction", Path(prompt_set).stem, {})
+        return replace(world, config=replace(world.config, prompt_set=prompt_set))
+
+    def world(self, intervention: Intervention, level: Level, env: Mapping[str, int]) -> World:
+        """Return the world in which these arguments of the task are changed."""
+        policies = [*self.config.policies]
+        if self.settings.controls:
+            policies += [control for control in self._controls() if control not in policies]
+        name = "_".join([self.spec.id, intervention, *([] if level is None else [str(level)])])
+        # Written out, so that this world is one level of the delay whatever the simulator's default is.
+        delay = {} if self.spec.candidates is None else {"delay_steps": default_delay_steps(self.spec)}
+        return World(
+            task=self.spec.id,
+            intervention=intervention,
+            level=level,
+            config=replace(
+                self.config,
+                name=name,
+                tasks=(self.spec.id,),
+                policies=tuple(policies),
+                env={**delay, **self.config.env, **env},
+            ),
+        )
+
+    def _controls(self) -> tuple[str, ...]:
+        shows_one = self.spec.candidates is not None and not shows_several(self.spec)
+        return (*CONTROLS, *CONTROLS_OF_ONE) if shows_one else CONTROLS
+
+    def _reset_steps(self) -> tuple[int, ...]:
+        if self.settings.reset_steps or self.spec.candidates is None:
+            return self.settings.reset_steps
+        phases = self._phases()
+        return tuple(dict.fromkeys((phases.cue_end_step, phases.response_step)))
+
+    def _phases(self) -> Phases:
+        """Return the phases of the world as drawn; only asked of tasks with phases."""
+        phases = phases_of(self.spec, self.config.env)
+        if isinstance(phases, str):
+            raise RecipeError(
+                f"env.{phases}={self.config.env[phases]!r}: a probe that changes a phase, or resets the "
+                "policy at the end of one, needs phases of a fixed length. Give one number, or leave these "
+                "probes out."
+            )
+        assert phases is not None  # a task with candidates has phases
+        return phases
+
+
+def shows_several(spec: TaskSpec) -> bool:
+    """Return whether several candidates are right."""
+    return "n_shown" in (*spec.kwargs, *spec.open_arguments)
+
+
+def delay_of(config: EvalConfig) -> int | None:
+    """Return the delay of a world; None for a task without one, or if it is drawn per episode."""
+    delay = config.env.get("delay_steps")
+    return delay if isinstance(delay, int) else None
+
+
+def _refuse_own_arguments(config: EvalConfig) -> None:
+    for name in OWN_ARGUMENTS:
+        if name in config.env:
+            raise RecipeError(
+                f"env.{name}: a probe sets this argument itself. `mikasa-vla eval` lets you set it."
+            )
+    if config.reset_policy_at_step is not None:
+        raise RecipeError("reset_policy_at_step: a probe sets this field itself. Use --reset-at.")

@@ -1,0 +1,177 @@
+"""The table of a probe as Markdown, CSV, JSON or LaTeX."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from vla_eval.probe.quantities import Share
+from vla_eval.probe.retention import HalfLife, Range
+from vla_eval.probe.sentences import notes, sentences
+from vla_eval.probe.table import ProbeRow, ProbeTable, Retention
+from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
+from vla_eval.results.estimates import Interval
+from vla_eval.results.table_formats import latex_table, latex_text
+
+ProbeFormat = Literal["markdown", "csv", "json", "latex"]
+PROBE_VERSION = 1
+UNDEFINED = "—"
+TITLES = (
+    *("task", "policy", "K", "world", "pairs", "sensitivity", "warranted", "value", "reliable", "follows"),
+    *("success once", "chance", "left", "p", "p (Holm)"),
+)
+JsonRow = dict[str, Any]  # Any: JSON
+
+
+def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
+    """Return the table as text, without a newline at its end."""
+    if fmt == "json":
+        return json.dumps(probe_json(table), indent=2, ensure_ascii=False, allow_nan=False)
+    if fmt == "csv":
+        return _csv([json_row(row) for row in table.rows])
+    cells = [_cells(row) for row in table.rows]
+    said = [*sentences(table), *notes(table)]
+    if fmt == "latex":
+        is_number = [title not in ("task", "policy", "world") for title in TITLES]
+        footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
+        return "\n".join(
+            ["% needs \\usepackage{booktabs}", *latex_table(list(TITLES), cells, is_number), *footnotes]
+        )
+    lines = [_line(TITLES), _line([":--"] * len(TITLES)), *(_line(row) for row in cells)]
+    return "\n".join([*lines, "", *(f"- {markdown_text(line)}" for line in said)])
+
+
+def probe_json(table: ProbeTable) -> JsonRow:
+    """Return rows, retention curves and sentences as JSON; undefined values are null."""
+    return {
+        "probe_version": PROBE_VERSION,
+        "rows": [json_row(row) for row in table.rows],
+        "retention": [_json_retention(curve) for curve in table.retention],
+        "sentences": sentences(table),
+        "notes": notes(table),
+    }
+
+
+def json_row(row: ProbeRow) -> JsonRow:
+    """Return one row; `ci_low` and `ci_high` belong to `success_once`."""
+    swap = row.swap
+    return {
+        "task": row.task,
+        "policy": row.policy,
+        "n_action_steps": row.n_action_steps,
+        "intervention": row.intervention,
+        "level": row.level,
+        "delay_steps": row.delay_steps,
+        "cue_inference_steps": list(row.inferences.cue_steps) if row.inferences else None,
+        "n_late_steps": row.inferences.n_late if row.inferences else None,
+        "n_pairs": row.n_pairs,
+        "change_of": swap.change_of if swap else None,
+        **_json_share("sensitivity", swap.sensitivity if swap else None),
+        **_json_share("actions_changed", swap.actions_changed if swap else None),
+        **_json_share("warranted_choice", swap.warranted_choice if swap else None),
+        "matched_world_value": swap.matched_value if swap else None,
+        **_ends("matched_world_value", swap.matched_interval if swap else None),
+        **_json_share("reliability", swap.reliability if swap else None),
+        **_json_share("follows", row.followed),
+        "n_success_once": row.success.n if row.success else None,
+        "success_once": row.success.rate if row.success else None,
+        "ci_low": row.success.interval.low if row.success else None,
+        "ci_high": row.success.interval.high if row.success else None,
+        "chance": row.chance,
+        "left": row.left,
+        **_ends("left", row.left_interval),
+        "p_value": row.p_value,
+        "corrected_p": row.corrected_p,
+        "n_errors": row.n_errors,
+    }
+
+
+def _json_share(name: str, share: Share | None) -> JsonRow:
+    return {
+        f"n_{name}": share.n if share else None,
+        name: share.rate if share else None,
+        **_ends(name, share.interval if share else None),
+    }
+
+
+def _ends(name: str, interval: Interval | Range | None) -> JsonRow:
+    low, high = (None, None) if interval is None else interval
+    return {f"{name}_low": low, f"{name}_high": high}
+
+
+def _json_retention(curve: Retention) -> JsonRow:
+    half = curve.half_life
+    return {
+        "task": curve.task,
+        "policy": curve.policy,
+        "n_action_steps": curve.n_action_steps,
+        "points": [
+            {"delay_steps": row.delay_steps, **_json_share("follows", row.followed), "chance": row.chance}
+            for row in curve.rows
+        ],
+        "half_life_steps": half.steps if half else None,
+        **_ends("half_life_steps", half.interval if half else None),
+        "half_life_state": _state(half),
+        "longest_delay_steps": curve.rows[-1].delay_steps,
+    }
+
+
+def _state(half: HalfLife | None) -> str:
+    if half is None:
+        return "undefined"
+    return "beyond_longest_delay" if half.steps is None else "measured"
+
+
+def _cells(row: ProbeRow) -> list[str]:
+    swap = row.swap
+    return [
+        row.task,
+        row.policy,
+        str(row.n_action_steps),
+        row.intervention if row.level is None else f"{row.intervention} {row.level}",
+        str(row.n_pairs),
+        _shown(swap.sensitivity if swap else None),
+        _shown(swap.warranted_choice if swap else None),
+        _shown_rate(swap.matched_value, swap.matched_interval) if swap else UNDEFINED,
+        _shown(swap.reliability if swap else None),
+        _shown(row.followed),
+        _shown(row.success),
+        UNDEFINED if row.chance is None else f"{row.chance:.2f}",
+        UNDEFINED
+        if row.left is None or row.left_interval is None
+        else _shown_rate(row.left, row.left_interval),
+        _shown_p(row.p_value),
+        _shown_p(row.corrected_p),
+    ]
+
+
+def _shown(share: Share | None) -> str:
+    return UNDEFINED if share is None else _shown_rate(share.rate, share.interval)
+
+
+def _shown_rate(rate: float, interval: Interval | Range) -> str:
+    low, high = (UNDEFINED if end is None else f"{end:.2f}" for end in interval)
+    return f"{rate:.2f} [{low}, {high}]"
+
+
+def _shown_p(p_value: float | None) -> str:
+    return UNDEFINED if p_value is None else f"{p_value:.3g}"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(markdown_cell(cell) for cell in cells)} |"
+
+
+def _csv(rows: Sequence[JsonRow]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(rows[0])
+    writer.writerows([[csv_cell(_csv_value(value)) for value in row.values()] for row in rows])
+    return text.getvalue().rstrip("\n")
+
+
+def _csv_value(value: object) -> object:
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    return "" if value is None else value

@@ -1,0 +1,176 @@
+"""What two worlds of the same episodes say of a policy's memory. Pure functions of records.
+
+An undefined value is None, never 0. `docs/probe.md` defines each quantity; their names are those of the
+Counterfactual Memory Audit (arXiv:2609.27247), the definitions are ours. Knows nothing of files.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from scipy import stats
+
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import CONFIDENCE, Interval, PairCounts, mcnemar_exact, wilson_interval
+from vla_eval.tasks.spec import TaskSpec
+
+CUE_IN_STATE = frozenset({"vla_eval.tasks.rotate:RotateEnv"})
+"""Tasks whose cue is a number of the state: the digest of a trajectory contains it."""
+
+ChangeOf = Literal["choice", "actions"]
+
+
+class Share(NamedTuple):
+    """How many of how many, with its interval."""
+
+    n: int
+    of: int
+
+    @property
+    def rate(self) -> float:
+        """The share."""
+        return self.n / self.of
+
+    @property
+    def interval(self) -> Interval:
+        """The Wilson interval at 95 %."""
+        found = wilson_interval(self.n, self.of)
+        assert found is not None  # a share is of at least one
+        return found
+
+
+class Pair(NamedTuple):
+    """The same episode in the world as it is drawn, and in another one."""
+
+    drawn: EpisodeRecord
+    other: EpisodeRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwapQuantities:
+    """What swapped cues say; `n_follow` and `n_against` are the counts of the sign test.
+
+    Attributes:
+        sensitivity: pairs whose choice changes, or whose actions, as `change_of` says; None where neither
+            is known.
+        actions_changed: pairs whose trajectories differ.
+        warranted_choice: pairs in which the cue is followed in both worlds.
+        matched_value: mean success over both worlds, each by its own rule, with its interval.
+        reliability: pairs that succeed in both worlds.
+        p_value: exact two-sided sign test; None where there is no single right candidate.
+    """
+
+    n_pairs: int
+    change_of: ChangeOf | None
+    sensitivity: Share | None
+    actions_changed: Share | None
+    warranted_choice: Share
+    matched_value: float
+    matched_interval: Interval
+    reliability: Share
+    p_value: float | None
+
+
+def pair_up(drawn: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) -> list[Pair]:
+    """Return the pairs with a result in both worlds, by run and seed.
+
+    Args:
+        drawn: episodes of one task, policy and n_action_steps in one world.
+        other: the same in another world.
+    """
+    partner = {(r.run, r.seed): r for r in other if r.outcome != "error"}
+    pairs = [
+        Pair(r, partner[r.run, r.seed]) for r in drawn if r.outcome != "error" and (r.run, r.seed) in partner
+    ]
+    return sorted(pairs, key=lambda pair: (pair.drawn.run, pair.drawn.seed))
+
+
+def follows(record: EpisodeRecord) -> bool:
+    """Return whether an episode follows its cue: by its first choice, or by success if several are right."""
+    if record.target is None:
+        return bool(record.success_once)
+    return bool(record.first_choice_success)
+
+
+def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | None:
+    """Return what the pairs of a swapped cue say; None without a pair."""
+    if not pairs:
+        return None
+    n_pairs = len(pairs)
+    moved = None if spec.entry_point in CUE_IN_STATE else _share(pairs, _acts_differently)
+    change_of = _change_of(pairs, spec)
+    by_change = {"choice": _share(pairs, _chooses_differently), "actions": moved, None: None}
+    n_successes = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs)
+    return SwapQuantities(
+        n_pairs=n_pairs,
+        change_of=change_of,
+        sensitivity=by_change[change_of],
+        actions_changed=moved,
+        warranted_choice=_share(pairs, lambda pair: follows(pair.drawn) and follows(pair.other)),
+        matched_value=n_successes / (2 * n_pairs),
+        matched_interval=wilson_of_rate(n_successes / (2 * n_pairs), n_pairs),
+        reliability=_share(pairs, lambda pair: bool(pair.drawn.success_once and pair.other.success_once)),
+        p_value=_sign_test(pairs),
+    )
+
+
+def _change_of(pairs: Sequence[Pair], spec: TaskSpec) -> ChangeOf | None:
+    """Return what a change is counted by: the first touch, if the cue determines it, else the actions."""
+    is_determined = pairs[0].drawn.target is not None or spec.memory == "sequential"
+    if pairs[0].drawn.n_candidates and is_determined:
+        return "choice"
+    return None if spec.entry_point in CUE_IN_STATE else "actions"
+
+
+def _share(pairs: Sequence[Pair], holds: Callable[[Pair], bool]) -> Share:
+    return Share(sum(holds(pair) for pair in pairs), len(pairs))
+
+
+def _chooses_differently(pair: Pair) -> bool:
+    return pair.drawn.first_choice != pair.other.first_choice
+
+
+def _acts_differently(pair: Pair) -> bool:
+    return pair.drawn.trajectory_sha256 != pair.other.trajectory_sha256
+
+
+def _sign_test(pairs: Sequence[Pair]) -> float | None:
+    """Return p of the hypothesis that the choice does not depend on the cue.
+
+    If it did not, a pair that follows both cues would be as probable as one that chooses each world's
+    candidate in the other world: the two worlds of a pair could be exchanged. Source: Fisher's sign test.
+    """
+    if any(pair.drawn.target is None for pair in pairs):
+        return None
+    n_follow = sum(follows(pair.drawn) and follows(pair.other) for pair in pairs)
+    n_against = sum(
+        pair.drawn.first_choice == pair.other.target and pair.other.first_choice == pair.drawn.target
+        for pair in pairs
+    )
+    n_told = n_follow + n_against
+    return min(1.0, float(stats.binomtest(n_follow, n_told).pvalue)) if n_told else 1.0
+
+
+def paired_p(pairs: Sequence[Pair]) -> float | None:
+    """Return p of the exact McNemar test on whether episodes follow the cue; None without a pair."""
+    counts = {(one, two): 0 for one in (True, False) for two in (True, False)}
+    for pair in pairs:
+        counts[follows(pair.drawn), follows(pair.other)] += 1
+    test = mcnemar_exact(
+        PairCounts(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
+    )
+    return None if test is None else test.p_value
+
+
+def wilson_of_rate(rate: float, n: int) -> Interval:
+    """Return the Wilson score interval of a mean of values in [0, 1].
+
+    Of such means, those of zeros and ones vary most, so the interval is conservative. Source: as
+    `wilson_interval`, which takes whole numbers of successes.
+    """
+    z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
+    middle = rate + z * z / (2 * n)
+    half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    scale = 1 + z * z / n
+    return Interval(max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale))

@@ -1,0 +1,123 @@
+"""How long a memory lasts: following the cue as a function of the delay, and the delay that halves it.
+
+Pure functions of episodes. The bootstrap draws whole seeds, so that the same episodes at different delays
+stay together, from a generator with a constant seed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from vla_eval.results.estimates import CONFIDENCE, p_above
+
+N_DRAWS = 1000
+BOOTSTRAP_SEED = 20260927
+LEVEL = 0.05
+BEYOND = float("inf")
+
+Followed = NDArray[np.bool_]
+"""(S,) per seed and run: whether the episode follows the cue; the same order at each delay."""
+
+
+class Range(NamedTuple):
+    """(low, high) of an interval that may reach beyond the longest delay: `high` is None then."""
+
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HalfLife:
+    """The delay at which half of what is above chance at the shortest delay is left.
+
+    Attributes:
+        steps: None if more than half is left at the longest delay.
+        interval: at 95 %, by bootstrap over seeds; an end that is None lies beyond the longest delay.
+        longest_delay: the longest delay that was measured.
+    """
+
+    steps: float | None
+    interval: Range
+    longest_delay: int
+
+
+def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | None:
+    """Return the half-life of a memory.
+
+    A decreasing curve is fitted to the rates (isotonic regression), and read between the delays by linear
+    interpolation.
+
+    Args:
+        followed: delay in steps -> whether each episode follows the cue.
+        chance: rate of following the cue without memory.
+
+    Returns:
+        None if there are fewer than two delays, or if at the shortest one the cue is not followed more often
+        than by chance (one-sided exact binomial test at 0.05): then there is nothing to halve.
+    """
+    delays = sorted(followed)
+    if len(delays) < 2:
+        return None
+    episodes = np.stack([followed[delay] for delay in delays])  # (delays, seeds)
+    n_episodes = episodes.shape[1]
+    if n_episodes == 0 or p_above(int(episodes[0].sum()), n_episodes, chance) >= LEVEL:
+        return None
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    drawn = [
+        _halved_at(delays, episodes[:, rng.integers(n_episodes, size=n_episodes)].mean(axis=1), chance)
+        for _ in range(N_DRAWS)
+    ]
+    low, high = _quantiles(drawn)
+    return HalfLife(
+        steps=_known(_halved_at(delays, episodes.mean(axis=1), chance)),
+        interval=Range(_known(low), _known(high)),
+        longest_delay=delays[-1],
+    )
+
+
+def _halved_at(delays: Sequence[int], rates: NDArray[np.float64], chance: float) -> float:
+    """Return the delay at which the curve falls to the middle between its beginning and chance."""
+    fitted = optimize.isotonic_regression(rates, increasing=False).x
+    middle = (float(fitted[0]) + chance) / 2
+    if fitted[0] <= chance:  # of a bootstrap draw: nothing above chance, so nothing lasts
+        return float(delays[0])
+    below = np.flatnonzero(fitted <= middle)
+    if not below.size:
+        return BEYOND
+    after = int(below[0])
+    before = after - 1
+    share = (fitted[before] - middle) / (fitted[before] - fitted[after])
+    return float(delays[before] + share * (delays[after] - delays[before]))
+
+
+def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
+    """Return after / before, with its interval by bootstrap over seeds; None if there was nothing before."""
+    if not before.any():
+        return None
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    n_episodes = len(before)
+    drawn = []
+    for _ in range(N_DRAWS):
+        chosen = rng.integers(n_episodes, size=n_episodes)
+        n_before = int(before[chosen].sum())
+        drawn.append(int(after[chosen].sum()) / n_before if n_before else BEYOND)
+    low, high = _quantiles(drawn)
+    return float(after.sum() / before.sum()), Range(_known(low), _known(high))
+
+
+def _quantiles(values: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of the central interval; without interpolation, as values may be infinite."""
+    ordered = np.sort(np.asarray(values))
+    tail = (1 - CONFIDENCE) / 2
+    return (
+        float(ordered[int(np.floor(tail * (len(ordered) - 1)))]),
+        float(ordered[int(np.ceil((1 - tail) * (len(ordered) - 1)))]),
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if value == BEYOND else value
