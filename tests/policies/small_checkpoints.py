@@ -12,6 +12,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 
 from vla_eval.chunking import ChunkingSpec
@@ -117,6 +118,24 @@ def act(backbone: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def diffusion(backbone: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """It reads two frames in time, and takes its noise from outside."""
+    config = DiffusionConfig(
+        device="cpu",
+        push_to_hub=False,
+        horizon=8,
+        n_action_steps=4,
+        noise_scheduler_type="DDIM",
+        num_inference_steps=2,
+        down_dims=(16, 32),
+        n_groups=4,
+        diffusion_step_embed_dim=16,
+        spatial_softmax_num_keypoints=4,
+    )
+    return save(with_features(config), tmp_path_factory.mktemp("diffusion") / "model")
+
+
+@pytest.fixture(scope="module")
 def pi0(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pi0")
     tokenizer = write_tiny_tokenizer(folder / "model" / "tokenizer")
@@ -141,8 +160,10 @@ def make(request: pytest.FixtureRequest, env: EnvSpec) -> Callable[..., LeRobotP
     return lambda **args: maker(context_for(env), **{"checkpoint": str(folder), **args})
 
 
-def start(slot: int = 0, seed: int = 1, run: int = 0) -> EpisodeStart:
-    return EpisodeStart(slot=slot, task=TASK, seed=seed, run=run, instruction="touch it", horizon_steps=60)
+def start(slot: int = 0, seed: int = 1, run: int = 0, row: int = 0) -> EpisodeStart:
+    return EpisodeStart(
+        slot=slot, task=TASK, seed=seed, run=run, instruction="touch it", horizon_steps=60, row=row
+    )
 
 
 def observation(step: int = 0, level: int = 100) -> Observation:

@@ -33,6 +33,7 @@ from vla_eval.testing.tiny_models import make_tiny_pi0
 pytestmark = pytest.mark.usefixtures("no_network")
 backbone, env = small_checkpoints.backbone, small_checkpoints.env
 act, pi0, make = small_checkpoints.act, small_checkpoints.pi0, small_checkpoints.make
+diffusion = small_checkpoints.diffusion
 
 BATCH_TOLERANCE = 1e-5  # float32, sums of some hundred terms in another order
 
@@ -65,23 +66,23 @@ class TestContract:
         assert np.abs(answers[0][0] - answers[0][1]).max() > 1e-3  # the slots do differ
         np.testing.assert_allclose(answers[1], answers[0], atol=BATCH_TOLERANCE)
 
-    @pytest.mark.parametrize("family", ["act", "pi0"])
+    @pytest.mark.parametrize("family", ["act", "pi0", "diffusion"])
     def test_in_one_pass_an_episodes_bits_are_its_own_whoever_is_beside_it(
         self, request: pytest.FixtureRequest, env: EnvSpec, family: str
     ) -> None:
-        maker: Any = make_lerobot if family == "act" else make_tiny_pi0
+        maker: Any = make_tiny_pi0 if family == "pi0" else make_lerobot
         checkpoint = str(request.getfixturevalue(family))
         policy = maker(dataclasses.replace(context_for(env), n_slots=3), checkpoint=checkpoint)
         passes = _count_passes(policy)
 
-        def actions(*slots: int) -> dict[int, Any]:
-            policy.reset([start(slot, seed=slot + 1) for slot in slots])
-            windows = [window(slot, observation(level=60 * slot)) for slot in slots]
-            return {slot: chunk.actions for slot, chunk in zip(slots, policy.act_batch(windows), strict=True)}
+        def actions(*rows: int) -> dict[int, Any]:
+            policy.reset([start(40 - 9 * row, seed=row + 1, row=row) for row in rows])
+            windows = [window(40 - 9 * row, observation(level=60 * row)) for row in rows]
+            return {row: chunk.actions for row, chunk in zip(rows, policy.act_batch(windows), strict=True)}
 
         together, some, one = actions(0, 1, 2), actions(2, 0), actions(1)
         assert passes == [3, 3, 3]  # rows of each pass
-        assert [together[slot].tobytes() for slot in (2, 0)] == [some[slot].tobytes() for slot in (2, 0)]
+        assert [together[row].tobytes() for row in (2, 0)] == [some[row].tobytes() for row in (2, 0)]
         assert together[1].tobytes() == one[1].tobytes()
         alone = maker(context_for(env), checkpoint=checkpoint)
         alone.reset([start(1, seed=2)])

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _verify(args: argparse.Namespace) -> list[str]:
     # Here and not above: `mikasa-vla --help` need not wait for torch.
-    from vla_eval.policies.lerobot import choose_device
+    from vla_eval.policies.lerobot_device import choose_device
     from vla_eval.policies.lerobot_loading import LoadOptions
     from vla_eval.policies.verify import verify_checkpoint
 

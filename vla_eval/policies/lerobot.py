@@ -13,16 +13,14 @@ Three kinds of policies, told apart by their configuration:
   configuration says `masks_history = True` gets `FIELD_is_pad`, which marks these frames (Octo).
 - with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
-  gets `memory` (a recurrent policy of your own).
+  gets `memory` (a recurrent policy of your own). One that also has `begin_memory(n_episodes) -> memory`,
+  a tuple of tensors (B, …), infers for several episodes in one pass: see `lerobot_memory.py`.
 """
 
-import zlib
-from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal  # lerobot is untyped
+from typing import Any, Literal, NamedTuple  # lerobot is untyped
 
 import numpy as np
 import torch
@@ -34,6 +32,15 @@ from vla_eval.features import StateKind
 from vla_eval.policies.bases import first_fetch
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot_device import autocast, choose_device, cuda_devices
+from vla_eval.policies.lerobot_episodes import (
+    Episode,
+    Frame,
+    batch_of,
+    frames_in_time,
+    given_noise,
+    in_rows,
+)
 from vla_eval.policies.lerobot_inputs import (
     STATES,
     InputMap,
@@ -43,22 +50,16 @@ from vla_eval.policies.lerobot_inputs import (
     input_map,
 )
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.policies.lerobot_memory import memory_of, recall, remembers, remembers_in_rows
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
-from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
 
-N_SEED_BITS = 63
 
+class _Inferred(NamedTuple):
+    """A chunk, and what the policy remembers now; None if it has no memory."""
 
-@dataclass(slots=True, kw_only=True)
-class _Slot:
-    """What is known of one running episode."""
-
-    start: EpisodeStart
-    frames: deque[dict[str, Tensor]]
-    memory: Any = None  # whatever the policy's `remember` returns
-    unseen: list[dict[str, Tensor]] = field(default_factory=list)
-    step: int = 0
+    chunk: ActionChunk
+    memory: Any
 
 
 class LeRobotPolicy:
@@ -71,8 +72,9 @@ class LeRobotPolicy:
         batch: infer for all due slots in one forward pass; None: if there are several slots and the
             policy can. Sums are then made in another order, so that actions agree with those of a pass
             of its own only up to rounding.
-        n_slots: how many slots there are. A pass then has a row for each, due or not: with the same
-            shape and the same place in it, an episode's actions are the same bits whoever is beside it.
+        n_slots: how many rows a pass has, due or not: with the same shape and the same place in it, an
+            episode's actions are the same bits whoever is beside it. Its place is `EpisodeStart.row`; what
+            is known of it is kept by its slot, and there may be more slots than rows.
     """
 
     def __init__(
@@ -85,8 +87,9 @@ class LeRobotPolicy:
         n_slots: int = 1,
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
-        self._remembers = callable(getattr(loaded.policy, "remember", None))
+        self._remembers = remembers(loaded.policy)
         self._deltas = history(loaded.config)
+        self._masks_history = bool(getattr(loaded.config, "masks_history", False))
         self._noise_shape = noise_shape(loaded.config)
         draws_nothing = loaded.config.type in DETERMINISTIC or getattr(loaded.policy, "draws_nothing", False)
         can_batch = draws_nothing or self._noise_shape is not None
@@ -96,10 +99,18 @@ class LeRobotPolicy:
                 f"from outside: in one pass the episodes would depend on each other. Leave `batch` out of "
                 "its recipe."
             )
-        wants_batch = n_slots > 1 and can_batch if batch is None else batch
-        self._batch = wants_batch and not self._remembers
+        if batch and self._remembers and not remembers_in_rows(loaded.policy):
+            raise SpecMismatchError(
+                f"policy '{name}' (type '{loaded.config.type}') has `remember` but no `begin_memory`, which "
+                "says what the memory of several episodes is. Leave `batch` out of its recipe, or add the "
+                "method (docs/lerobot_policies.md)."
+            )
+        if batch is None:
+            batch = n_slots > 1 and can_batch and (not self._remembers or remembers_in_rows(loaded.policy))
+        # One episode that remembers is shown all its new frames at once, which is faster.
+        self._batch = batch and (n_slots > 1 or not self._remembers)
         self._n_slots = n_slots
-        self._slots: dict[int, _Slot] = {}
+        self._slots: dict[int, Episode] = {}
         self.spec = PolicySpec(
             name=name,
             reads="every" if self._remembers or len(self._deltas) > 1 else "last",
@@ -111,68 +122,75 @@ class LeRobotPolicy:
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
         for episode in episodes:
-            n_kept = 1 - min(self._deltas, default=0)
-            self._slots[episode.slot] = _Slot(start=episode, frames=deque(maxlen=n_kept))
+            self._slots[episode.slot] = Episode(start=episode)
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Infer for one episode."""
         return self.act_batch([window])[0]
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
-        """Infer for each window; the draws of an episode are its own."""
-        slots = [self._take(window) for window in windows]
-        if not self._batch:
-            return [self._infer([slot])[0] for slot in slots]
-        if self._n_slots == 1:
-            return self._infer(slots)
-        # A row that nobody is due for repeats another one, and its answer is dropped.
-        due = {slot.start.slot: slot for slot in slots}
-        chunks = self._infer([due.get(row, slots[0]) for row in range(self._n_slots)])
-        return [chunks[slot.start.slot] for slot in slots]
+        """Infer for each window; the draws of an episode are its own.
 
-    def _take(self, window: ObservationWindow) -> _Slot:
-        slot = self._slots[window.slot]
-        frames = [self._inputs.tensors(observation) for observation in window.frames]
-        slot.frames.extend(frames)
-        slot.unseen = frames
-        slot.step = window.last.step
-        return slot
+        Raises:
+            InvalidActionError: two windows are of the same row of a pass, or a row is beyond it.
+        """
+        due = [self._shown(window) for window in windows]
+        if not self._batch:
+            inferred = [self._infer([episode])[0] for episode in due]
+        elif self._n_slots == 1:
+            inferred = self._infer(due)
+        else:
+            of_rows = self._infer(in_rows(due, self._n_slots))
+            inferred = [of_rows[episode.start.row] for episode in due]
+        # Only now: a call that raises leaves all episodes as they were, and may be made again.
+        for episode, (_, memory) in zip(due, inferred, strict=True):
+            self._slots[episode.start.slot] = replace(episode, unseen=(), memory=memory)
+        return [chunk for chunk, _ in inferred]
+
+    def _shown(self, window: ObservationWindow) -> Episode:
+        return self._slots[window.slot].shown(
+            [self._inputs.tensors(observation) for observation in window.frames],
+            step=window.last.step,
+            n_kept=1 - min(self._deltas, default=0),
+        )
 
     @torch.no_grad()
-    def _infer(self, slots: Sequence[_Slot]) -> list[ActionChunk]:
+    def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
         policy, config = self._loaded.policy, self._loaded.config
-        seeds = [_seed(slot) for slot in slots]
-        with torch.random.fork_rng(devices=_cuda_devices(config.device)), _autocast(config):
+        seeds = [episode.seed() for episode in rows]
+        with torch.random.fork_rng(devices=cuda_devices(config.device)), autocast(config):
             torch.manual_seed(seeds[0])
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}
             if self._noise_shape is not None:
-                extra["noise"] = torch.stack([_noise(seed, self._noise_shape) for seed in seeds]).to(
-                    config.device
-                )
+                extra["noise"] = given_noise(seeds, self._noise_shape).to(config.device)
+            memories: list[Any] = [None] * len(rows)
             if self._remembers:
-                (slot,) = slots
-                seen = self._loaded.preprocessor(_batched([_in_time(slot.unseen)], [slot]))
-                slot.memory = extra["memory"] = policy.remember(seen, slot.memory)
-            batch = self._loaded.preprocessor(_batched([self._frame(slot) for slot in slots], slots))
+                extra["memory"], memories = self._recall(rows)
+            frames = [episode.read(self._deltas, masks_history=self._masks_history) for episode in rows]
+            batch = self._loaded.preprocessor(batch_of(frames, rows))
             actions = self._loaded.postprocessor(policy.predict_action_chunk(batch, **extra))
-        return self._chunks(actions, len(slots))
+        chunks = self._chunks(actions, len(rows))
+        return [_Inferred(*one) for one in zip(chunks, memories, strict=True)]
 
-    def _frame(self, slot: _Slot) -> dict[str, Tensor]:
-        """Return the frame, or the frames in time, that the next inference reads."""
-        if not self._deltas:
-            return slot.frames[-1]
-        last = len(slot.frames) - 1
-        frames = _in_time([slot.frames[max(0, last + delta)] for delta in self._deltas])
-        if not getattr(self._loaded.config, "masks_history", False):
-            return frames
-        # As lerobot's datasets say it: what lies before the episode's beginning is padding.
-        is_pad = torch.tensor([last + delta < 0 for delta in self._deltas])
-        return {**frames, **{f"{key}_is_pad": is_pad for key in frames}}
+    def _recall(self, rows: Sequence[Episode]) -> tuple[Any, list[Any]]:
+        """Return what the policy remembers now: of all rows, as it takes it, and of each."""
 
-    def _chunks(self, actions: Tensor, n_slots: int) -> list[ActionChunk]:
+        def preprocessed(frames: Sequence[Frame]) -> dict[str, Any]:
+            batch: dict[str, Any] = self._loaded.preprocessor(batch_of(frames, rows))
+            return batch
+
+        policy = self._loaded.policy
+        if not self._batch:
+            (episode,) = rows
+            memory = policy.remember(preprocessed([frames_in_time(episode.unseen)]), episode.memory)
+            return memory, [memory]
+        memory = recall(policy, rows, preprocessed)
+        return memory, [memory_of(memory, row) for row in range(len(rows))]
+
+    def _chunks(self, actions: Tensor, n_rows: int) -> list[ActionChunk]:
         rows = actions.detach().to("cpu", torch.float32).numpy()
-        expected = (n_slots, self.spec.chunk_size)
+        expected = (n_rows, self.spec.chunk_size)
         if rows.shape[:2] != expected:
             raise InvalidActionError(
                 f"policy '{self.spec.name}': expected chunks of shape {expected} before the action's "
@@ -225,51 +243,3 @@ def make_lerobot(
         policy=context.name,
     )
     return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)
-
-
-def choose_device(device: str) -> str:
-    """Return the device that `auto` means here; anything else is left as it is.
-
-    Raises:
-        SpecMismatchError: a GPU is asked for that is not there.
-    """
-    has_cuda = torch.cuda.is_available()
-    if device == "auto":
-        return "cuda" if has_cuda else "cpu"
-    if device.startswith("cuda") and not has_cuda:
-        raise SpecMismatchError(
-            f"device is '{device}', but torch finds no GPU here. Run `mikasa-vla doctor`, or use device: cpu."
-        )
-    return device
-
-
-def _seed(slot: _Slot) -> int:
-    """Return the seed of one inference of one episode; the same wherever and beside whatever it runs."""
-    start = slot.start
-    rng = generator(start.seed, Stream.POLICY, zlib.crc32(start.task.encode()), start.run, slot.step)
-    return int(rng.integers(1 << N_SEED_BITS))
-
-
-def _noise(seed: int, shape: tuple[int, int]) -> Tensor:
-    # On the CPU: the same draws on every device.
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def _in_time(frames: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    return {key: torch.stack([frame[key] for frame in frames]) for key in frames[0]}
-
-
-def _batched(frames: Sequence[Mapping[str, Tensor]], slots: Sequence[_Slot]) -> dict[str, Any]:
-    batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in frames]) for key in frames[0]}
-    return {**batch, "task": [slot.start.instruction for slot in slots]}
-
-
-def _cuda_devices(device: str) -> list[torch.device]:
-    return [torch.device(device)] if str(device).startswith("cuda") else []
-
-
-def _autocast(config: Any) -> AbstractContextManager[None]:
-    if not config.use_amp:
-        return nullcontext()
-    context: AbstractContextManager[None] = torch.autocast(torch.device(config.device).type)
-    return context

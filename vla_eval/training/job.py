@@ -19,7 +19,7 @@ from vla_eval.data.opening import video_decoder
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
-from vla_eval.policies.lerobot import choose_device
+from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.held_out import check_held_out
 from vla_eval.training.lora import check_lora_targets, peft_config

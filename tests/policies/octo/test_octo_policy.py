@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -268,12 +269,15 @@ class TestInTheHarness:
 
     def test_several_episodes_in_one_pass_get_the_actions_they_get_alone(self, run: Path) -> None:
         together = in_float64(adapter(run, n_slots=3))
-        together.reset([episode(slot) for slot in range(3)])
+        # In slots 5, 6, 7 of a server, and in rows 2, 1, 0 of a pass.
+        together.reset([replace(episode(slot), slot=slot + 5, row=2 - slot) for slot in range(3)])
         alone = [in_float64(adapter(run)) for _ in range(3)]
         for slot, policy in enumerate(alone):
-            policy.reset([EpisodeStart(**{**vars_of(episode(slot)), "slot": 0})])
+            policy.reset([replace(episode(slot), slot=0)])
         for first, stop in ((0, 1), (1, 5), (5, 9)):
-            windows = [ObservationWindow(slot=slot, frames=frames(slot, first, stop)) for slot in range(3)]
+            windows = [
+                ObservationWindow(slot=slot + 5, frames=frames(slot, first, stop)) for slot in range(3)
+            ]
             chunks = together.act_batch(windows)
             for slot, policy in enumerate(alone):
                 (single,) = policy.act_batch([ObservationWindow(slot=0, frames=frames(slot, first, stop))])
@@ -301,7 +305,3 @@ class TestInTheHarness:
         assert set(state) == {"action/mean", "action/std"}
         assert state["action/mean"].shape == (len(ACTION_NAMES),)
         assert "observation.state" not in json.loads((folder / "config.json").read_text())["input_features"]
-
-
-def vars_of(start: EpisodeStart) -> dict[str, Any]:
-    return {name: getattr(start, name) for name in ("task", "seed", "run", "instruction", "horizon_steps")}

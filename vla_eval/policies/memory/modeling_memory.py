@@ -39,8 +39,8 @@ class Episodes(NamedTuple):
 class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
     """See `MikasaMemoryConfig`.
 
-    With memory it has a method `remember`; the harness shows it every frame. The twin has none and is
-    shown the frame at which it is asked.
+    With memory it has the methods `remember` and `begin_memory`; the harness shows it every frame. The twin
+    has none and is shown the frame at which it is asked.
     """
 
     config_class = MikasaMemoryConfig
@@ -53,7 +53,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         self.config: MikasaMemoryConfig = config
         self.network = MemoryNetwork(network_sizes(config), remembers=config.remembers)
         if config.remembers:
-            self.remember = self._remember
+            self.remember, self.begin_memory = self._remember, self.network.begin
         self.reset()
 
     def get_optim_params(self) -> Any:

@@ -1,0 +1,37 @@
+"""Where a LeRobot policy computes, and in which precision."""
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any  # lerobot is untyped
+
+import torch
+
+from vla_eval.errors import SpecMismatchError
+
+
+def choose_device(device: str) -> str:
+    """Return the device that `auto` means here; anything else is left as it is.
+
+    Raises:
+        SpecMismatchError: a GPU is asked for that is not there.
+    """
+    has_cuda = torch.cuda.is_available()
+    if device == "auto":
+        return "cuda" if has_cuda else "cpu"
+    if device.startswith("cuda") and not has_cuda:
+        raise SpecMismatchError(
+            f"device is '{device}', but torch finds no GPU here. Run `mikasa-vla doctor`, or use device: cpu."
+        )
+    return device
+
+
+def cuda_devices(device: str) -> list[torch.device]:
+    """Return the GPUs of which a policy on this device may draw random numbers."""
+    return [torch.device(device)] if str(device).startswith("cuda") else []
+
+
+def autocast(config: Any) -> AbstractContextManager[None]:
+    """Return the context in which a policy of this configuration computes."""
+    if not config.use_amp:
+        return nullcontext()
+    context: AbstractContextManager[None] = torch.autocast(torch.device(config.device).type)
+    return context
