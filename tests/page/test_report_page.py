@@ -20,7 +20,7 @@ from vla_eval.page.charts import MARKERS, Bar, Chart, Point, Series, curves, for
 from vla_eval.page.svg import PALETTE
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
-from vla_eval.results.table_formats import table_cells
+from vla_eval.results.table_columns import lay_out
 from vla_eval.storage.capture_files import video_file
 from vla_eval.storage.run_folder import RunDescription, RunFolder, Session, StoredRun, read_run
 
@@ -132,8 +132,8 @@ def test_the_table_of_the_page_is_the_json_report() -> None:
     run = full_run()
     page, table = Page(full_page()), build_table([run])
     assert page.data == json.loads(render(table, "json"))["rows"]
-    columns, cells = table_cells(table)
-    assert page.rows == [[column.title for column in columns], *cells]
+    layout = lay_out(table)
+    assert page.rows == [[column.title for column in layout.columns], *map(list, layout.cells)]
 
 
 def test_the_json_report_is_in_the_page_for_programs() -> None:
@@ -195,7 +195,7 @@ def test_text_of_a_run_never_becomes_markup(evil: str) -> None:
     read = Page(page)
     assert "<script>alert" not in page
     assert [link for link in read.loads if "evil" in link] == []
-    assert read.rows[1][1] == evil  # the name of the policy is shown as it is
+    assert read.rows[1][0] == evil  # the name of the policy is shown as it is
     assert evil in read.sections["errors"] and evil in read.sections["reproduce"]
     assert "49" not in read.sections["table"]
 
@@ -336,6 +336,5 @@ def test_a_browser_shows_the_page_without_complaint(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     assert "CONSOLE" not in done.stderr  # where chromium logs what a page does wrong
     read = Page(done.stdout)  # the browser's own reading of the page
-    _, cells = table_cells(build_table([run]))
-    assert read.rows[1:] == cells
+    assert read.rows[1:] == [list(row) for row in lay_out(build_table([run])).cells]
     assert len(re.findall(r'<svg[^>]*role="img"', done.stdout)) >= 4

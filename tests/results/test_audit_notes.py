@@ -8,9 +8,17 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.evaluations import Counts, TaskAudit, verdict
+from vla_eval.audit.evaluations import (
+    NEEDS_MEMORY,
+    SHORTCUTS,
+    UNDECIDED,
+    WITHOUT_ACTING,
+    Counts,
+    TaskAudit,
+    verdict,
+)
 from vla_eval.results import shipped_audit as audited
-from vla_eval.results.audit_notes import audit_notes
+from vla_eval.results.audit_notes import OTHER_VERDICTS, ROADS, audit_notes
 from vla_eval.results.shipped_audit import STRICT, protocol_of, shipped_verdicts
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import TASKS
@@ -52,14 +60,20 @@ def run_of(task: str, **config: object) -> StoredRun:
 
 def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -> None:
     (note,) = audit_notes([run_of(COLOR), run_of(COLOR, env={})])
-    assert note.startswith("shortcut audit under the paper's rule, 30 episodes per control: ")
-    assert f"{COLOR}: can be toured, body can store the cue" in note
+    assert note == (
+        f"can be won without memory: {COLOR} by touching one candidate after another, or by storing the cue "
+        "in the gripper (audit under the paper's rule, 30 episodes per control: docs/audit.md)."
+    )
+
+
+def test_every_verdict_of_an_audit_has_words_for_readers() -> None:
+    assert set(ROADS) == {*SHORTCUTS.values(), WITHOUT_ACTING}
+    assert set(OTHER_VERDICTS) == {NEEDS_MEMORY, UNDECIDED}
 
 
 def test_a_strict_run_gets_the_strict_verdict() -> None:
     (note,) = audit_notes([run_of(COLOR, env={"freeze_until_choice": True, "strict_choice": True})])
-    assert "under the strict rule" in note
-    assert f"{COLOR}: needs memory" in note
+    assert note.startswith(f"no shortcut found: {COLOR} (audit under the strict rule")
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_the_text_names_what_the_figures_are() -> None:
     text = render_sweep(sweep, "markdown")
     assert "exact McNemar" in text and "Holm" in text and "a difference of 0.2" in text
     assert "variant" not in text  # there is one only
-    line = next(line for line in text.splitlines() if "| p      | 4 " in line)
+    line = next(line for line in text.splitlines() if "| p      |  4 " in line)
     assert "-1.00" in line and "0.125" in line  # 2 · 0.5⁴
     assert render_sweep(sweep, "csv").startswith("task,policy,K,episodes,success")
 

@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from vla_eval.results.estimates import (
@@ -13,6 +14,7 @@ from vla_eval.results.estimates import (
     estimate_runs,
     holm,
     mcnemar_exact,
+    paired_interval,
     wilson_interval,
 )
 
@@ -145,3 +147,42 @@ def test_estimates_import_neither_torch_nor_pandas() -> None:
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert output.stdout.strip() == "[]"
+
+
+# ------------------------------------------------------------------------------- interval of a difference
+
+
+def test_the_interval_of_a_difference_is_the_one_of_the_formula() -> None:
+    # 10 both, 15 only the first, 5 only the second, 20 neither: rates 25/50 and 15/50.
+    # Wilson with z²/n = 0.076829: of 0.5: centre 0.5, half 0.133550; of 0.3: (0.3 + 0.038415)/1.076829 =
+    # 0.314270, half 0.123171, so 0.191099 to 0.437441. φ = (10 · 20 - 15 · 5 - 25)/√(25 · 25 · 15 · 35)
+    # = 100/572.8220 = 0.174574, with n/2 = 25 taken off.
+    # Below: √(0.133550² - 2φ · 0.133550 · 0.137441 + 0.137441²); above: the same with 0.108901.
+    below = math.sqrt(0.133550**2 - 2 * 0.174574 * 0.133550 * 0.137441 + 0.137441**2)
+    above = math.sqrt(0.133550**2 - 2 * 0.174574 * 0.133550 * 0.108901 + 0.108901**2)
+    found = paired_interval(PairCounts(both=10, only_first=15, only_second=5, neither=20))
+    assert found == pytest.approx((0.2 - below, 0.2 + above), abs=1e-4)
+
+
+def test_the_interval_of_a_difference_has_no_preferred_side() -> None:
+    one = paired_interval(PairCounts(both=7, only_first=9, only_second=2, neither=4))
+    other = paired_interval(PairCounts(both=7, only_first=2, only_second=9, neither=4))
+    assert (one.low, one.high) == pytest.approx((-other.high, -other.low))
+
+
+@pytest.mark.parametrize("counts", [PairCounts(20, 0, 0, 0), PairCounts(0, 20, 0, 0), PairCounts(0, 0, 0, 1)])
+def test_outcomes_that_never_vary_have_an_interval_of_some_width(counts: PairCounts) -> None:
+    low, high = paired_interval(counts)
+    assert -1 <= low < high <= 1
+
+
+def test_the_interval_of_a_difference_holds_it_as_often_as_promised() -> None:
+    rng, n = np.random.default_rng(0), 20
+    # Success 0.9 and 0.35, independent: the situation of a policy against chance.
+    shares = (0.9 * 0.35, 0.9 * 0.65, 0.1 * 0.35, 0.1 * 0.65)
+    draws = rng.multinomial(n, shares, 1000)
+    covered = 0
+    for draw in draws:
+        low, high = paired_interval(PairCounts(*map(int, draw)))
+        covered += low <= 0.55 <= high
+    assert covered / 1000 > 0.93  # 0.95, less three standard errors of 1000 draws

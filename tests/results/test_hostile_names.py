@@ -38,8 +38,6 @@ def run_of(name: str) -> StoredRun:
 
 def outputs(run: StoredRun, fmt: str) -> list[str]:
     table = render(build_table([run]), fmt)  # type: ignore[arg-type]
-    if fmt == "latex":
-        return [table]
     return [table, render_sweep(compare_runs([run]), fmt)]  # type: ignore[arg-type]
 
 
@@ -70,14 +68,14 @@ def test_a_row_of_markdown_is_one_line_with_all_its_cells(name: str) -> None:
         lines = [line for line in text.split("\n") if line.startswith("|")]
         assert len(lines) == 4  # titles, rule, two rows
         assert len({len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines}) == 1
-        assert all(line == "" or line.startswith(("|", "- ")) for line in text.split("\n"))
+        assert all(line == "" or line.startswith(("|", "- ", "All rows: ")) for line in text.split("\n"))
         assert not re.search(r"<[A-Za-z/!?]", text)
 
 
 @pytest.mark.parametrize("name", ["[a](http://b)", "![a][b]", "`a`", "**a**", "a](b"])
 def test_no_cell_of_markdown_is_a_link_or_code_or_bold(name: str) -> None:
     for text in outputs(run_of(name), "markdown"):
-        cells = "".join(line for line in text.split("\n") if line.startswith("|"))
+        cells = "".join(line for line in text.split("\n") if line.startswith(("|", "All rows: ")))
         acting = re.sub(r"\\.", "", cells)
         assert not re.search(r"\]\(|\]\[|`|\*", acting)
 
@@ -90,8 +88,11 @@ def test_code_and_blocks_of_markdown_end_where_they_should() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_latex_s_own_characters_are_escaped(name: str) -> None:
-    (text,) = outputs(run_of(name), "latex")
-    rows = [line for line in text.split("\n") if line.endswith(" \\\\")]
+    for text in outputs(run_of(name), "latex"):
+        check_latex_rows([line for line in text.split("\n") if line.endswith(" \\\\")])
+
+
+def check_latex_rows(rows: list[str]) -> None:
     assert len(rows) == 3  # titles, two rows
     for row in rows:
         assert not row.startswith(("[", "*"))
@@ -99,6 +100,16 @@ def test_latex_s_own_characters_are_escaped(name: str) -> None:
         known = re.sub(r"\\[_%&#${}]|\\text(backslash|asciitilde|asciicircum)\{\}|\$(<|>|-|\\pm)\$", "", row)
         known = re.sub(r"\\texttt\{(.*?)\}", r"\1", known.removesuffix(" \\\\")).replace(" & ", "")
         assert not set("\\%&#$~^") & set(known.replace("$^\\dagger$", "").replace("$\\times$", ""))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_html_table_has_only_its_own_elements(name: str) -> None:
+    allowed = {"p", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "code"}
+    for text in outputs(run_of(name), "html-table"):
+        found = _Tags(text).found
+        assert {tag for tag, _ in found} <= allowed
+        assert {attribute for _, attributes in found for attribute in attributes} <= {"style"}
+        assert [tag for tag, _ in found].count("tr") == 3  # titles, two rows
 
 
 class _Tags(HTMLParser):

@@ -92,9 +92,39 @@ def test_a_baseline_that_was_asked_for_must_be_there() -> None:
         build_table([stored(episodes("p", "+"), episodes("random", "-"))], baseline="ramdom")
 
 
+def test_by_default_policies_are_compared_with_the_arm_that_forgets_and_beside_it_with_random() -> None:
+    # Six pairs each. p wins all against random, 4 of 6 against cue_blind and loses none.
+    groups = episodes("p", "++++++"), episodes("cue_blind", "++----"), episodes("random", "------")
+    table = build_table([stored(*groups)])
+    p, blind, random = (only_row(table, name) for name in ("p", "cue_blind", "random"))
+    assert table.baselines == ("cue_blind", "random")
+    assert (p.baseline, p.second_baseline) == ("cue_blind", "random")
+    assert p.paired_difference == pytest.approx(4 / 6) and p.second_difference == 1
+    assert (p.paired_p_raw, p.second_p_raw) == (pytest.approx(2 / 2**4), pytest.approx(2 / 2**6))
+    # The two baselines are one more comparison, not two: three in all. Holm: 3 · 2/64, then 2 · 2/16.
+    assert table.n_comparisons == 3
+    assert (p.second_p, p.paired_p) == (pytest.approx(3 * 2 / 64), pytest.approx(2 * 2 / 16))
+    assert blind.baseline is None and blind.second_difference == pytest.approx(2 / 6)
+    assert random.paired_difference is random.second_difference is None
+    assert has_note(table, "vs cue_blind, vs random: difference", "over 3 comparisons")
+
+
+def test_a_baseline_that_is_named_is_the_only_one() -> None:
+    groups = episodes("p", "++++++"), episodes("cue_blind", "++----"), episodes("random", "------")
+    table = build_table([stored(*groups)], baseline="random")
+    row = only_row(table, "p")
+    assert (table.baselines, row.baseline, row.second_baseline) == (("random",), "random", None)
+    assert "cue_blind" not in render(table, "markdown").splitlines()[2]
+
+
+def test_without_a_baseline_no_column_is_empty() -> None:
+    text = render(build_table([stored(episodes("p", "+-"), episodes("q", "--"))]), "markdown")
+    assert "vs " not in text
+
+
 def test_without_random_there_is_no_comparison_and_no_complaint() -> None:
     table = build_table([stored(episodes("p", "+"))])
-    assert table.baseline is None and table.rows[0].baseline is None
+    assert table.baselines == () and table.rows[0].baseline is None
     assert table.rows[0].paired_difference is None
 
 

@@ -12,9 +12,11 @@ from pathlib import Path
 import pytest
 
 from tests.results.stored_runs import episode, episodes, stored
+from vla_eval.cli import output
 from vla_eval.cli import report as report_verb
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.results.report import FORMATS, Format, Table, build_table, render
+from vla_eval.results.table_formats import PRESETS
 from vla_eval.storage.run_folder import RunFolder
 
 # ------------------------------------------------------------------------------- formats
@@ -30,6 +32,49 @@ def test_markdown_columns_are_aligned() -> None:
     assert len({len(line) for line in lines}) == 1
     positions = [[i for i, char in enumerate(line) if char == "|"] for line in lines]
     assert all(found == positions[0] for found in positions)
+
+
+def demo_like(n_tasks: int) -> Table:
+    """The rows of `make demo`: oracle, cue_blind and random, on some of its tasks."""
+    tasks = ("RememberColor3-v0", "InterceptMedium-v0", "ShellGameTouch-v0")[:n_tasks]
+    outcomes = {"oracle": "+" * 20, "cue_blind": "+" * 7 + "-" * 13, "random": "-" * 20}
+    return build_table(
+        [stored(*(episodes(name, text, task=task) for task in tasks for name, text in outcomes.items()))]
+    )
+
+
+@pytest.mark.parametrize("n_tasks", [1, 2, 3])
+def test_the_table_fits_a_terminal_of_100_columns_with_success_third_at_most(n_tasks: int) -> None:
+    lines = [line for line in render(demo_like(n_tasks), "markdown").splitlines() if line.startswith("|")]
+    assert max(map(len, lines)) <= 100
+    titles = [title.strip() for title in lines[0].strip("|").split("|")]
+    assert titles.index("success once") <= 2
+    assert "vs cue_blind" in titles and "vs random" in titles
+
+
+def test_what_is_the_same_in_all_rows_is_said_above_and_what_has_no_room_below() -> None:
+    text = render(demo_like(2), "markdown")
+    assert text.splitlines()[0] == "All rows: K 1, chance 0.35, ceiling 1.00, episodes 20, errors 0."
+    # Nothing but success in any of these records is an inference or a step: what was left out has values.
+    (left_out,) = re.findall(r"^- not shown: (.*) \(`--wide` shows every column\)\.$", text, re.M)
+    wide = render(demo_like(2), "markdown", wide=True)
+    titles = [title.strip() for title in wide.splitlines()[0].strip("|").split("|")]
+    assert set(left_out.split(", ")) < set(titles) and {"K", "episodes", "errors"} < set(titles)
+    assert "not shown" not in wide and "All rows" not in wide
+
+
+def test_a_column_that_differs_is_never_folded_or_left_out() -> None:
+    groups = episodes("a" * 60, "+" * 9 + "e"), episodes("cue_blind", "-" * 12), episodes("random", "-" * 12)
+    head = render(build_table([stored(*groups)]), "markdown").splitlines()
+    assert head[0] == "All rows: task RememberColor3-v0, K 1, chance 0.00."
+    assert {"episodes", "errors"} < {title.strip() for title in head[2].strip("|").split("|")}
+
+
+def test_wide_is_refused_where_every_column_is_there_anyway() -> None:
+    with pytest.raises(ReportError, match="--wide: json has every column"):
+        render(a_table(), "json", wide=True)
+    with pytest.raises(ReportError, match="--preset paper is a whole table in LaTeX"):
+        render(a_table(), "markdown", preset="paper")
 
 
 @pytest.mark.parametrize("fmt", ["markdown", "latex"])
@@ -54,7 +99,7 @@ def test_the_help_names_every_column(capsys: pytest.CaptureFixture[str]) -> None
     report_verb.add_parser(parser.add_subparsers())
     with pytest.raises(SystemExit):
         parser.parse_args(["report", "--help"])
-    told = capsys.readouterr().out.partition("latex:")[2].partition("--html")[0]
+    told = capsys.readouterr().out.partition("for reading:")[2].partition("--html")[0]
     assert sorted(told.split()) == sorted(known[1].split(", "))
 
 
@@ -160,7 +205,7 @@ def test_the_baseline_random_is_an_error_only_if_it_was_asked_for(tmp_path: Path
 
 
 def test_report_offers_the_formats_that_there_are() -> None:
-    assert report_verb.FORMATS == FORMATS
+    assert (output.FORMATS, output.PRESETS) == (FORMATS, PRESETS)
 
 
 def test_help_does_not_wait_for_scipy_and_a_report_needs_no_torch(run_folder: Path) -> None:

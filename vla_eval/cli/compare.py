@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.output import FORMATS
+
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
 chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired
 test against a reference, and how many episodes would settle a difference.
@@ -33,7 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument(
         "--difference", type=float, default=0.1, metavar="D", help="difference to plan for (0.1)"
     )
-    parser.add_argument("--format", choices=("markdown", "csv"), default="markdown", help="(markdown)")
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
 
 
 def run(args: argparse.Namespace) -> int:

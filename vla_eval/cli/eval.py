@@ -12,6 +12,7 @@ from vla_eval.cli.arguments import (
     typed_command,
     workers_argument,
 )
+from vla_eval.cli.output import add_table_arguments
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
@@ -92,9 +93,7 @@ def _add_capture_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--format", choices=("markdown", "csv", "json", "latex"), default="markdown")
-    parser.add_argument("--baseline", metavar="NAME", help="policy that the others are compared with")
-    parser.add_argument("--paper", action="store_true", help="print the paper's figures beside ours")
+    add_table_arguments(parser)
     parser.add_argument(
         "--tiny",
         action="store_true",
@@ -108,7 +107,7 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.cli.output import check_baseline, print_table, write_html
+    from vla_eval.cli.output import check_baseline, check_table_arguments, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.evaluation.evaluate import default_run_folder
     from vla_eval.storage.run_folder import read_run
@@ -120,6 +119,7 @@ def run(args: argparse.Namespace) -> int:
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
+    check_table_arguments(args)
     check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
     out = args.out or default_run_folder(config)

@@ -74,11 +74,12 @@ def evaluate_table(args: argparse.Namespace) -> int:
     Raises:
         VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
     """
-    from vla_eval.cli.output import check_baseline, print_table, write_html
+    from vla_eval.cli.output import check_baseline, check_table_arguments, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.storage.run_folder import read_run
 
     _refuse(args, EVAL_FLAGS)
+    check_table_arguments(args)
     work = _work(args, rows=args.policies)
     check_baseline(args.baseline, [*work.table.controls, *(row.name for row in work.table.rows)])
     if args.tiny:

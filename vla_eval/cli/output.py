@@ -11,15 +11,53 @@ if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
 
 
-def print_table(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+# Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
+FORMATS = ("markdown", "csv", "json", "latex", "html-table")
+PRESETS = ("paper",)
+
+
+def add_table_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare how the table is printed."""
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    parser.add_argument("--wide", action="store_true", help="every column, however wide the table becomes")
+    parser.add_argument(
+        "--preset",
+        choices=PRESETS,
+        help="of --format latex: a table as in papers, tasks as columns, the best policy in bold",
+    )
+    parser.add_argument(
+        "--baseline",
+        metavar="NAME",
+        help="policy that the others are compared with (cue_blind and random, if they were run)",
+    )
+    parser.add_argument(
+        "--paper", action="store_true", help="print the paper's figures for the same tasks beside yours"
+    )
+
+
+def print_table(
+    runs: "Sequence[StoredRun]", args: argparse.Namespace, *, columns: "Sequence[str]" = ()
+) -> None:
     """Print the table of all runs in the format that was asked for."""
     from vla_eval.results.report import build_table, render
 
     table = build_table(runs, baseline=args.baseline)
-    print(render(table, args.format, paper=args.paper))
+    text = render(table, args.format, paper=args.paper, columns=columns, wide=args.wide, preset=args.preset)
+    print(text)
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
+
+
+def check_table_arguments(args: argparse.Namespace) -> None:
+    """Refuse a combination that no table has, before the run and not after it.
+
+    Raises:
+        ReportError: a preset or --wide in a format that does not take it.
+    """
+    from vla_eval.results.table_formats import check_format
+
+    check_format(args.format, columns=(), wide=args.wide, preset=args.preset, paper=args.paper)
 
 
 def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:

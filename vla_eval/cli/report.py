@@ -1,12 +1,11 @@
 """`mikasa-vla report`: print the success table of one or more run folders, or write it as a page."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
-# Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
-FORMATS = ("markdown", "csv", "json", "latex")
+from vla_eval.cli.output import add_table_arguments, print_table
+
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
 
 Each RUN is a folder that `mikasa-vla eval` made; a run may still be unfinished. Several runs go into one
@@ -26,25 +25,18 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         allow_abbrev=False,
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
-    parser.add_argument(
-        "--baseline",
-        metavar="NAME",
-        help="policy that the others are compared with (random, if it was run)",
-    )
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_table_arguments(parser)
     parser.add_argument(
         "--columns",
         nargs="+",
         default=[],
         metavar="NAME",
-        help="only these, in this order, in markdown or latex: task policy K variant episodes errors success "
-        "at_end first_choice chose right_if_chose steps inferences difference chance ceiling corrected",
+        help="only these, in this order, in formats for reading: task policy K variant success difference "
+        "second_difference first_choice chose right_if_chose chance ceiling corrected steps at_end "
+        "inferences episodes errors",
     )
     parser.add_argument(
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
-    )
-    parser.add_argument(
-        "--paper", action="store_true", help="print the paper's figures for the same tasks beside yours"
     )
 
 
@@ -55,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a RUN is no run folder, holds nothing yet, or has no such baseline.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
-    from vla_eval.results.report import build_table, render
     from vla_eval.storage.run_folder import read_run
 
     runs = [read_run(path) for path in args.runs]
@@ -63,15 +54,12 @@ def run(args: argparse.Namespace) -> int:
         from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
 
-        if args.paper or args.columns or args.format != "markdown":
+        if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
             raise ReportError(
-                "--html writes a page, which --format, --columns and --paper say nothing of. Drop them."
+                "--html writes a page, which has no --format, --preset, --columns, --wide and --paper. "
+                "Remove them."
             )
         print(write_page(runs, args.html, baseline=args.baseline))
         return 0
-    table = build_table(runs, baseline=args.baseline)
-    print(render(table, args.format, paper=args.paper, columns=args.columns))
-    if args.format == "csv":  # has no place for them
-        for note in table.notes:
-            print(f"note: {note}", file=sys.stderr)
+    print_table(runs, args, columns=args.columns)
     return 0

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.results.comparison import compare_with_baseline, count_pairs
+from vla_eval.results.comparison import Comparison, compare_with_baselines, count_pairs
 from vla_eval.results.estimates import PairCounts
 from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey, group_runs
 from vla_eval.results.report import build_table
@@ -21,7 +21,8 @@ class Material:
         runs: each run folder once.
         table: as `mikasa-vla report` prints it.
         grouping: the episodes of each of its rows.
-        pairs: the counts of each comparison with the baseline.
+        compared: baseline -> each comparison with it.
+        pairs: baseline -> the counts of each comparison with it.
         timings: run folder -> episode -> seconds.
         colors: policy -> number of its colour and marker, the same in every plot.
     """
@@ -29,7 +30,8 @@ class Material:
     runs: tuple[StoredRun, ...]
     table: Table
     grouping: Grouping
-    pairs: Mapping[RowKey, PairCounts]
+    compared: Mapping[str, Mapping[RowKey, Comparison]]
+    pairs: Mapping[str, Mapping[RowKey, PairCounts]]
     timings: Mapping[str, Mapping[EpisodeKey, EpisodeTiming]]
     colors: Mapping[str, int]
 
@@ -72,14 +74,18 @@ def gather(runs: Sequence[StoredRun], *, baseline: str | None) -> Material:
     runs = tuple({run.path.resolve(): run for run in runs}.values())
     table = build_table(runs, baseline=baseline)
     grouping = group_runs(runs)
-    compared = compare_with_baseline(grouping.groups, table.baseline) if table.baseline else {}
+    compared = compare_with_baselines(grouping.groups, table.baselines)
     groups = grouping.groups
     policies = dict.fromkeys(row.policy for row in table.rows)
     return Material(
         runs=runs,
         table=table,
         grouping=grouping,
-        pairs={key: count_pairs(groups[key], groups[found.baseline]) for key, found in compared.items()},
+        compared=compared,
+        pairs={
+            baseline: {key: count_pairs(groups[key], groups[one.baseline]) for key, one in found.items()}
+            for baseline, found in compared.items()
+        },
         timings={str(run.path): read_timings(run.path) for run in runs},
         colors={policy: number for number, policy in enumerate(policies)},
     )

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from markupsafe import Markup
@@ -24,7 +24,7 @@ from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
 from vla_eval.results.success_table import Row
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
-from vla_eval.results.table_formats import table_cells
+from vla_eval.results.table_columns import Layout, lay_out, sentence_of
 
 N_STEP_TICKS = 5
 
@@ -53,14 +53,33 @@ class Sweep:
     refusal: str = ""
 
 
-def results_table(material: Material) -> PageTable:
-    """Return the table that `mikasa-vla report` prints, each row with its JSON."""
-    columns, rows = table_cells(material.table)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Results:
+    """The table that `mikasa-vla report` prints: what all rows share, the columns that fit, all columns."""
+
+    same: str
+    table: PageTable
+    wide: PageTable
+
+
+def results(material: Material) -> Results:
+    """Return the table as the terminal has it, each row with its JSON, and the table of all columns."""
+    narrow = lay_out(material.table)
+    return Results(
+        same=sentence_of(narrow.same) if narrow.same else "",
+        table=replace(
+            _layout_table(narrow, "Success by task, policy and K (actions executed per inference)"),
+            row_data=tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows),
+        ),
+        wide=_layout_table(lay_out(material.table, wide=True), "Every column"),
+    )
+
+
+def _layout_table(layout: Layout, caption: str) -> PageTable:
     return PageTable(
-        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in columns),
-        rows=tuple(map(tuple, rows)),
-        caption="Success by task, policy and K (actions executed per inference)",
-        row_data=tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows),
+        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in layout.columns),
+        rows=layout.cells,
+        caption=caption,
     )
 
 
@@ -126,25 +145,27 @@ def chunk_sweep(material: Material) -> Sweep:
 
 
 def paired_table(material: Material) -> PageTable | None:
-    """Return the counts of each policy against the baseline; None if none is compared."""
-    if not material.pairs:
-        return None
+    """Return the counts of each policy against each baseline; None if none is compared."""
     rows = []
     for row in material.table.rows:
-        pairs = material.pairs.get(key_of(row))
-        if pairs is None or row.paired_difference is None:
-            continue
-        counts = (pairs.n_pairs, pairs.both, pairs.only_first, pairs.only_second, pairs.neither)
-        rows.append(
-            [
-                material.name_of(row, with_task=True),
-                f"{row.baseline} K={row.baseline_n_action_steps}",
-                *map(str, counts),
-                f"{row.paired_difference:+.2f}",
-                _p(row.paired_p_raw),
-                _p(row.paired_p),
-            ]
-        )
+        for baseline, compared in material.compared.items():
+            found = compared.get(key_of(row))
+            if found is None:
+                continue
+            pairs, test = material.pairs[baseline][key_of(row)], found.test
+            counts = (pairs.n_pairs, pairs.both, pairs.only_first, pairs.only_second, pairs.neither)
+            rows.append(
+                [
+                    material.name_of(row, with_task=True),
+                    f"{baseline} K={found.baseline.n_action_steps}",
+                    *map(str, counts),
+                    f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]",
+                    _p(test.p_value),
+                    _p(found.corrected_p),
+                ]
+            )
+    if not rows:
+        return None
     counted = ("pairs", "both", "only it", "only the baseline", "neither")
     return page_table(rows, text=("policy", "against"), numbers=(*counted, "difference", "p", "p (Holm)"))
 

@@ -1,4 +1,4 @@
-"""The footnote that names the shortcuts by which a table's tasks can be won without remembering."""
+"""The note that says by which shortcuts a table's tasks can be won without memory."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,6 +6,20 @@ from vla_eval.results.shipped_audit import AuditProtocol, Verdict, protocol_of, 
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
+ROADS: Mapping[str, str] = {
+    "can be toured": "by touching one candidate after another",
+    "body can store the cue": "by storing the cue in the gripper",
+    "won by staying at the cue": "by staying where the cue was shown",
+    "won from single frames": "from single frames",
+    "won without acting": "without acting",
+    "won by chance motions": "by chance motions",
+    "won without the cue": "without the cue",
+}
+"""A shortcut in the words of the audit -> how the task is won by it."""
+OTHER_VERDICTS: Mapping[str, str] = {
+    "needs memory": "no shortcut found",
+    "not decided": "not decided by so few episodes",
+}
 RULES: Mapping[AuditProtocol, str] = {"paper": "the paper's rule", "strict": "the strict rule"}
 
 
@@ -31,10 +45,16 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
 def _note(protocol: AuditProtocol, verdicts: Mapping[str, Verdict]) -> str:
     tasks_of: dict[tuple[str, ...], list[str]] = {}
     for task, verdict in verdicts.items():
-        tasks_of.setdefault(verdict.words, []).append(task)
-    said = "; ".join(f"{', '.join(tasks)}: {', '.join(words)}" for words, tasks in tasks_of.items())
-    n_episodes = min(verdict.n_episodes for verdict in verdicts.values())
-    return (
-        f"shortcut audit under {RULES[protocol]}, {n_episodes} episodes per control: {said} (docs/audit.md; "
-        "`mikasa-vla audit` runs it again)."
+        tasks_of.setdefault(tuple(word for word in verdict.words if word in ROADS), []).append(task)
+    won = (
+        f"{', '.join(tasks)} {', or '.join(ROADS[word] for word in words)}"
+        for words, tasks in tasks_of.items()
+        if words
     )
+    said = [f"can be won without memory: {'; '.join(won)}"] if any(tasks_of) else []
+    for words, meaning in OTHER_VERDICTS.items():
+        tasks = [task for task, verdict in verdicts.items() if words in verdict.words]
+        said += [f"{meaning}: {', '.join(tasks)}"] if tasks else []
+    n_episodes = min(verdict.n_episodes for verdict in verdicts.values())
+    under = f"audit under {RULES[protocol]}, {n_episodes} episodes per control: docs/audit.md"
+    return f"{'; '.join(said)} ({under})."

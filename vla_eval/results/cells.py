@@ -3,7 +3,9 @@
 Knows nothing of tables.
 """
 
+import html
 import re
+from collections.abc import Sequence
 
 from vla_eval.errors import one_line
 
@@ -48,6 +50,27 @@ def markdown_block(text: str, language: str) -> str:
     fence = "`" * max(3, _longest_run(text) + 1)
     end = "" if text.endswith("\n") else "\n"
     return f"{fence}{language}\n{text}{end}{fence}"
+
+
+def html_text(text: str) -> str:
+    """Return one line of HTML: escaped, names in backticks as code."""
+    parts = [html.escape(part) for part in re.split("`([^`]*)`", one_line(text))]
+    return "".join(f"<code>{part}</code>" if i % 2 else part for i, part in enumerate(parts))
+
+
+def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_number: Sequence[bool]) -> str:
+    """Return a `table` element without classes or scripts; numbers are aligned to the right."""
+    styles = [' style="text-align:right"' if number else "" for number in is_number]
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        whole = (
+            f"<{tag}{style}>{html.escape(one_line(cell))}</{tag}>"
+            for cell, style in zip(cells, styles, strict=True)
+        )
+        return f"<tr>{''.join(whole)}</tr>"
+
+    body = "\n".join(line(row, "td") for row in rows)
+    return f"<table>\n<thead>{line(titles, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"
 
 
 def _longest_run(text: str) -> int:

@@ -1,4 +1,4 @@
-"""Measure one row, and compare it: with a baseline on the same episodes, with chance, with the ceiling."""
+"""Measure one row, and compare it: with baselines on the same episodes, with chance, with the ceiling."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,6 +20,7 @@ from vla_eval.tasks.catalog import find_task
 
 CHANCE_POLICY = "cue_blind"
 CEILING_POLICY = "oracle"
+RANDOM_POLICY = "random"
 TOUR_POLICY = "tour"
 
 
@@ -96,27 +97,33 @@ def measure(group: RowEpisodes) -> Measured:
     )
 
 
-def compare_with_baseline(groups: Mapping[RowKey, RowEpisodes], baseline: str) -> dict[RowKey, Comparison]:
-    """Compare every other policy with the baseline, on the same task, variant, run and seed.
+def compare_with_baselines(
+    groups: Mapping[RowKey, RowEpisodes], baselines: Sequence[str]
+) -> dict[str, dict[RowKey, Comparison]]:
+    """Compare every other policy with each baseline, on the same task, variant, run and seed.
+
+    No pair of policies is tested twice: a baseline is not compared with those before it.
 
     Args:
         groups: all rows.
-        baseline: name of the policy to compare with.
+        baselines: names of the policies to compare with.
 
     Returns:
-        One comparison per row that shares episodes with the baseline; p values are corrected for all.
+        Baseline -> one comparison per row that shares episodes with it; p values are corrected for all
+        comparisons with all baselines.
     """
-    found: dict[RowKey, tuple[RowKey, PairedTest]] = {}
-    for key, group in groups.items():
-        other = _baseline_of(key, groups, baseline)
-        test = mcnemar_exact(count_pairs(group, other)) if other is not None else None
-        if other is not None and test is not None:
-            found[key] = (other.key, test)
+    found: dict[tuple[str, RowKey], tuple[RowKey, PairedTest]] = {}
+    for rank, baseline in enumerate(baselines):
+        for key, group in groups.items():
+            other = None if key.policy in baselines[rank + 1 :] else _baseline_of(key, groups, baseline)
+            test = mcnemar_exact(count_pairs(group, other)) if other is not None else None
+            if other is not None and test is not None:
+                found[baseline, key] = (other.key, test)
     corrected = holm([test.p_value for _, test in found.values()])
-    return {
-        key: Comparison(baseline=other_key, test=test, corrected_p=p)
-        for (key, (other_key, test)), p in zip(found.items(), corrected, strict=True)
-    }
+    compared: dict[str, dict[RowKey, Comparison]] = {baseline: {} for baseline in baselines}
+    for ((baseline, key), (other_key, test)), p in zip(found.items(), corrected, strict=True):
+        compared[baseline][key] = Comparison(baseline=other_key, test=test, corrected_p=p)
+    return compared
 
 
 def chance_of(

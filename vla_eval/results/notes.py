@@ -61,28 +61,29 @@ def _interval_notes(rows: Sequence[Row]) -> list[str]:
     return notes
 
 
-def comparison_notes(
-    rows: Sequence[Row], comparisons: Mapping[RowKey, Comparison], baseline: str
-) -> list[str]:
-    """Say what the comparison with the baseline is."""
-    if not comparisons:
+def comparison_notes(rows: Sequence[Row], compared: Mapping[str, Mapping[RowKey, Comparison]]) -> list[str]:
+    """Say what the comparisons with the baselines are."""
+    n_comparisons = sum(len(found) for found in compared.values())
+    if not n_comparisons:
         return []
+    columns = ", ".join(f"vs {baseline}" for baseline, found in compared.items() if found)
     notes = [
-        f"vs {baseline}: difference of success once over the same episodes (run, seed); p of the exact "
-        f"McNemar test, Holm-corrected over {_number(len(comparisons), 'comparison')} in this table."
+        f"{columns}: difference of success once over the same episodes (run, seed); p of the exact "
+        f"McNemar test, Holm-corrected over {_number(n_comparisons, 'comparison')} in this table."
     ]
-    if any(row.n_runs > 1 and row.n_pairs for row in rows):
+    if any(row.n_runs > 1 and (row.n_pairs or row.second_n_pairs) for row in rows):
         notes.append(
             "p treats pairs of several runs as independent: it describes these trained policies, not "
             "training them again; for that, use the interval over the runs."
         )
-    other_k = [
-        f"{_shown(row)} against K={row.baseline_n_action_steps}"
-        for row in rows
-        if row.baseline_n_action_steps not in (None, row.n_action_steps)
-    ]
-    if other_k:
-        notes.append(f"compared with {baseline} at another n_action_steps: {some_of(other_k)}.")
+    for baseline, found in compared.items():
+        other_k = [
+            f"{_shown(row)} against K={one.baseline.n_action_steps}"
+            for row in rows
+            if (one := found.get(_key(row))) and one.baseline.n_action_steps != row.n_action_steps
+        ]
+        if other_k:
+            notes.append(f"compared with {baseline} at another n_action_steps: {some_of(other_k)}.")
     return notes
 
 

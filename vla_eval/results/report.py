@@ -4,17 +4,20 @@ Reads and returns; changes nothing. `docs/statistics.md` explains each column.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results import notes
 from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.comparison import (
+    CHANCE_POLICY,
+    RANDOM_POLICY,
     Chance,
     Comparison,
     Measured,
     ceiling_of,
     chance_of,
-    compare_with_baseline,
+    compare_with_baselines,
     measure,
 )
 from vla_eval.results.estimates import chance_corrected
@@ -23,9 +26,9 @@ from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
 from vla_eval.storage.run_folder import StoredRun
 
-__all__ = ["DEFAULT_BASELINE", "FORMATS", "Format", "Row", "Table", "build_table", "render"]
+__all__ = ["DEFAULT_BASELINES", "FORMATS", "Format", "Row", "Table", "build_table", "render"]
 
-DEFAULT_BASELINE = "random"
+DEFAULT_BASELINES = (CHANCE_POLICY, RANDOM_POLICY)
 
 
 def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Table:
@@ -33,8 +36,8 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
 
     Args:
         runs: what the run folders hold; a folder given twice counts once.
-        baseline: the policy with which all others are compared. By default `random`, or no comparison if
-            it was not run.
+        baseline: the policy with which all others are compared. By default `cue_blind` and `random`, as
+            far as they were run.
 
     Raises:
         ReportError: there is no episode yet.
@@ -48,25 +51,27 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     policies = dict.fromkeys(key.policy for key in grouping.groups)
     if baseline is not None and baseline not in policies:
         raise unknown_name("policy", baseline, policies, where="--baseline")
-    name = DEFAULT_BASELINE if baseline is None else baseline
-    comparisons = compare_with_baseline(grouping.groups, name)
+    baselines = (
+        tuple(name for name in DEFAULT_BASELINES if name in policies) if baseline is None else (baseline,)
+    )
+    compared = compare_with_baselines(grouping.groups, baselines)
     measured = {key: measure(group) for key, group in grouping.groups.items()}
     chances = {key: chance_of(key, grouping.groups, measured) for key in grouping.groups}
     rows = [
-        _row(group, measured, chance=chances[key], comparison=comparisons.get(key))
+        _row(group, measured, chance=chances[key], versus=[compared[name].get(key) for name in baselines])
         for key, group in grouping.groups.items()
     ]
     table_notes = (
-        *notes.row_notes(rows, chances),
-        *notes.comparison_notes(rows, comparisons, name),
         *audit_notes(runs),
+        *notes.row_notes(rows, chances),
+        *notes.comparison_notes(rows, compared),
         *notes.run_notes(runs, grouping),
     )
     return Table(
         rows=tuple(rows),
         notes=table_notes,
-        baseline=name if name in policies else None,
-        n_comparisons=len(comparisons),
+        baselines=baselines,
+        n_comparisons=sum(len(found) for found in compared.values()),
         runs={str(run.path): run.description.name for run in runs},
     )
 
@@ -76,12 +81,12 @@ def _row(
     measured: Mapping[RowKey, Measured],
     *,
     chance: Chance | None,
-    comparison: Comparison | None,
+    versus: Sequence[Comparison | None],
 ) -> Row:
     own = measured[group.key]
     right = own.right_if_chose_interval
     ceiling = ceiling_of(group.key, measured)
-    test = comparison.test if comparison else None
+    first, second = (*(_versus(one) for one in versus), _versus(None), _versus(None))[:2]
     return Row(
         **group.key._asdict(),
         n_episodes=len(group.results),
@@ -102,16 +107,55 @@ def _row(
         right_if_chose_high=right.high if right else None,
         mean_success_step=own.mean_success_step,
         inferences_per_episode=own.inferences_per_episode,
-        baseline=comparison.baseline.policy if comparison else None,
-        baseline_n_action_steps=comparison.baseline.n_action_steps if comparison else None,
-        paired_difference=test.difference if test else None,
-        n_pairs=test.n_pairs if test else None,
-        paired_p=comparison.corrected_p if comparison else None,
-        paired_p_raw=test.p_value if test else None,
+        baseline=first.baseline,
+        baseline_n_action_steps=first.n_action_steps,
+        paired_difference=first.difference,
+        paired_low=first.low,
+        paired_high=first.high,
+        n_pairs=first.n_pairs,
+        paired_p=first.p,
+        paired_p_raw=first.p_raw,
+        second_baseline=second.baseline,
+        second_n_action_steps=second.n_action_steps,
+        second_difference=second.difference,
+        second_low=second.low,
+        second_high=second.high,
+        second_n_pairs=second.n_pairs,
+        second_p=second.p,
+        second_p_raw=second.p_raw,
         chance=chance.rate if chance else None,
         chance_source=chance.source if chance else None,
         ceiling=ceiling,
         chance_corrected=chance_corrected(
             own.success_once, chance=chance.rate if chance else None, ceiling=ceiling
         ),
+    )
+
+
+class _Versus(NamedTuple):
+    """The cells of one comparison; all None without one."""
+
+    baseline: str | None = None
+    n_action_steps: int | None = None
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
+    n_pairs: int | None = None
+    p: float | None = None
+    p_raw: float | None = None
+
+
+def _versus(comparison: Comparison | None) -> _Versus:
+    if comparison is None:
+        return _Versus()
+    test = comparison.test
+    return _Versus(
+        baseline=comparison.baseline.policy,
+        n_action_steps=comparison.baseline.n_action_steps,
+        difference=test.difference,
+        low=test.interval.low,
+        high=test.interval.high,
+        n_pairs=test.n_pairs,
+        p=comparison.corrected_p,
+        p_raw=test.p_value,
     )

@@ -28,8 +28,10 @@ class Row:
         mean_success_step: control steps until success, over the successes.
         inferences_per_episode: calls of the policy.
         baseline, baseline_n_action_steps: the row with which this one is compared, on the same episodes.
-        paired_difference: this row minus the baseline, over n_pairs pairs.
+        paired_difference: this row minus the baseline, over n_pairs pairs; paired_low, paired_high: its 95 %
+            interval.
         paired_p, paired_p_raw: exact McNemar, with and without Holm's correction.
+        second_baseline … second_p_raw: the same with a second baseline.
         chance, chance_source: success without memory, and its source.
         ceiling: success of the `oracle` at the same n_action_steps.
         chance_corrected: success_once relative to chance (0) and ceiling (1).
@@ -61,9 +63,19 @@ class Row:
     baseline: str | None
     baseline_n_action_steps: int | None
     paired_difference: float | None
+    paired_low: float | None
+    paired_high: float | None
     n_pairs: int | None
     paired_p: float | None
     paired_p_raw: float | None
+    second_baseline: str | None
+    second_n_action_steps: int | None
+    second_difference: float | None
+    second_low: float | None
+    second_high: float | None
+    second_n_pairs: int | None
+    second_p: float | None
+    second_p_raw: float | None
     chance: float | None
     chance_source: ChanceSource | None
     ceiling: float | None
@@ -81,13 +93,13 @@ class Table:
     Attributes:
         rows: in the order of the configuration.
         notes: footnotes, whole sentences.
-        baseline: the policy with which the others are compared; None if the table has none.
+        baselines: the policies with which the others are compared: one, two or none.
         n_comparisons: how many p values were corrected together.
         runs: run folder -> name of its configuration.
     """
 
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
-    baseline: str | None
+    baselines: tuple[str, ...]
     n_comparisons: int
     runs: Mapping[str, str]

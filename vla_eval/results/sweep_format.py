@@ -1,33 +1,81 @@
-"""Write a comparison as text: Markdown or CSV."""
+"""Write a comparison as text: Markdown, CSV, JSON, LaTeX or an HTML table."""
 
 import csv
 import io
-from collections.abc import Sequence
-from typing import Literal
+import json
 
-from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
+from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
+from vla_eval.results.estimates import CONFIDENCE
+from vla_eval.results.latex import latex_table, latex_text
 from vla_eval.results.sweep import Sweep, SweepRow
+from vla_eval.results.table_formats import Format, markdown_table
 
-SweepFormat = Literal["markdown", "csv"]
+JSON_VERSION = 1
 UNKNOWN = "—"
+TEXTS = ("task", "policy", "variant", "95 % interval", "cue frames", "reference")  # the others are numbers
 TITLES = (
     *("task", "policy", "K", "variant", "episodes", "success", "95 % interval", "chance", "ceiling"),
     *("cue frames", "reference", "difference", "p", "p (Holm)", "episodes to settle"),
 )
 
 
-def render_sweep(sweep: Sweep, fmt: SweepFormat) -> str:
+def render_sweep(sweep: Sweep, fmt: Format) -> str:
     """Return the comparison as text, without the notes for CSV."""
     titles, rows = sweep_cells(sweep)
+    notes = sweep_notes(sweep)
+    is_number = [title not in TEXTS for title in titles]
     if fmt == "csv":
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(
             [titles, *([csv_cell(cell) for cell in row] for row in rows)]
         )
         return text.getvalue().rstrip("\n")
-    return f"{_markdown(titles, rows)}\n\n" + "\n".join(
-        f"- {markdown_text(note)}" for note in sweep_notes(sweep)
+    if fmt == "json":
+        return _json(sweep, notes)
+    if fmt == "latex":
+        lines = ["% needs \\usepackage{booktabs}", *latex_table(titles, rows, is_number, ruled_by_first=True)]
+        return "\n".join(
+            [*lines, *(f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes)]
+        )
+    if fmt == "html-table":
+        items = [f"<li>{html_text(note)}</li>" for note in notes]
+        return "\n".join([html_table(titles, rows, is_number), "<ul>", *items, "</ul>"])
+    return f"{markdown_table(titles, rows, is_number)}\n\n" + "\n".join(
+        f"- {markdown_text(note)}" for note in notes
     )
+
+
+def _json(sweep: Sweep, notes: list[str]) -> str:
+    """Return every value in full precision; what is undefined is null."""
+    data = {
+        "format_version": JSON_VERSION,
+        "confidence": CONFIDENCE,
+        "by": sweep.by,
+        "n_comparisons": sweep.n_comparisons,
+        "rows": [_values(row, sweep) for row in sweep.rows],
+        "notes": notes,
+    }
+    return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _values(row: SweepRow, sweep: Sweep) -> dict[str, object]:
+    interval, test = row.measured.interval, row.test
+    return {
+        **row.key._asdict(),
+        "n_episodes": row.n_episodes,
+        "success_once": row.measured.success_once,
+        "ci_low": interval.low if interval else None,
+        "ci_high": interval.high if interval else None,
+        "chance": row.chance.rate if row.chance else None,
+        "ceiling": row.ceiling,
+        "cue_frames": list(row.cue) if row.cue else None,
+        "reference": getattr(row.reference, sweep.by) if row.reference else None,
+        "paired_difference": test.difference if test else None,
+        "n_pairs": test.n_pairs if test else None,
+        "paired_p_raw": test.p_value if test else None,
+        "paired_p": row.corrected_p,
+        "episodes_to_settle": row.n_to_settle,
+    }
 
 
 def sweep_cells(sweep: Sweep) -> tuple[list[str], list[list[str]]]:
@@ -75,14 +123,3 @@ def _cells(row: SweepRow, sweep: Sweep) -> list[str]:
 
 def _rate(value: float | None) -> str:
     return UNKNOWN if value is None else f"{value:.2f}"
-
-
-def _markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    table = [[markdown_cell(cell) for cell in row] for row in (titles, *rows)]
-    widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
-        return f"| {' | '.join(padded)} |"
-
-    return "\n".join([line(table[0]), line(["-" * width for width in widths]), *map(line, table[1:])])

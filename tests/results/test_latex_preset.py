@@ -1,0 +1,104 @@
+"""The table as a paper has it: what it says, and that LaTeX sets it within one line width."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.results.stored_runs import COLOR, INTERCEPT, episodes, stored
+from vla_eval.policies.registry import POLICIES
+from vla_eval.results.latex_preset import CONTROLS
+from vla_eval.results.report import build_table, render
+from vla_eval.results.success_table import Table
+from vla_eval.results.sweep import compare_runs
+from vla_eval.results.sweep_format import render_sweep
+
+PDFLATEX = shutil.which("pdflatex")
+TASKS = (COLOR, INTERCEPT, "RememberShapeAndColor5x3-v0", "ShellGameTouch-v0", "SeqOfColors7-v0", "Rotate-v0")
+OUTCOMES = {
+    "memory_color3": "+" * 10,
+    "memoryless_color3": "+++-------",
+    "oracle": "+" * 10,
+    "cue_blind": "++--------",
+    "random": "-" * 10,
+}
+
+
+def a_table(*tasks: str, policies: tuple[str, ...] = tuple(OUTCOMES), runs: int = 1) -> Table:
+    groups = [
+        episodes(name, OUTCOMES[name], task=task, run=run)
+        for task in tasks
+        for name in policies
+        for run in range(runs)
+    ]
+    return build_table([stored(*groups)])
+
+
+def preset(table: Table) -> str:
+    return render(table, "latex", preset="paper")
+
+
+def rows_of(text: str) -> list[list[str]]:
+    lines = [re.sub(r" \\\\(\[2pt\])?$", "", line) for line in text.splitlines() if r" \\" in line]
+    return [[cell.strip() for cell in line.split("&")] for line in lines]
+
+
+def test_tasks_are_columns_policies_are_rows_and_the_best_policy_is_bold() -> None:
+    first, second, *rows = rows_of(preset(a_table(COLOR, INTERCEPT)))
+    assert (first, second) == (["", "Remember", "Intercept"], ["", "Color3", "Medium"])
+    by_name = {row[0]: row[1:] for row in rows if row[0]}
+    assert by_name[r"memory\_color3"] == [r"\textbf{1.00}"] * 2
+    assert by_name[r"memoryless\_color3"] == ["0.30"] * 2
+    assert by_name["oracle"] == ["1.00"] * 2  # a control is never the best policy
+    # Wilson, 3 of 10: (0.3 + 0.19207) / 1.38415 ± 0.24806.
+    assert [r"{\scriptsize [0.11, 0.60]}"] * 2 in [row[1:] for row in rows]
+
+
+def test_a_caption_speaks_of_what_is_in_the_table() -> None:
+    whole = preset(a_table(COLOR))
+    for part in (
+        "10 episodes per cell",
+        "$K = 1$",
+        "best policy",
+        r"cue\_blind: the same arm without",
+        "tab:demo",
+    ):
+        assert part in whole
+    alone = preset(a_table(COLOR, policies=("memory_color3",)))
+    for part in ("bold", "Controls", "$\\pm$", "error"):
+        assert part not in alone
+    assert r"chance, 1/N & 0.33 \\" in alone  # not measured, so it is said where it comes from
+
+
+def test_several_runs_have_their_spread() -> None:
+    groups = [episodes("p", "+" * n + "-" * (10 - n), run=run) for run, n in enumerate((5, 6, 7))]
+    text = preset(build_table([stored(*groups)]))
+    assert r"p & 0.60 $\pm$ 0.06 \\" in text and "standard error over the runs" in text
+
+
+def test_the_controls_of_the_caption_are_the_scripted_policies() -> None:
+    scripted = {name for name, code in POLICIES.items() if re.search("scripted|shortcuts", code)}
+    assert set(CONTROLS) == scripted
+
+
+@pytest.mark.skipif(PDFLATEX is None, reason="LaTeX is not installed")
+@pytest.mark.parametrize("runs", [1, 2])
+def test_latex_sets_the_tables_within_one_line_width(tmp_path: Path, runs: int) -> None:
+    table = a_table(*TASKS, runs=runs)
+    sweep = compare_runs([stored(*(episodes("p", "+-", n_action_steps=k) for k in (1, 4)))])
+    body = [
+        preset(table),
+        r"\clearpage\tiny\hoffset-1in\hsize=40in\noindent",  # of the others only that they compile
+        render(table, "latex", paper=True),
+        render_sweep(sweep, "latex"),
+    ]
+    packages = r"\documentclass{article}\usepackage{booktabs}\begin{document}"
+    source = "\n".join([packages, *body, r"\end{document}"])
+    (tmp_path / "table.tex").write_text(source, encoding="utf-8")
+    command = [PDFLATEX or "", "-interaction=nonstopmode", "-halt-on-error", "table.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Overfull" not in done.stdout.partition("[1")[0]
+    assert (tmp_path / "table.pdf").stat().st_size > 0

@@ -1,0 +1,75 @@
+"""Escape text for LaTeX and write its tables. Knows nothing of results."""
+
+import re
+from collections.abc import Sequence
+
+from vla_eval.errors import one_line
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "{": r"\{",
+        "}": r"\}",
+        "_": r"\_",
+        "%": r"\%",
+        "&": r"\&",
+        "#": r"\#",
+        "$": r"\$",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"$<$",
+        ">": r"$>$",
+        "±": r"$\pm$",
+        "×": r"$\times$",
+        "†": r"$^\dagger$",
+        "π": r"$\pi$",
+        "—": "---",
+        "“": "``",
+        "”": "''",
+    }
+)
+
+
+def latex_table(
+    titles: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    is_number: Sequence[bool],
+    *,
+    ruled_by_first: bool = False,
+) -> list[str]:
+    """Return the lines of a `tabular`, which needs booktabs.
+
+    Args:
+        titles: of the columns.
+        rows: as many cells each.
+        is_number: whether a column is aligned to the right.
+        ruled_by_first: draw a rule wherever the first cell changes.
+    """
+    lines = [f"\\begin{{tabular}}{{{''.join('r' if number else 'l' for number in is_number)}}}", "\\toprule"]
+    lines += [latex_row(titles), "\\midrule"]
+    for above, row in zip((None, *rows), rows, strict=False):
+        if ruled_by_first and above is not None and above[0] != row[0]:
+            lines.append("\\midrule")
+        lines.append(latex_row(row))
+    return [*lines, "\\bottomrule", "\\end{tabular}"]
+
+
+def latex_row(cells: Sequence[str]) -> str:
+    """Return one row of names and numbers."""
+    first, *others = cells
+    parts = [latex_first(first), *(re.sub("^-(?=[0-9])", "$-$", latex_text(cell)) for cell in others)]
+    return f"{' & '.join(parts)} \\\\"
+
+
+def latex_first(cell: str) -> str:
+    """Return the first cell of a row; the rule or row above would read a bracket or a star as its own."""
+    text = re.sub("^-(?=[0-9])", "$-$", latex_text(cell))
+    return f"{{}}{text}" if text.startswith(("[", "*")) else text
+
+
+def latex_text(text: str) -> str:
+    """Return text for LaTeX: its own characters escaped, names in backticks as code."""
+    parts = [
+        part.translate(_LATEX) for part in re.split("`([^`]*)`", one_line(text))
+    ]  # every second one was code
+    return "".join(f"\\texttt{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

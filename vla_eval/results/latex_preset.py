@@ -1,0 +1,184 @@
+"""Write a table as a paper has it: LaTeX, tasks as columns, policies as rows, the best policy in bold.
+
+Knows nothing of episodes.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from vla_eval.results.latex import latex_first, latex_text
+from vla_eval.results.success_table import Row, Table
+
+CONTROLS = {
+    "oracle": "the scripted arm that knows the answer",
+    "cue_blind": "the same arm without the cue",
+    "random": "random actions",
+    "hold": "no motion",
+    "tour": "one candidate after another",
+    "body_memory": "the cue stored in the gripper",
+    "cue_touch": "stays where the cue was",
+    "one_frame": "single frames",
+}
+"""Scripted policy -> what a caption says of it. They are below the rule and never the best."""
+LINE_WIDTH_PT = 345  # \linewidth of LaTeX's article with 10 pt
+SMALL_PT, SCRIPT_PT = 5.0, 3.9  # width of a letter in \small and \scriptsize, which are 9 and 7 pt high
+COLUMN_SPACE_PT = 6  # twice \tabcolsep
+LONGEST_LINE = 10  # letters in a line of a column's title
+CHANCE_NAME = "chance, 1/N"
+
+
+class _Label(NamedTuple):
+    """What a row of the paper's table is of."""
+
+    policy: str
+    n_action_steps: int
+    variant: str | None
+
+
+def paper_preset(table: Table) -> str:
+    """Return a `table` environment that fits into one line width; it needs booktabs.
+
+    Tasks that do not fit side by side continue in a second block below the first.
+    """
+    tasks = list(dict.fromkeys(row.task for row in table.rows))
+    labels = dict.fromkeys(_label(row) for row in table.rows)
+    names = {label: _name(label, list(labels)) for label in labels}
+    cells = {(_label(row), row.task): row for row in table.rows}
+    width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
+    n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
+    blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
+    lines = [
+        "% needs \\usepackage{booktabs}",
+        "\\begin{table}[t]",
+        "\\centering",
+        f"\\caption{{{_caption(table)}}}",
+        f"\\label{{tab:{_slug(table)}}}",
+        "\\small",
+        f"\\setlength{{\\tabcolsep}}{{{COLUMN_SPACE_PT / 2:g}pt}}",
+    ]
+    for number, block in enumerate(blocks):
+        lines += [*(["", "\\medskip"] if number else []), *_tabular(block, names, cells)]
+    return "\n".join([*lines, "\\end{table}"])
+
+
+def _tabular(
+    tasks: Sequence[str], names: dict[_Label, str], cells: dict[tuple[_Label, str], Row]
+) -> list[str]:
+    lines = [f"\\begin{{tabular}}{{@{{}}l{'c' * len(tasks)}@{{}}}}", "\\toprule"]
+    titles = [_title(task) for task in tasks]
+    height = max(map(len, titles))
+    for i in range(height):
+        # Titles end in the same line.
+        parts = [title[i - height + len(title)] if i >= height - len(title) else "" for title in titles]
+        lines.append(" & ".join(["", *map(latex_text, parts)]) + r" \\")
+    learned = [label for label in names if label.policy not in CONTROLS]
+    controls = [label for label in names if label.policy in CONTROLS]
+    best = {task: _best([cells.get((label, task)) for label in learned]) for task in tasks}
+    for group in (learned, controls):
+        lines += ["\\midrule"] if group else []
+        for label in group:
+            found = [cells.get((label, task)) for task in tasks]
+            lines += _row(names[label], found, [row is not None and row in best[row.task] for row in found])
+    by_luck = [_by_luck(task, cells) for task in tasks]
+    if any(by_luck):
+        lines += [] if controls else ["\\midrule"]
+        lines.append(" & ".join([latex_text(CHANCE_NAME), *(one or "---" for one in by_luck)]) + r" \\")
+    return [*lines, "\\bottomrule", "\\end{tabular}"]
+
+
+def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list[str]:
+    """Return a line of rates, and below it a line of their intervals."""
+    rates, intervals = [], []
+    for row, best in zip(rows, is_best, strict=True):
+        if row is None or row.success_once is None:
+            rates.append("---")
+            intervals.append("")
+            continue
+        rate = f"{row.success_once:.2f}"
+        rates.append(f"\\textbf{{{rate}}}" if best else rate)
+        if row.sem is not None:
+            rates[-1] += f" $\\pm$ {row.sem:.2f}"
+        known = row.ci_low is not None and row.ci_high is not None
+        intervals.append(f"{{\\scriptsize [{row.ci_low:.2f}, {row.ci_high:.2f}]}}" if known else "")
+    return [
+        latex_first(name) + "".join(f" & {rate}" for rate in rates) + r" \\",
+        " & ".join(["", *intervals]) + r" \\[2pt]",
+    ]
+
+
+def _best(rows: Sequence[Row | None]) -> list[Row]:
+    """Return the rows with the highest rate; none if there is nothing to be better than."""
+    known = [row for row in rows if row is not None and row.success_once is not None]
+    if len(known) < 2:
+        return []
+    highest = max(row.success_once or 0.0 for row in known)
+    return [row for row in known if row.success_once == highest]
+
+
+def _by_luck(task: str, cells: dict[tuple[_Label, str], Row]) -> str | None:
+    """Return chance by arithmetic, if that is what the rows of the task are compared with."""
+    rates = {
+        row.chance
+        for (_, other), row in cells.items()
+        if other == task and row.chance is not None and row.chance_source in ("1/N", "catalogue")
+    }
+    return f"{rates.pop():.2f}" if len(rates) == 1 else None
+
+
+def _label(row: Row) -> _Label:
+    return _Label(row.policy, row.n_action_steps, row.variant)
+
+
+def _name(label: _Label, labels: Sequence[_Label]) -> str:
+    several = len({other.n_action_steps for other in labels}) > 1
+    parts = [label.policy, *([f"K = {label.n_action_steps}"] if several else [])]
+    return ", ".join([*parts, label.variant] if label.variant else parts)
+
+
+def _title(task: str) -> list[str]:
+    """Return the lines of a column's title: `RememberColor3-v0` gives `Remember`, `Color3`."""
+    lines: list[str] = []
+    for word in re.findall("[A-Z][^A-Z]*|[^A-Z]+", task.removesuffix("-v0")):
+        if lines and len(lines[-1] + word) <= LONGEST_LINE:
+            lines[-1] += word
+        else:
+            lines.append(word)
+    return lines
+
+
+def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
+    rate = len("0.00 ± 0.00") if any(row.sem is not None for row in rows) else len("0.00")
+    title = max(len(line) for task in tasks for line in _title(task))
+    return max(max(rate, title) * SMALL_PT, len("[0.00, 0.00]") * SCRIPT_PT) + COLUMN_SPACE_PT
+
+
+def _caption(table: Table) -> str:
+    rows = [row for row in table.rows if row.success_once is not None]
+    parts = ["Success once with its 95\\,\\% interval"]
+    counts = sorted({row.n_episodes for row in rows})
+    if counts:
+        spread = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        parts.append(f", {spread} episodes per cell")
+    sizes = {row.n_action_steps for row in rows}
+    if len(sizes) == 1:
+        parts.append(f", $K = {sizes.pop()}$")
+    sentences = ["".join(parts) + "."]
+    if any(row.sem is not None for row in rows):
+        sentences.append("$\\pm$: standard error over the runs.")
+    learned = {_label(row) for row in rows if row.policy not in CONTROLS}
+    if len(learned) > 1:
+        sentences.append("The best policy of each task is in bold.")
+    controls = dict.fromkeys(row.policy for row in rows if row.policy in CONTROLS)
+    if controls:
+        said = "; ".join(f"{latex_text(name)}: {CONTROLS[name]}" for name in controls)
+        sentences.append(f"Controls: {said}.")
+    n_errors = sum(row.n_errors for row in table.rows)
+    if n_errors:
+        sentences.append(f"Episodes that ended in an error are in no rate: {n_errors}.")
+    return " ".join(sentences)
+
+
+def _slug(table: Table) -> str:
+    names = "-".join(dict.fromkeys(table.runs.values()))
+    return re.sub("[^a-z0-9]+", "-", names.lower()).strip("-") or "results"
