@@ -78,6 +78,16 @@ def test_several_runs_have_their_spread() -> None:
     assert r"p & 0.60 $\pm$ 0.06 \\" in text and "standard error over the runs" in text
 
 
+def test_settings_have_letters_which_the_caption_explains() -> None:
+    runs = [
+        stored(episodes("p", "+-"), env={"delay_steps": 5}),
+        stored(episodes("p", "--"), path="runs/b", env={"delay_steps": 9}),
+    ]
+    text = preset(build_table(runs))
+    assert r"p (a) & \textbf{0.50}" in text and "p (b) & 0.00" in text
+    assert r"Settings: (a) env.delay\_steps=5; (b) env.delay\_steps=9." in text
+
+
 def test_the_controls_of_the_caption_are_the_scripted_policies() -> None:
     scripted = {name for name, code in POLICIES.items() if re.search("scripted|shortcuts", code)}
     assert set(CONTROLS) == scripted

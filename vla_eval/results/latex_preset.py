@@ -4,7 +4,7 @@ Knows nothing of episodes.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from vla_eval.results.latex import latex_first, latex_text
@@ -43,7 +43,8 @@ def paper_preset(table: Table) -> str:
     """
     tasks = list(dict.fromkeys(row.task for row in table.rows))
     labels = dict.fromkeys(_label(row) for row in table.rows)
-    names = {label: _name(label, list(labels)) for label in labels}
+    variants = {text: chr(ord("a") + i) for i, text in enumerate(_variants(table))}
+    names = {label: _name(label, list(labels), variants) for label in labels}
     cells = {(_label(row), row.task): row for row in table.rows}
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
@@ -52,8 +53,9 @@ def paper_preset(table: Table) -> str:
         "% needs \\usepackage{booktabs}",
         "\\begin{table}[t]",
         "\\centering",
-        f"\\caption{{{_caption(table)}}}",
+        f"\\caption{{{_caption(table, variants)}}}",
         f"\\label{{tab:{_slug(table)}}}",
+        "\\smallskip",
         "\\small",
         f"\\setlength{{\\tabcolsep}}{{{COLUMN_SPACE_PT / 2:g}pt}}",
     ]
@@ -79,6 +81,8 @@ def _tabular(
         lines += ["\\midrule"] if group else []
         for label in group:
             found = [cells.get((label, task)) for task in tasks]
+            if not any(found):  # it is in another block
+                continue
             lines += _row(names[label], found, [row is not None and row in best[row.task] for row in found])
     by_luck = [_by_luck(task, cells) for task in tasks]
     if any(by_luck):
@@ -130,10 +134,15 @@ def _label(row: Row) -> _Label:
     return _Label(row.policy, row.n_action_steps, row.variant)
 
 
-def _name(label: _Label, labels: Sequence[_Label]) -> str:
+def _name(label: _Label, labels: Sequence[_Label], variants: Mapping[str, str]) -> str:
+    """Return the policy, its K if there are several, and the letter of its variant."""
     several = len({other.n_action_steps for other in labels}) > 1
-    parts = [label.policy, *([f"K = {label.n_action_steps}"] if several else [])]
-    return ", ".join([*parts, label.variant] if label.variant else parts)
+    name = f"{label.policy}, K = {label.n_action_steps}" if several else label.policy
+    return f"{name} ({variants[label.variant]})" if label.variant else name
+
+
+def _variants(table: Table) -> list[str]:
+    return list(dict.fromkeys(row.variant for row in table.rows if row.variant))
 
 
 def _title(task: str) -> list[str]:
@@ -153,7 +162,7 @@ def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
     return max(max(rate, title) * SMALL_PT, len("[0.00, 0.00]") * SCRIPT_PT) + COLUMN_SPACE_PT
 
 
-def _caption(table: Table) -> str:
+def _caption(table: Table, variants: Mapping[str, str]) -> str:
     rows = [row for row in table.rows if row.success_once is not None]
     parts = ["Success once with its 95\\,\\% interval"]
     counts = sorted({row.n_episodes for row in rows})
@@ -173,6 +182,9 @@ def _caption(table: Table) -> str:
     if controls:
         said = "; ".join(f"{latex_text(name)}: {CONTROLS[name]}" for name in controls)
         sentences.append(f"Controls: {said}.")
+    if variants:
+        said = "; ".join(f"({letter}) {latex_text(text)}" for text, letter in variants.items())
+        sentences.append(f"Settings: {said}.")
     n_errors = sum(row.n_errors for row in table.rows)
     if n_errors:
         sentences.append(f"Episodes that ended in an error are in no rate: {n_errors}.")
