@@ -141,11 +141,17 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:
-    """Build the error for a name that does not exist: what it was, what exists, and a suggestion."""
+    """Build the error for a name that does not exist: what it was, and a suggestion or what exists.
+
+    A long list is given only if no known name is close.
+    """
     names = sorted(known)
     prefix = f"{where}: " if where else ""
     problem = f"{prefix}there is no {kind} '{name:.{MAX_SHOWN}}'."
-    return UnknownNameError(f"{problem}{did_you_mean(name, names)} Known: {', '.join(names)}.")
+    suggestion = did_you_mean(name, names)
+    if suggestion and len(names) > MAX_NAMED:
+        return UnknownNameError(f"{problem}{suggestion} ({len(names)} are known.)")
+    return UnknownNameError(f"{problem}{suggestion} Known: {', '.join(names)}.")
 
 
 def check_names(kind: str, names: Iterable[str], known: Collection[str], *, where: str = "") -> None:

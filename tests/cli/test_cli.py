@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.cli.main import VERBS, main
+from vla_eval.cli.main import VERBS, build_parser, main
 from vla_eval.cli.show import task_arguments
 from vla_eval.config.files import list_recipes
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -40,11 +40,42 @@ class TestMistakes:
         message = mistake(capsys, "evla")
 
         assert message == (
-            f"mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? Known: {', '.join(VERBS)}.\n"
+            "mikasa-vla: error: there is no verb 'evla'. Did you mean 'eval'? See `mikasa-vla --help`.\n"
         )
 
+    def test_a_verb_like_none_is_answered_by_all(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert f"Known: {', '.join(VERBS)}." in mistake(capsys, "xyzzy")
+
     def test_an_unknown_flag(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "unrecognized arguments: --episods 3" in mistake(capsys, "eval", "demo", "--episods", "3")
+        message = mistake(capsys, "eval", "demo", "--polcy", "oracle")
+
+        assert message == (
+            "mikasa-vla: error: eval: there is no flag '--polcy'. Did you mean '--policy'? See `mikasa-vla "
+            "eval --help`.\n"
+        )
+
+    def test_an_unknown_flag_of_a_verb_of_a_verb(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "See `mikasa-vla list --help`" in mistake(capsys, "list", "--kind=tasks")
+
+    def test_one_argument_too_many(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "list: expected no more arguments, found tasks" in mistake(capsys, "list", "tasks", "tasks")
+
+    def test_a_path_that_is_not_there(self, capsys: pytest.CaptureFixture[str]) -> None:
+        message = mistake(capsys, "eval", "--task", "RememberColor3-v0", "--policy", "runs/nothing/here")
+
+        assert message.startswith(
+            "mikasa-vla: error: runs/nothing/here: there is no such file or folder in /"
+        )
+        assert "mikasa-vla list policies" in message and "oracle" not in message
+
+    def test_a_long_list_of_names_is_given_only_if_none_is_close(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        eval_with = ("eval", "--task", "RememberColor3-v0", "--policy")
+        close, far = (mistake(capsys, *eval_with, name) for name in ("oracl", "xyzzy"))
+
+        assert "Did you mean 'oracle'?" in close and "Known:" not in close
+        assert "Did you mean" not in far and "cue_blind" in far
 
     def test_an_unknown_task(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert "Did you mean 'ShellGameTouch-v0'" in mistake(capsys, "show", "ShellGameTuch-v0")
@@ -81,6 +112,14 @@ class TestMistakes:
         monkeypatch.setattr("vla_eval.cli.list.run", interrupt)
 
         assert run(capsys, "list") == (130, "", "")
+
+
+def test_without_arguments_it_names_three_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys)
+    assert (code, err) == (0, "")
+    assert len([line for line in out.splitlines() if line.startswith("  mikasa-vla ")]) == 3
+    for words in re.findall(r"^  mikasa-vla (.*)$", out, re.M):  # they can be typed as they stand
+        build_parser((words.split()[0],)).parse_args(words.split())
 
 
 class TestList:

@@ -18,15 +18,33 @@ def test_a_line_tells_what_is_left_at_the_rate_of_this_start(capsys: pytest.Capt
     bar = EpisodeBar(clock=clock)
     bar.begin(n_done=10, n_total=50, title="RememberColor3-v0")
     bar.advance(n_done=14, note="success 0.50, errors 0")
+    clock.seconds += 29
+    bar.tick()
+    assert capsys.readouterr().err == ""
+    clock.seconds += 1
+    bar.tick()
+    # 4 episodes in half a minute, 36 are left.
+    assert "8.0 per minute, 4.5 min left" in capsys.readouterr().err
     clock.seconds += 59
     bar.tick()
     assert capsys.readouterr().err == ""
-    clock.seconds += 61
+    clock.seconds += 31
     bar.tick()
     # 4 episodes in 2 minutes; the 10 of before took none of them. 36 are left.
     assert capsys.readouterr().err == (
         "RememberColor3-v0: 14/50 episodes after 2.0 min, 2.0 per minute, 18.0 min left, "
         "success 0.50, errors 0\n"
+    )
+
+
+def test_no_remaining_time_is_made_up_before_an_episode_has_ended(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    bar = EpisodeBar(clock=clock)
+    bar.begin(n_done=0, n_total=5)
+    clock.seconds += 30
+    bar.tick()
+    assert capsys.readouterr().err == (
+        "0/5 episodes after 0.5 min, none has ended yet, so the remaining time is unknown\n"
     )
 
 

@@ -327,6 +327,7 @@ def test_a_folder_whose_name_is_no_utf_8_is_shown_escaped(tmp_path: Path) -> Non
     assert "runs/\\udcfc" in page
 
 
+@pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_browser_shows_the_page_without_complaint(tmp_path: Path) -> None:
     run = full_run()

@@ -7,6 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+FIRST_LINE_SECONDS = 30.0
 LINE_EVERY_SECONDS = 60.0
 
 
@@ -51,7 +52,8 @@ class EpisodeBar:
 
     def tick(self) -> None:
         """Write a line if it is time and there is no bar."""
-        if self._bar is None and self._clock() - self._last_line >= LINE_EVERY_SECONDS:
+        wait = LINE_EVERY_SECONDS if self._last_line > self._begun else FIRST_LINE_SECONDS
+        if self._bar is None and self._clock() - self._last_line >= wait:
             self._line()
 
     def close(self) -> None:
@@ -79,6 +81,8 @@ class EpisodeBar:
         ]
         if n_left and per_minute > 0:
             parts.append(f"{n_left / per_minute:.1f} min left")
+        elif n_left:
+            parts = [parts[0], "none has ended yet, so the remaining time is unknown"]
         if self._note:
             parts.append(self._note)
         self.write((f"{self._title}: " if self._title else "") + ", ".join(parts))

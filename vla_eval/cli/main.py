@@ -32,6 +32,16 @@ VERBS = (
     "doctor",
     "bench",
 )
+FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
+
+  {PROGRAM} eval demo
+      scripted policies with and without memory on two tasks; minutes, no GPU
+  {PROGRAM} check POLICY
+      does your policy keep the contract? POLICY: a name, a recipe, a checkpoint or ws://HOST:PORT
+  {PROGRAM} eval --task RememberColor3-v0 --policy POLICY cue_blind oracle random
+      your policy beside chance and ceiling, on the same episodes
+
+`{PROGRAM} list` shows tasks and policies, `{PROGRAM} --help` every verb."""
 EXIT_USER_MISTAKE = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
 
@@ -66,14 +76,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     first = arguments[0] if arguments else ""
-    if first and not first.startswith("-") and first not in VERBS:
-        return _fail(f"there is no verb '{first}'.{did_you_mean(first, VERBS)} Known: {', '.join(VERBS)}.")
+    if not arguments:
+        print(FIRST_STEPS)
+        return 0
+    if not first.startswith("-") and first not in VERBS:
+        suggestion = did_you_mean(first, VERBS) or f" Known: {', '.join(VERBS)}."
+        return _fail(f"there is no verb '{first}'.{suggestion} See `{PROGRAM} --help`.")
     parser = build_parser((first,) if first in VERBS else VERBS)
     try:
-        args = parser.parse_args(arguments)
-        if args.verb is None:
-            parser.print_help()
-            return 0
+        args, unknown = parser.parse_known_args(arguments)
+        if unknown:
+            return _fail(_unknown_arguments(parser, first, unknown))
         code = _verb(args.verb).run(args)
         sys.stdout.flush()
     except VlaEvalError as exc:
@@ -105,6 +118,28 @@ def build_parser(verbs: Sequence[str] = VERBS) -> argparse.ArgumentParser:
 
 def _verb(name: str) -> Verb:
     return cast(Verb, importlib.import_module(f"vla_eval.cli.{name.replace('-', '_')}"))
+
+
+def _unknown_arguments(parser: argparse.ArgumentParser, verb: str, unknown: Sequence[str]) -> str:
+    """Return what is wrong with arguments that no parser knows: the first flag, and the closest one."""
+    flag = next((text.partition("=")[0] for text in unknown if text.startswith("-")), None)
+    program = f"{PROGRAM} {verb}" if verb in VERBS else PROGRAM
+    help_line = f" See `{program} --help`."
+    if flag is None:
+        return f"{verb}: expected no more arguments, found {' '.join(unknown)}.{help_line}"
+    return f"{verb}: there is no flag '{flag}'.{did_you_mean(flag, flags_of(parser))}{help_line}"
+
+
+def flags_of(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the long flags of a parser and of the verbs below it, but not those that no help shows."""
+    flags: dict[str, None] = {}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                flags.update(dict.fromkeys(flags_of(below)))
+        elif action.help != argparse.SUPPRESS:
+            flags.update(dict.fromkeys(text for text in action.option_strings if text.startswith("--")))
+    return list(flags)
 
 
 def _fail(message: str) -> int:

@@ -96,7 +96,7 @@ class Progress:
             return
         workers = "1 worker" if n_workers == 1 else f"{n_workers} workers"
         self._bar.write(
-            f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before, {workers}"
+            f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before; starting {workers}"
         )
         self._n_done = n_finished
         self._bar.begin(n_done=n_finished, n_total=n_episodes)

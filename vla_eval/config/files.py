@@ -18,7 +18,7 @@ from vla_eval.bounds import require
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.shipped import search_folders
 from vla_eval.config.yaml_data import MAX_CHARACTERS, load_yaml
-from vla_eval.errors import MAX_SHOWN, RecipeError, unknown_name
+from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, unknown_name
 from vla_eval.record_rules import is_name
 
 Folder = Literal["configs", "policies", "prompts", "datasets"]
@@ -83,6 +83,11 @@ def find_recipe(folder: Folder, name: str) -> Path:
     stem = name.removeprefix(f"{folder}/").removesuffix(".yaml")
     if stem in known:
         return known[stem]
+    if "/" in stem:
+        raise UnknownNameError(
+            f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected the path "
+            f"of one, or a name of `mikasa-vla list {folder}`."
+        )
     raise unknown_name(f"{folder}/*.yaml", name, known)
 
 
