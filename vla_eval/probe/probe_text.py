@@ -12,7 +12,7 @@ from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable, Retention
 from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
 from vla_eval.results.estimates import Interval
-from vla_eval.results.table_formats import latex_table, latex_text
+from vla_eval.results.latex import latex_table, latex_text
 
 ProbeFormat = Literal["markdown", "csv", "json", "latex"]
 PROBE_VERSION = 1
@@ -36,7 +36,11 @@ def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
         is_number = [title not in ("task", "policy", "world") for title in TITLES]
         footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
         return "\n".join(
-            ["% needs \\usepackage{booktabs}", *latex_table(list(TITLES), cells, is_number), *footnotes]
+            [
+                "% needs \\usepackage{booktabs}",
+                *latex_table(TITLES, cells, is_number, ruled_by_first=True),
+                *footnotes,
+            ]
         )
     lines = [_line(TITLES), _line([":--"] * len(TITLES)), *(_line(row) for row in cells)]
     return "\n".join([*lines, "", *(f"- {markdown_text(line)}" for line in said)])
