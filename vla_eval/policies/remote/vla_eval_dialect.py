@@ -91,10 +91,10 @@ class VlaEvalClient:
     def _greet(self) -> ServerMetadata:
         self._send(HELLO, {"harness_version": CLIENT_VERSION, "protocol_version": PROTOCOL_VERSION})
         said = self._receive(HELLO)
-        if said.get("protocol_version") != PROTOCOL_VERSION:
+        version = said.get("protocol_version")
+        if not (isinstance(version, int) and version == PROTOCOL_VERSION):
             raise self._connection.refuse(
-                f"expected version {PROTOCOL_VERSION} of the protocol of vla-eval, found "
-                f"{shown(said.get('protocol_version'))}"
+                f"expected version {PROTOCOL_VERSION} of the protocol of vla-eval, found {shown(version)}"
             )
         name = said.get("model_server")
         return ServerMetadata(name=name if isinstance(name, str) and name else None, other=said)
@@ -111,15 +111,15 @@ class VlaEvalClient:
         payload = message.get("payload") if isinstance(message, dict) else None
         if not isinstance(message, dict) or not isinstance(payload, dict):
             raise self._connection.refuse(f"expected a message of vla-eval, found {shown(message)}")
-        if message.get("type") == ERROR:
+        found, seq = str(message.get("type")), message.get("seq")
+        if found == ERROR:
             self._connection.close()
             error = str(payload.get("error", payload))
             raise RemoteReplyError(
                 f"{self._connection.url}: the server replied with an error: {error[:MAX_SHOWN_ERROR]}"
             )
-        if message.get("type") != kind or message.get("seq") != self._n_sent:
+        if found != kind or not (isinstance(seq, int) and seq == self._n_sent):
             raise self._connection.refuse(
-                f"expected '{kind}' for message {self._n_sent}, found {shown(message.get('type'))} for "
-                f"{shown(message.get('seq'))}"
+                f"expected '{kind}' for message {self._n_sent}, found {shown(found)} for {shown(seq)}"
             )
         return payload
