@@ -24,7 +24,7 @@ test: setup  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)
 
 test-all: setup  ## run every test this machine can run
-	$(PYTEST) -m "not network and not parity"
+	$(PYTEST) -m "not network and not parity and not peer"
 
 lint: setup  ## ruff, mypy --strict and import-linter
 	$(BIN)/python -m ruff check .

@@ -10,11 +10,10 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_example_policy_passes_the_check_and_is_evaluated(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "policies.md").read_text()
-    policy, check = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (policy,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (recipe,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "my_policy.py").write_text(policy)
     (tmp_path / "my_policy.yaml").write_text(recipe)
-    (tmp_path / "check.py").write_text(check)
     environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
 
     def run(*arguments: str) -> str:
@@ -24,7 +23,8 @@ def test_the_example_policy_passes_the_check_and_is_evaluated(tmp_path: Path) ->
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    run("check.py")
+    checked = run("-m", "vla_eval.cli", "check", "my_policy.yaml")
+    assert "The same episode seed and observations give the same actions beside another episode." in checked
     table = run(
         "-m", "vla_eval.cli", "eval", "--task", "RememberColor3-v0", "--policy", "my_policy.yaml",
         "--n-action-steps", "4", "8", "--episodes", "2", "--workers", "1", "--out", str(tmp_path / "run"),

@@ -74,6 +74,7 @@ class TestDescription:
             ({"name": ""}, "name is '', expected a text that is not empty"),
             ({"chunk_size": 0}, "chunk_size is 0, expected a number from 1"),
             ({"chunk_size": True}, "chunk_size is True"),
+            ({"n_action_steps": 2}, "n_action_steps is 2, expected a number from 1 to chunk_size"),
             ({"cameras": "base_camera"}, "cameras is 'base_camera', expected a tuple of names"),
             ({"cameras": ("top",)}, r"cameras is \('top',\), expected names out of base_camera, hand_camera"),
             ({"state": "joint"}, "state is 'joint', expected 'joints' or 'eef' or None"),

@@ -44,6 +44,7 @@ class PolicySpec:
     Attributes:
         name: the policy's name in records and tables.
         chunk_size: how many actions one inference gives.
+        n_action_steps: how many of them are executed before the next inference, unless the evaluation says.
         cameras: which cameras it needs: `base_camera`, `hand_camera`, both or none.
         state: what it reads of the arm: `joints` (25 numbers: pose, joint positions, joint velocities), `eef`
             (10: position, rotation columns, gripper width), or None.
@@ -59,6 +60,7 @@ class PolicySpec:
 
     name: str
     chunk_size: int
+    n_action_steps: int = 1
     cameras: tuple[str, ...] = ()
     state: str | None = None
     image_size_px: tuple[int, int] = (128, 128)
@@ -83,6 +85,8 @@ class PolicySpec:
         self._expect(
             _is_count(self.chunk_size, MAX_CHUNK_SIZE), "chunk_size", f"a number from 1 to {MAX_CHUNK_SIZE}"
         )
+        is_number = _is_count(self.n_action_steps, self.chunk_size)
+        self._expect(is_number, "n_action_steps", "a number from 1 to chunk_size")
         known = ", ".join(CAMERA_KEYS)
         self._expect(set(self.cameras) <= set(CAMERA_KEYS), "cameras", "names out of " + known)
         layouts = " or ".join(repr(name) for name in STATE_LAYOUTS)
@@ -113,6 +117,7 @@ class PolicySpec:
             "weights_sha256": None if self.weights_file is None else _sha256(Path(self.weights_file)),
             "recipe_sha256": None,
             "chunk_size": self.chunk_size,
+            "n_action_steps": self.n_action_steps,
             "control_mode": self.control_mode,
             "action_dims": list(self.action_dims),
             "control_hz": float(self.control_hz),
