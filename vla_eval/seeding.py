@@ -24,6 +24,7 @@ class Stream(IntEnum):
     MOTION = 6
     POLICY = 7
     NOISE = 8
+    DISTRACTOR = 9
 
 
 def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:

@@ -70,7 +70,8 @@ def test_controls_follow_the_swapped_cue_as_far_as_they_know_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], one_place: str
 ) -> None:
     arguments = ("--task", "RememberColor3-v0", "--policy", one_place, "--probe", "swap")
-    paper = rows_of(probe(tmp_path / "paper", capsys, *arguments), "swap")
+    found = probe(tmp_path / "paper", capsys, *arguments, "interference")
+    paper, moved = rows_of(found, "swap"), rows_of(found, "interference")
     assert {row["n_pairs"] for row in paper.values()} == {N}
     for policy in ("oracle", "body_memory"):
         assert (paper[policy]["n_warranted_choice"], paper[policy]["n_sensitivity"]) == (N, N)
@@ -82,6 +83,11 @@ def test_controls_follow_the_swapped_cue_as_far_as_they_know_it(
         assert 0 < paper[policy]["matched_world_value"] <= 12 / 18
     assert paper["cue_blind"]["chance"] == pytest.approx(1 / 3)
 
+    # The motion leaves the gripper open, which stands for the first of the candidates.
+    assert moved["oracle"]["n_follows"] == N
+    assert 0 < moved["body_memory"]["n_follows"] < N
+    assert moved["body_memory"]["left"] == moved["body_memory"]["follows"]
+
     rule = ("--set", "env.freeze_until_choice=true", "--set", "env.strict_choice=true")
     strict = rows_of(probe(tmp_path / "strict", capsys, *arguments, *rule), "swap")
     assert strict["oracle"]["n_warranted_choice"] == N
@@ -92,7 +98,7 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--task", "ChainOfColors3-v0", "--policy", "oracle", "--delay", "0", "12"]
-    arguments += ["--probe", "swap,order,blank,delay,reset", "--no-controls"]
+    arguments += ["--probe", "swap,order,blank,delay,distractor,interference,reset", "--no-controls"]
     found = probe(tmp_path, capsys, *arguments)
     assert [(row["intervention"], row["level"]) for row in found["rows"]] == [
         ("none", None),
@@ -101,6 +107,8 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
         ("blank", None),
         ("delay", 0),
         ("delay", 12),
+        ("distractor", 3),
+        ("interference", None),
         ("reset", 15),  # three cubes for five steps each
         ("reset", 20),
     ]
@@ -121,10 +129,10 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
         assert main([*again, style]) == 0
         output = capsys.readouterr()
         shown[style] = output.out
-        assert output.err.count(f"all {N} episodes are there") == 8
+        assert output.err.count(f"all {N} episodes are there") == 10
     assert shown["markdown"].splitlines()[2].startswith("| ChainOfColors3-v0 | oracle | 1 | none | 9 | — |")
     table = list(csv.DictReader(io.StringIO(shown["csv"])))
-    assert (len(table), table[0]["sensitivity"], table[1]["sensitivity"]) == (8, "", "1.0")
+    assert (len(table), table[0]["sensitivity"], table[1]["sensitivity"]) == (10, "", "1.0")
     assert "\\toprule" in shown["latex"]
 
 
@@ -175,6 +183,18 @@ def test_horizons_follow_the_delay() -> None:
         {"delay_steps": 0},
         {"delay_steps": 40, "horizon_steps": 130},
     ]
+
+
+def test_a_distractor_needs_items_and_a_delay_that_is_long_enough() -> None:
+    settings = ProbeSettings(probes=("swap", "distractor", "interference"), distractors=(3, 6))
+    color = plan_probe(config(), settings)
+    assert [(world.intervention, world.level) for world in color.worlds[2:]] == [
+        ("distractor", 3),  # not 6: the delay has five steps
+        ("interference", None),
+    ]
+    shells = plan_probe(config(tasks=("ShellGameTouch-v0",)), settings)
+    assert [world.intervention for world in shells.worlds] == ["none", "swap"]
+    assert len(shells.left_out) == 2
 
 
 def test_a_short_cue_shortens_the_horizon_for_each_item() -> None:

@@ -19,8 +19,8 @@ DESCRIPTION = """Run each task as it is and with one thing changed, on the same 
 
 swap: another cue in the same scene. Who follows the cue chooses what was shown in each of the two worlds.
 order: the same items in another order (Seq, Chain). blank: the cue phase passes without a cue.
-cue, delay: other lengths of the phase. reset: the policy is reset in mid-episode.
-instruction: other sentences, of another task or without content.
+cue, delay: other lengths of the phase. distractor: another item is seen in the delay. interference: the
+arm is moved in the delay. reset: the policy is reset in mid-episode. instruction: other sentences.
 
 CONFIG is a file, or the name of one in configs/; without it, name at least one --task and one --policy.
 The controls oracle, cue_blind and body_memory are run beside the policies. The same command resumes."""
@@ -59,13 +59,14 @@ def _add_interventions(parser: argparse.ArgumentParser) -> None:
         dest="probes",
         type=_one_or_several,
         metavar="P",
-        help="swap order blank cue delay reset instruction, by spaces or commas (swap,blank,delay,reset)",
+        help="what to change, by spaces or commas (swap,blank,delay,reset)",
     )
     parser.add_argument("--swap", **many, type=int, dest="swaps", metavar="K", help="which other cues (1)")
     parser.add_argument(
         "--delay", **many, type=int, dest="delays", metavar="L", help="steps (0 5 10 20 40 80 160 320)"
     )
     parser.add_argument("--cue", **many, type=int, dest="cues", metavar="L", help="steps of the cue (1 2 3)")
+    parser.add_argument("--distract", **many, type=int, dest="distractors", metavar="L", help="steps (3)")
     parser.add_argument(
         "--instruction",
         **many,
@@ -138,6 +139,7 @@ FLAGS = {
     "swaps": ("--swap", 1),
     "delays": ("--delay", 0),
     "cues": ("--cue", 1),
+    "distractors": ("--distract", 1),
     "reset_steps": ("--reset-at", 1),
 }
 """Attribute -> flag and least value."""

@@ -19,6 +19,7 @@ from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_argument, check_arguments
+from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
@@ -34,7 +35,11 @@ GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 IMAGE_SIZE_PX = 128
 MAX_ITEMS = 100
-RULES = {"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False}
+DISTRACTOR_LEVEL = 255  # of the first rows of an image; no cue has it
+RULES = {
+    **{"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False},
+    **{"move_in_delay": False, "distract_steps": 0},
+}
 CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5, **RULES}
 SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0, **RULES}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
@@ -84,8 +89,8 @@ class FakeEnv:
 
     Args:
         settings: `kwargs` may hold `horizon_steps` and `swap_cue`; `n_items`, `n_shown`, `cue_steps`,
-            `delay_steps`, `swap_order`, `show_cue`, `freeze_until_choice`, `strict_choice` for tasks with
-            candidates; `velocity_range_m_s` for the others.
+            `delay_steps`, `swap_order`, `show_cue`, `freeze_until_choice`, `move_in_delay`,
+            `distract_steps`, `strict_choice` for tasks with candidates; `velocity_range_m_s` for the others.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
@@ -110,6 +115,8 @@ class FakeEnv:
         self._swap_order: int = arguments.get("swap_order", 0)
         self._shows_cue: bool = arguments.get("show_cue", True)
         self._is_frozen: bool = arguments.get("freeze_until_choice", False)
+        self._moves_in_delay: bool = arguments.get("move_in_delay", False)
+        self._distract_steps: int = arguments.get("distract_steps", 0)
         self._is_strict: bool = arguments.get("strict_choice", False)
         self._settings = settings
         self._episodes: dict[int, _Episode] = {}
@@ -141,7 +148,12 @@ class FakeEnv:
         }
 
     def _executed(self, slot: int, action: FloatArray) -> FloatArray:
-        if self._is_frozen and self._episodes[slot].step < self._response_step:
+        step = self._episodes[slot].step
+        motion = delay_motion(step, begins=self._cue_steps, ends=self._response_step)
+        if self._moves_in_delay and motion is not None:
+            action = np.zeros(len(ACTION.dims), dtype=np.float32)
+            action[Y_DIMENSION], action[GRIPPER_DIMENSION] = motion
+        elif self._is_frozen and step < self._response_step:
             return self.hold_action(slot)
         return np.clip(action, -1, 1).astype(np.float32)
 
@@ -281,6 +293,9 @@ class FakeEnv:
         picture = rng.integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
         in_cue = self._shows_cue and self._phase(episode) == "cue" and episode.targets
         picture[:8] = 20 * (episode.targets[0] + 1) if in_cue else 0
+        first = self._cue_steps + (self._response_step - self._cue_steps - self._distract_steps) // 2
+        if first <= episode.step < first + self._distract_steps:
+            picture[:8] = DISTRACTOR_LEVEL
         return picture
 
     def _privileged(self, episode: _Episode) -> PrivilegedState:
@@ -328,6 +343,7 @@ def _check_ranges(arguments: Mapping[str, Any], *, where: str) -> None:  # Any: 
     most = {
         "swap_cue": 1 if n_items == 1 else n_items - n_shown if several else n_items - 1,
         "swap_order": n_shown - 1,
+        "distract_steps": arguments.get("delay_steps", 0),
     }
     for name, largest in most.items():
         if not 0 <= arguments.get(name, 0) <= largest:

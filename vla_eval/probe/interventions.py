@@ -15,11 +15,26 @@ from vla_eval.probe.phases import Phases, default_delay_steps, phases_of
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
-Intervention = Literal["none", "swap", "order", "blank", "cue", "delay", "reset", "instruction"]
-PROBES: tuple[Intervention, ...] = ("swap", "order", "blank", "cue", "delay", "reset", "instruction")
+Intervention = Literal[
+    "none",
+    "swap",
+    "order",
+    "blank",
+    "cue",
+    "delay",
+    "distractor",
+    "interference",
+    "reset",
+    "instruction",
+]
+PROBES: tuple[Intervention, ...] = (
+    *("swap", "order", "blank", "cue", "delay", "distractor", "interference", "reset"),
+    "instruction",
+)
 DEFAULT_PROBES: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
 DEFAULT_DELAYS = (0, 5, 10, 20, 40, 80, 160, 320)
 DEFAULT_CUES = (1, 2, 3)
+DEFAULT_DISTRACTORS = (3,)
 DEFAULT_INSTRUCTIONS = ("paraphrased", "other_task", "no_content")
 
 Level = int | str | None
@@ -29,7 +44,11 @@ CONTROLS = ("oracle", "cue_blind")
 CONTROLS_OF_ONE = ("body_memory",)
 """Controls that need a single right candidate."""
 
-OWN_ARGUMENTS = ("swap_cue", "swap_order", "show_cue")
+ITEMS = ("items", "cubes")
+"""Kinds of candidates that can be shown, and so can distract."""
+LEAST_MOTION_STEPS = 2
+"""One step out and one back."""
+OWN_ARGUMENTS = ("swap_cue", "swap_order", "show_cue", "distract_steps", "move_in_delay")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +60,7 @@ class ProbeSettings:
         swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
         delays: values of `env.delay_steps`.
         cues: values of `env.cue_steps`.
+        distractors: values of `env.distract_steps`.
         instructions: prompt sets.
         reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
             of the response if that is later.
@@ -51,6 +71,7 @@ class ProbeSettings:
     swaps: tuple[int, ...] = (1,)
     delays: tuple[int, ...] = DEFAULT_DELAYS
     cues: tuple[int, ...] = DEFAULT_CUES
+    distractors: tuple[int, ...] = DEFAULT_DISTRACTORS
     instructions: tuple[str, ...] = DEFAULT_INSTRUCTIONS
     reset_steps: tuple[int, ...] = ()
     controls: bool = True
@@ -117,6 +138,8 @@ WHY_NOT: Mapping[Intervention, str] = {
     "blank": "it has no cue phase",
     "cue": "it has no cue phase",
     "delay": "it has no delay",
+    "distractor": "it has no items, or its delay is shorter than the distractor",
+    "interference": "it has no delay of two steps or more",
     "instruction": "the only prompt set that was named is that of the evaluation",
     "reset": "it has no phases; name the steps with --reset-at",
 }
@@ -144,6 +167,11 @@ class _Task:
             return self._of_lengths(probe, "cue_steps", settings.cues) if has_phases else []
         if probe == "delay":
             return self._of_lengths(probe, "delay_steps", settings.delays) if has_phases else []
+        if probe == "distractor":
+            return self._distracting() if has_phases else []
+        if probe == "interference":
+            is_long = has_phases and self._phases().delay_steps >= LEAST_MOTION_STEPS
+            return [self.world(probe, None, {"move_in_delay": True})] if is_long else []
         if probe == "reset":
             return [self._resetting(step) for step in self._reset_steps()]
         names = [name for name in settings.instructions if name != self.config.prompt_set]
@@ -162,6 +190,13 @@ class _Task:
             )
             for length in sorted(set(lengths) - {usual})
         ]
+
+    def _distracting(self) -> list[World]:
+        if self.spec.candidates not in ITEMS:
+            return []
+        longest = self._phases().delay_steps
+        lengths = [length for length in self.settings.distractors if length <= longest]
+        return [self.world("distractor", length, {"distract_steps": length}) for length in lengths]
 
     def _resetting(self, step: int) -> World:
         world = self.world("reset", step, {})

@@ -37,6 +37,8 @@ def _clause(row: ProbeRow) -> str | None:
         "none": "follows the cue in",
         "blank": "with a blank cue in",
         "cue": f"with a cue of {row.level} steps in",
+        "distractor": f"with a distractor for {row.level} steps in",
+        "interference": "after a motion of the arm in the delay in",
         "instruction": f"with the instructions '{row.level}' in",
         "delay": f"after a delay of {row.level} steps in",
         "reset": f"after a reset of its memory at step {row.level} in",

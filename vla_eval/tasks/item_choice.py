@@ -3,6 +3,7 @@
 Knows nothing of what is shown as the cue, nor of which item is right.
 """
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,17 @@ class ItemChoiceEnv(ChoiceEnv):
     that of the cue as drawn, to the last bit: an item that has been shown settles in another way when it
     appears again (measured: by up to 0.3 µm and 7e-6). On the GPU simulator, whose results are not
     reproducible to the last bit, the items themselves are swapped.
+
+    Args:
+        items: what there is to choose among.
+        distract_steps: for so many steps in the middle of the delay, a decoy of another item is seen where
+            single items are shown; it is drawn per episode, and it is neither right nor was it shown.
     """
 
-    def __init__(self, *args: Any, items: tuple[Item, ...], **kwargs: Any) -> None:
+    def __init__(self, *args: Any, items: tuple[Item, ...], distract_steps: int = 0, **kwargs: Any) -> None:
         """Take the items and build the scene."""
         self.items = items
+        self.distract_steps = distract_steps
         super().__init__(*args, **kwargs)
 
     @property
@@ -47,8 +54,22 @@ class ItemChoiceEnv(ChoiceEnv):
         self.candidates = [
             build_item(self.scene, item, initial_pose=self._parking_pose(item)) for item in self.items
         ]
-        uses_decoys = self.is_swapped() and not self.gpu_sim_enabled
+        self._check_distractor()
+        self._hides_items = self.is_swapped() and not self.gpu_sim_enabled
+        uses_decoys = self._hides_items or self.distract_steps > 0
         self.decoys = [self._build_decoy(item) for item in self.items] if uses_decoys else []
+        self._distractor = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    def _check_distractor(self) -> None:
+        least_delay = self.delay_steps_range[0]
+        if not 0 <= self.distract_steps <= least_delay:
+            raise TaskArgumentError(
+                f"distract_steps={self.distract_steps}: expected 0 to {least_delay}, the steps of the delay."
+            )
+        if self.distract_steps and self.n_swaps() <= int(self.swap_cue > 0):
+            raise TaskArgumentError(
+                f"distract_steps={self.distract_steps}: every item is right or shown, so none is left for it."
+            )
 
     def _build_decoy(self, item: Item) -> Actor:
         return build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
@@ -78,15 +99,43 @@ class ItemChoiceEnv(ChoiceEnv):
     def _on_episode_start(self, mask: torch.Tensor) -> None:
         super()._on_episode_start(mask)
         self._park_all(mask)
-        self._set_visible(mask, not self.decoys)
+        self._set_visible(mask, False)
 
     def _park_all(self, mask: torch.Tensor) -> None:
         if not bool(mask.any()):  # most steps: one check for all items, not one per item
             return
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
+        self._park_decoys(mask)
+
+    def _park_decoys(self, mask: torch.Tensor) -> None:
         for item, decoy in zip(self.items, self.decoys, strict=False):  # of no decoys or of all
             self.move(decoy, mask, self._decoy_parking_pose(item))
+
+    def _sample_distractor(self, env: int, excluded: Collection[int]) -> None:
+        """Draw the item that distracts, after the cue has been drawn.
+
+        Args:
+            env: the parallel environment.
+            excluded: the items that are right, and those that the drawn cue shows.
+        """
+        if self.distract_steps:
+            others = [index for index in range(self.n_items) if index not in excluded]
+            drawn = self.episode_generator(env, Stream.DISTRACTOR).integers(len(others))
+            self._distractor[env] = others[int(drawn)]
+
+    def _distract(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """Show the distractor, or remove it, where its time begins or ends at `step`; return (B,) where."""
+        if not self.distract_steps:
+            return torch.zeros_like(mask)
+        delay = self._response_step - self._cue_end_step
+        first = self._cue_end_step + (delay - self.distract_steps) // 2
+        begins, ends = mask & (step == first), mask & (step == first + self.distract_steps)
+        self._park_decoys(ends)
+        for index, item in enumerate(self.items):
+            middle = sapien.Pose(p=[0, 0, item.shape.rest_height_m])
+            self.move(self.decoys[index], begins & (self._distractor == index), middle)
+        return begins | ends
 
     def _show_in_middle(self, mask: torch.Tensor, drawn: torch.Tensor, shown: torch.Tensor) -> None:
         """Move items to the centre of the table where the mask holds.
@@ -104,13 +153,13 @@ class ItemChoiceEnv(ChoiceEnv):
 
     def _show_item(self, index: int, pose: sapien.Pose, *, moved: torch.Tensor, seen: torch.Tensor) -> None:
         """Move an item where `moved` (B,) holds, so that it is seen where `seen` (B,) holds."""
-        self.move(self.candidates[index], moved if self.decoys else seen, pose)
-        if self.decoys:
+        self.move(self.candidates[index], moved if self._hides_items else seen, pose)
+        if self._hides_items:
             self.move(self.decoys[index], seen, pose)
 
     def _set_visible(self, mask: torch.Tensor, visible: bool) -> None:
-        """Let the items be seen or not, if there are decoys: on the CPU simulator, with one environment."""
-        if not self.decoys or not bool(mask.any()):
+        """Let the items be seen or not, if decoys show the cue: on the CPU simulator alone."""
+        if not self._hides_items or not bool(mask.any()):
             return
         for actor in self.candidates:
             for entity in actor._objs:

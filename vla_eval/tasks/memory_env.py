@@ -8,7 +8,7 @@ Differences from the official code that concern every task (reasons in `docs/tas
 - All randomness comes from `streams.generator(seed, purpose)` of the single episode.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -27,6 +27,8 @@ from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import Phase
 from vla_eval.tasks.arms import ARMS, CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.bodies import Body, yaw_rad
+from vla_eval.tasks.durations import StepRange, step_range
+from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
@@ -38,22 +40,6 @@ PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
 
-StepRange = int | Sequence[int]
-
-
-def step_range(name: str, value: StepRange) -> tuple[int, int]:
-    """Return (least, most) of a duration in control steps given as a number or as a pair.
-
-    Raises:
-        TaskArgumentError: not a whole number ≥ 0, nor a pair of such numbers in order.
-    """
-    pair = (value, value) if isinstance(value, int) else tuple(value)
-    if len(pair) != 2 or not all(isinstance(v, int) and v >= 0 for v in pair) or pair[0] > pair[1]:
-        raise TaskArgumentError(
-            f"{name}={value!r}: expected a number of control steps ≥ 0, or a pair (least, most) of them."
-        )
-    return int(pair[0]), int(pair[1])
-
 
 class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     """A Panda with a wrist camera at a table, with the phases cue, delay and response.
@@ -64,6 +50,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         swap_cue: 0 to `n_swaps()`; which other cue is shown instead of the drawn one. It has its own right
             answer. Whatever else is drawn for the seed stays the same: places, noise, durations.
         freeze_until_choice: hold arm and gripper width until the response phase, whatever the action.
+        move_in_delay: a scripted motion moves arm and gripper during the delay, whatever the action.
         phase_gate_success: success counts only in the response phase (the official code has no gate).
         static_threshold_rad_s: the arm is at rest if no joint moves faster.
         instruction: the sentence for `info["language_instruction"]`; `gymnasium.make` gives the paper's.
@@ -93,6 +80,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         delay_steps: StepRange = 5,
         swap_cue: int = 0,
         freeze_until_choice: bool = False,
+        move_in_delay: bool = False,
         phase_gate_success: bool = True,
         static_threshold_rad_s: float = 0.2,
         instruction: str | None = None,
@@ -104,6 +92,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         self.delay_steps_range = step_range("delay_steps", delay_steps)
         self.swap_cue = self._checked_swap("swap_cue", swap_cue, most=self.n_swaps())
         self.freeze_until_choice = freeze_until_choice
+        self.move_in_delay = move_in_delay
         self.phase_gate_success = phase_gate_success
         self.static_threshold_rad_s = static_threshold_rad_s
         self.instruction = instruction
@@ -292,13 +281,25 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return action
 
     def _step_action(self, action: Any) -> Any:
-        if self.freeze_until_choice and action is not None:
+        if (self.freeze_until_choice or self.move_in_delay) and action is not None:
             given = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.device)
-            frozen = self._elapsed_steps < self._response_step
-            action = torch.where(frozen[:, None], self.hold_action(), given.reshape(self.num_envs, -1))
+            action = self._replaced(given.reshape(self.num_envs, -1))
         executed = super()._step_action(action)
         self.executed_action = None if executed is None else executed.clamp(-1, 1)
         return executed
+
+    def _replaced(self, action: torch.Tensor) -> torch.Tensor:
+        """Return the (B, A) action with what holds or moves the arm before the choice in its place."""
+        action, held = action.clone(), self.hold_action()  # not the caller's array
+        if self.freeze_until_choice:
+            action = torch.where((self._elapsed_steps < self._response_step)[:, None], held, action)
+        for env in range(self.num_envs) if self.move_in_delay else ():
+            begins, ends = int(self._cue_end_step[env]), int(self._response_step[env])
+            motion = delay_motion(int(self._elapsed_steps[env]), begins=begins, ends=ends)
+            if motion is not None:
+                action[env] = torch.zeros_like(held[env])
+                action[env, Y_DIMENSION], action[env, GRIPPER_DIMENSION] = motion
+        return action
 
     # ---------------------------------------------------------------- reading
 

@@ -64,6 +64,7 @@ class RememberEnv(ItemChoiceEnv):
         self._drawn[env] = int(self.episode_generator(env, Stream.TARGET).integers(self.n_items))
         self._target[env] = (self._drawn[env] + self.swap_cue) % self.n_items
         self._sample_slots(env)
+        self._sample_distractor(env, {int(self._drawn[env]), int(self._target[env])})
 
     def n_swaps(self) -> int:
         """Return how many other items could be shown."""
@@ -75,8 +76,9 @@ class RememberEnv(ItemChoiceEnv):
         choice_begins = mask & (step == self._response_step)
         self._show_in_middle(cue_begins, self._drawn, self._target)
         self._park_all(cue_ends)
+        distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
-        return bool((cue_begins | cue_ends | choice_begins).any())
+        return bool((cue_begins | cue_ends | distracts | choice_begins).any())
 
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """As in `ChoiceEnv`, but slowing down is rewarded everywhere (official code)."""

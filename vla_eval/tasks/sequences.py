@@ -147,6 +147,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
             flags[env] = False
             flags[env, sequence[env]] = True
         self._sample_slots(env)
+        self._sample_distractor(env, {int(index) for index in (*drawn[: self.n_shown], *shown)})
 
     def is_swapped(self) -> bool:
         """Return whether other cubes than the drawn ones are shown, or in another order."""
@@ -170,8 +171,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
             moved = in_cue & (step == 0)
             self._show_together(moved)
         self._park_all(cue_ends)
+        distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
-        return bool((moved | cue_ends | choice_begins).any())
+        return bool((moved | cue_ends | distracts | choice_begins).any())
 
     def _show_together(self, mask: torch.Tensor) -> None:
         if not bool(mask.any()):

@@ -15,7 +15,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks import mug as mugs
 from vla_eval.tasks.choice import ChoiceEnv
-from vla_eval.tasks.memory_env import StepRange
+from vla_eval.tasks.durations import StepRange
 
 N_MUGS = 3
 MUG_SPACING_M = 0.2
