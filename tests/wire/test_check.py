@@ -121,3 +121,14 @@ def test_the_plugin_checks_with_the_same_code(capsys: pytest.CaptureFixture[str]
     assert "no connection" in capsys.readouterr().err
     with pytest.raises(client.CheckFailedError):
         client.check_remote("ws://127.0.0.1:1")
+
+
+def test_a_server_that_waits_for_a_greeting_is_named_as_one_of_another_protocol() -> None:
+    with serve(lambda socket: socket.recv(timeout=10), "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        url = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        with pytest.raises(ConformanceError, match=r"no reply within 0\.2 s.* name a recipe"):
+            check_remote(url, timeout_seconds=0.2)
+        server.shutdown()
+        thread.join()

@@ -207,7 +207,7 @@ def _sessions(server: Server) -> list[str]:
                 _expect_same(server, chunks, seed, requirement, BY_SESSION)
         finally:
             for connection in connections:
-                connection.__exit__()
+                connection.close()
         claims.append(requirement)
     return claims
 

@@ -86,10 +86,19 @@ class Server:
             )
         except (OSError, InvalidHandshake, InvalidURI, TimeoutError) as exc:
             raise self.failed(f"no connection: {exc or type(exc).__name__}. Start the server first.") from exc
+        connection = Connection(self, socket, opened)
         try:
-            return Connection(self, socket, opened)
+            connection.metadata = connection.receive()
         except RefusedError as exc:
+            connection.close()
             raise self.failed(f"expected a map as the first message, found the text: {exc}") from exc
+        except CheckFailedError as exc:
+            connection.close()
+            raise CheckFailedError(
+                f"{exc} This was the first message, in which a server of openpi's protocol says what it is. "
+                f"For another protocol, name a recipe: `mikasa-vla list` shows those that begin with remote_."
+            ) from exc
+        return connection
 
     def first_message(self) -> Message:
         """Return what the server says of itself."""
@@ -112,12 +121,16 @@ class Connection:
     def __init__(self, server: Server, socket: Any, opened: contextlib.ExitStack) -> None:
         self._server, self._socket, self._opened = server, socket, opened
         self._kept: dict[str, list[Message]] = {}
-        self.metadata = self.receive()
+        self.metadata: Message = {}
 
     def __enter__(self) -> Connection:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
         self._opened.close()
 
     def send(self, message: Any) -> None:

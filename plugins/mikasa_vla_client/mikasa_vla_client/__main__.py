@@ -12,17 +12,15 @@ from mikasa_vla_client.check import CheckFailedError, check_remote
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Check; return 0 if every requirement is met, otherwise 1."""
-    parser = argparse.ArgumentParser(
-        prog="mikasa_vla_client", description=check_remote.__doc__.splitlines()[0]
-    )
+    parser = argparse.ArgumentParser(prog="mikasa_vla_client", description="Check a policy server.")
     parser.add_argument("url", metavar="URL", help="ws://HOST:PORT of the server")
     parser.add_argument("--api-key-env", metavar="VAR", help="variable that holds the server's key")
     args = parser.parse_args(argv)
-    try:
-        key = os.environ[args.api_key_env] if args.api_key_env else None
-        check_remote(args.url, api_key=key, report=lambda claim: print("ok  " + claim, flush=True))
-    except KeyError:
+    key = os.environ.get(args.api_key_env) if args.api_key_env else None
+    if args.api_key_env and not key:
         parser.error(f"--api-key-env: the variable {args.api_key_env} is not set")
+    try:
+        check_remote(args.url, api_key=key, report=lambda claim: print("ok  " + claim, flush=True))
     except CheckFailedError as exc:
         print(exc, file=sys.stderr)
         return 1

@@ -88,7 +88,8 @@ class PolicyServer:
         debug: bool = False,
     ) -> None:
         """See `serve`."""
-        self._policy = _Function(policy) if callable(policy) and not hasattr(policy, "infer") else policy
+        is_function = callable(policy) and not hasattr(policy, "infer")
+        self._policy: Any = _Function(policy) if is_function else policy
         for name in ("reset", "infer") + (("observe",) if spec.needs_every_frame else ()):
             if not callable(getattr(self._policy, name, None)):
                 raise SpecError(

@@ -155,7 +155,7 @@ class PolicySpec:
         if self.state is not None:
             _check_array(observation, STATE_KEY, (len(STATE_LAYOUTS[self.state]),), np.floating)
 
-    def check_actions(self, actions: Any) -> np.ndarray:
+    def check_actions(self, actions: Any) -> np.ndarray[Any, Any]:
         """Return a policy's answer as a float32 array of its own.
 
         Raises:
