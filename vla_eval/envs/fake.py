@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.errors import TaskArgumentError, check_names
-from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_argument, check_arguments
+from vla_eval.tasks.interface import ACTION, CAMERA_SIZE_PX, CAMERAS, CONTROL_HZ, states
 from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
 M_PER_STEP = 0.039  # measured displacement of ManiSkill's pd_ee_delta_pose per step at action 1
-CONTROL_HZ = 20.0
 TCP_START_M = (-0.07, 0.0, 0.318)
 CANDIDATE_SPACING_M = 0.1
 CANDIDATE_Z_M = 0.02
@@ -33,7 +33,6 @@ MUG_REACH_M = 0.07  # the arm comes to rest on a mug, which is taller than a cub
 STATIC_ACTION = 0.2  # the point counts as at rest if every dimension is below it
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
-IMAGE_SIZE_PX = 128
 MAX_ITEMS = 100
 DISTRACTOR_LEVEL = 255  # of the first rows of an image; no cue has it
 RULES = {
@@ -43,25 +42,6 @@ RULES = {
 CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5, **RULES}
 SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0, **RULES}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
-CAMERAS = tuple(
-    CameraSpec(name=name, height_px=IMAGE_SIZE_PX, width_px=IMAGE_SIZE_PX, fov_rad=np.pi / 2)
-    for name in ("base_camera", "hand_camera")
-)
-STATES = tuple(
-    StateSpec(name=name, dims=tuple(dims.split()), unit=unit, frame=frame)
-    for name, dims, unit, frame in (
-        ("tcp_pose", "x y z qw qx qy qz", "m, wxyz quaternion", "world"),
-        ("qpos", "q1 q2 q3 q4 q5 q6 q7 finger1 finger2", "rad, m", "joint"),
-        ("qvel", "q1 q2 q3 q4 q5 q6 q7 finger1 finger2", "rad/s, m/s", "joint"),
-    )
-)
-ACTION = ActionSpec(
-    dims=("dx", "dy", "dz", "drx", "dry", "drz", "gripper"),
-    low=-1.0,
-    high=1.0,
-    control_mode="pd_ee_delta_pose",
-    gripper_open=1.0,
-)
 
 Vector = NDArray[np.float64]
 
@@ -125,7 +105,7 @@ class FakeEnv:
         self.spec = EnvSpec(
             task=task.id,
             cameras=CAMERAS,
-            states=STATES,
+            states=states(),
             action=ACTION,
             horizon_steps=arguments.get("horizon_steps", task.default_horizon_steps(self._response_step)),
             control_hz=CONTROL_HZ,
@@ -290,7 +270,7 @@ class FakeEnv:
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
-        picture = rng.integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
+        picture = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
         in_cue = self._shows_cue and self._phase(episode) == "cue" and episode.targets
         picture[:8] = 20 * (episode.targets[0] + 1) if in_cue else 0
         first = self._cue_steps + (self._response_step - self._cue_steps - self._distract_steps) // 2

@@ -18,34 +18,18 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
-from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
-from vla_eval.tasks.arms import CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_argument, check_arguments
+from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, CONTROL_MODE, states
 from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.spec import TaskSpec
 
-CONTROL_MODE = "pd_ee_delta_pose"
 ROBOT = "robot_uids"
-TCP_POSE = StateSpec(
-    name="tcp_pose", dims=("x", "y", "z", "qw", "qx", "qy", "qz"), unit="m, wxyz quaternion", frame="world"
-)
-CAMERAS = tuple(
-    CameraSpec(name=name, height_px=CAMERA_SIZE_PX, width_px=CAMERA_SIZE_PX, fov_rad=CAMERA_FOV_RAD)
-    for name in ("base_camera", "hand_camera")
-)
-ACTION = ActionSpec(
-    dims=("dx", "dy", "dz", "drx", "dry", "drz", "gripper"),
-    low=-1.0,
-    high=1.0,
-    control_mode=CONTROL_MODE,
-    gripper_open=1.0,
-)
-CONTROL_HZ = 20.0
 RENDERING_ADVICE = (
     "Run `mikasa-vla doctor`; on a machine without GPU, SAPIEN needs Mesa's lavapipe ≥ 24.3, which "
     "`make setup` installs."
@@ -89,7 +73,7 @@ class ManiSkillEnv:
         self.spec = EnvSpec(
             task=row.id,
             cameras=CAMERAS,
-            states=states(self._envs[0].arm, env_class(row).PROMPT_DIMS),
+            states=states(self._envs[0].arm.joints, env_class(row).PROMPT_DIMS),
             action=ACTION,
             horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
@@ -236,18 +220,6 @@ def _render_backend(settings: EnvSettings) -> str:
     if settings.render.backend == "auto":
         return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
     return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
-
-
-def states(arm: Arm, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]:
-    """Return the states that every task provides with an arm, and the numbers of the prompt if it has any."""
-    offered = (
-        TCP_POSE,
-        StateSpec(name="qpos", dims=arm.joints, unit="rad, m", frame="joint"),
-        StateSpec(name="qvel", dims=arm.joints, unit="rad/s, m/s", frame="joint"),
-    )
-    if not prompt_dims:
-        return offered
-    return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
 def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: Mapping[str, Any]) -> None:

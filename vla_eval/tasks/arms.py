@@ -17,11 +17,11 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.fetch import Fetch
 from mani_skill.sensors.camera import CameraConfig
 
+from vla_eval.features import JOINT_NAMES
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, CAMERA_SIZE_PX
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 
 FINGERS = ("finger1", "finger2")
-CAMERA_SIZE_PX = 128
-CAMERA_FOV_RAD = np.pi / 2
 FETCH_UID = "fetch_at_table"
 HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
 
@@ -45,7 +45,7 @@ class Arm:
 
 # Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
 PANDA = Arm(
-    joints=(*(f"joint{i}" for i in range(1, 8)), *FINGERS),
+    joints=JOINT_NAMES,
     arm_joints=tuple(range(7)),
     rest_qpos=(0.0, 0.0, 0.0, -2 * np.pi / 3, 0.0, 2 * np.pi / 3, np.pi / 4, 0.04, 0.04),
     base_m=(-0.615, 0.0, 0.0),

@@ -25,9 +25,10 @@ from mani_skill.utils.structs import Actor, Pose
 from vla_eval.errors import TaskArgumentError, unknown_name
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import Phase
-from vla_eval.tasks.arms import ARMS, CAMERA_FOV_RAD, CAMERA_SIZE_PX, Arm
+from vla_eval.tasks.arms import ARMS, Arm
 from vla_eval.tasks.bodies import Body, yaw_rad
 from vla_eval.tasks.durations import StepRange, step_range
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, CAMERA_SIZE_PX
 from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 
