@@ -12,6 +12,7 @@ MAX_SEED = 2**32 - 1  # of numpy's `RandomState`, from which ManiSkill takes its
 MAX_EPISODES = 1_000_000  # in one run folder: its plan and its records are held in memory
 MAX_PROCESSES = 1024
 MAX_SLOTS = 16_384  # of one worker; on a GPU, ManiSkill simulates some thousands side by side
+MAX_SERVER_ROWS = 4096  # of a pass of a policy server
 MAX_STEPS = 10_000  # control steps of anything: 500 s
 MAX_SECONDS = 7 * 24 * 3600.0
 MAX_TRAINING_STEPS = 1_000_000_000

@@ -163,11 +163,20 @@ class Policy(Protocol):
 class BatchPolicy(Policy, Protocol):
     """A policy that infers for several slots at once: the loop calls `act_batch` instead of `act`.
 
-    A chunk must not depend on the other slots.
+    A chunk must not depend on the other slots. A call that raises leaves every slot as it was, so that each
+    can be asked again alone.
     """
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
         """Decide for each window; the order of the answers is that of the windows."""
+
+
+@runtime_checkable
+class ForgettingPolicy(Policy, Protocol):
+    """A policy that can release the memory of an episode that is over, before the next `reset`."""
+
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release what is known of these slots; nothing is asked of them before their next `reset`."""
 
 
 class StepObserver(Protocol):

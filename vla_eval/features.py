@@ -29,6 +29,8 @@ REWARD_KEY, SUCCESS_KEY, DONE_KEY = "next.reward", "next.success", "next.done"
 StateKind = Literal["eef", "joints"]
 PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.joints"}
 """Both kinds are always stored. lerobot takes as inputs only what begins with `observation`."""
+PROPRIO_STATES = ("tcp_pose", "qpos", "qvel")
+"""States of the environment that both are computed from; `joints` is all of them, one after the other."""
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 JOINT_NAMES = (*(f"joint{i}" for i in range(1, 8)), "finger1", "finger2")  # of the Panda

@@ -27,6 +27,7 @@ VERBS = (
     "dataset",
     "finetune",
     "checkpoint",
+    "serve",
     "list",
     "show",
     "doctor",

@@ -7,7 +7,6 @@ native library or a GPU context may be left in a state that nothing within the p
 
 import dataclasses
 import functools
-import inspect
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from vla_eval.core import EpisodeStart, Policy, SimEnv
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import (
     InvalidActionError,
-    RecipeError,
     RemoteConnectionError,
     RemoteReplyError,
     RemoteTimeoutError,
@@ -29,7 +27,7 @@ from vla_eval.errors import (
 from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.registry import policy_factory
+from vla_eval.policies.registry import make_from_adapter
 from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
@@ -179,7 +177,6 @@ def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
     Raises:
         RecipeError: the adapter does not take the recipe's arguments.
     """
-    factory = policy_factory(group.adapter)
     context = PolicyContext(
         name=group.key.policy,
         env=facts.spec,
@@ -187,15 +184,7 @@ def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
         n_candidates=facts.n_candidates,
         n_slots=group.env.n_slots,
     )
-    seed_global_generators("policy", group.key.policy)
-    try:
-        inspect.signature(factory).bind(context, **group.args)
-    except TypeError as exc:
-        raise RecipeError(
-            f"policy '{group.key.policy}': the adapter '{group.adapter}' does not take the recipe's args "
-            f"{dict(group.args)}: {exc}. It is called as {group.adapter}{inspect.signature(factory)}."
-        ) from exc
-    return factory(context, **group.args)
+    return make_from_adapter(group.adapter, context, group.args)
 
 
 def worker_main(

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
-from vla_eval.features import StateKind
+from vla_eval.features import PROPRIO_STATES, StateKind
 from vla_eval.policies.bases import first_fetch
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
@@ -42,7 +42,6 @@ from vla_eval.policies.lerobot_episodes import (
     in_rows,
 )
 from vla_eval.policies.lerobot_inputs import (
-    STATES,
     InputMap,
     InputOptions,
     check_training,
@@ -115,7 +114,7 @@ class LeRobotPolicy:
             name=name,
             reads="every" if self._remembers or len(self._deltas) > 1 else "last",
             cameras=tuple(inputs.cameras),
-            states=STATES if inputs.state is not None else (),
+            states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
         )
 
@@ -123,6 +122,16 @@ class LeRobotPolicy:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
         for episode in episodes:
             self._slots[episode.slot] = Episode(start=episode)
+
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release the frames and the memory of these slots."""
+        for slot in slots:
+            self._slots.pop(slot, None)
+
+    @property
+    def proprioception(self) -> StateKind | None:
+        """Which proprioception it reads."""
+        return self._inputs.state
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Infer for one episode."""

@@ -12,16 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla_eval.core import Observation
+from vla_eval.core import FloatArray, Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
-from vla_eval.features import CAMERA_KEYS, STATE_KEY, STATE_NAMES, StateKind, proprioception
+from vla_eval.features import (
+    CAMERA_KEYS,
+    STATE_KEY,
+    STATE_NAMES,
+    StateKind,
+    proprioception,
+)
 from vla_eval.policies.checkpoint import TrainingFacts
 from vla_eval.specs import EnvSpec
 
 ACTION_KEY = "action"
 MAX_UNIT = 1.0 + 1e-3  # statistics of images in [0, 1]; those of 0 … 255 are far beyond
 MAX_FOV_DIFFERENCE_RAD = 1e-4
-STATES = ("tcp_pose", "qpos", "qvel")  # what `proprioception` is computed from
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,14 +42,22 @@ class InputMap:
     state: StateKind | None
 
     def tensors(self, observation: Observation) -> dict[str, Tensor]:
-        """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field."""
+        """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field.
+
+        The state is computed from those of the environment, unless the observation holds it by its kind.
+        """
         fields = {
             key: torch.from_numpy(observation.images[camera].transpose(2, 0, 1).astype(np.float32) / 255)
             for camera, key in self.cameras.items()
         }
         if self.state is not None:
-            fields[STATE_KEY] = torch.from_numpy(proprioception(observation.state)[self.state])
+            fields[STATE_KEY] = torch.from_numpy(self._proprioception(observation))
         return fields
+
+    def _proprioception(self, observation: Observation) -> FloatArray:
+        assert self.state is not None
+        given = observation.state.get(self.state)  # a client may have computed it
+        return proprioception(observation.state)[self.state] if given is None else given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

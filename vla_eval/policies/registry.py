@@ -13,13 +13,22 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import Any
 
 from vla_eval.core import Policy
-from vla_eval.errors import MAX_SHOWN, MissingDependencyError, UnknownNameError, did_you_mean, unknown_name
+from vla_eval.errors import (
+    MAX_SHOWN,
+    MissingDependencyError,
+    RecipeError,
+    UnknownNameError,
+    did_you_mean,
+    unknown_name,
+)
+from vla_eval.policies.context import PolicyContext
+from vla_eval.seeding import seed_global_generators
 
 PolicyFactory = Callable[..., Policy]
 """`make_x(context: PolicyContext, **args) -> Policy`; `args` come from the policy's recipe."""
@@ -39,6 +48,8 @@ POLICIES = {
     "openvla": "vla_eval.policies.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
 }
+PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "body_memory", "cue_touch", "one_frame"})
+"""Those of ours that read the true state of the world."""
 
 
 _TARGET = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
@@ -104,6 +115,30 @@ def policy_factory(adapter: str) -> PolicyFactory:
         )
     factory: PolicyFactory = found
     return factory
+
+
+def make_from_adapter(adapter: str, context: PolicyContext, args: Mapping[str, Any]) -> Policy:
+    """Make a policy of an adapter, with global generators seeded by its name.
+
+    Args:
+        adapter: a name from the registry, or `module:attr`.
+        context: what the policy gets to know.
+        args: keyword arguments of the adapter, from a recipe.
+
+    Raises:
+        UnknownNameError, MissingDependencyError: see `policy_factory`.
+        RecipeError: the adapter does not take these arguments.
+    """
+    factory = policy_factory(adapter)
+    seed_global_generators("policy", context.name)
+    try:
+        inspect.signature(factory).bind(context, **args)
+    except TypeError as exc:
+        raise RecipeError(
+            f"policy '{context.name}': the adapter '{adapter}' does not take the recipe's args "
+            f"{dict(args)}: {exc}. It is called as {adapter}{inspect.signature(factory)}."
+        ) from exc
+    return factory(context, **args)
 
 
 def _target(adapter: str) -> tuple[str, str]:

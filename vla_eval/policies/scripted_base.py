@@ -60,6 +60,11 @@ class ScriptedPolicy:
             task_key = zlib.crc32(episode.task.encode())  # else luck would be the same luck in every task
             self._rng[episode.slot] = generator(episode.seed, Stream.POLICY, task_key, episode.run)
 
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release the generators of these slots."""
+        for slot in slots:
+            self._rng.pop(slot, None)
+
     def privileged_state(self, window: ObservationWindow) -> PrivilegedState:
         """Return the true state of the world at the last observation.
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple  # Any: a server may say anything
 
 import numpy as np
 
+from vla_eval.bounds import MAX_SERVER_ROWS
 from vla_eval.errors import RemoteReplyError
 from vla_eval.strict_json import shown
 
@@ -18,7 +19,6 @@ SUPPORTS = ("reset", "observe", "seed", "row")
 
 MAX_ACTIONS = 10_000  # of one reply
 MAX_IMAGE_PX = 4096
-MAX_SERVER_ROWS = 4096
 MAX_COUNT = 2**31
 MAX_NUMBERS_SHOWN = 64  # of an array among what a server says; of a larger one, the digest is recorded
 

@@ -1,0 +1,208 @@
+"""Sessions: slots, rows, frames in order, limits; and what a request must hold."""
+
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from tests.serving.served_policies import frame
+from vla_eval.features import STATE_NAMES
+from vla_eval.serving import sessions
+from vla_eval.serving.observations import ObservationReader, RequestError, observation_reader
+from vla_eval.serving.sessions import Session, SessionTable
+from vla_eval.specs import PolicySpec
+from vla_eval.tasks.interface import env_spec
+
+
+def reader(*, end_effector: bool = False, states: tuple[str, ...] = ("qpos",)) -> ObservationReader:
+    spec = PolicySpec(name="any", reads="last", cameras=("base_camera",), states=states, chunk_size=1)
+    return observation_reader(spec, env_spec(), end_effector=end_effector)
+
+
+class Clock:
+    seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def table(*, reads: Literal["last", "every"] = "every", n_rows: int = 2, clock: Any = None) -> SessionTable:
+    return SessionTable(reader(), reads=reads, n_rows=n_rows, task="any", clock=clock or Clock())
+
+
+def request(**fields: Any) -> dict[str, Any]:
+    return frame(**{"observation/image": np.zeros((128, 128, 3), np.uint8), **fields})
+
+
+def begun(sessions: SessionTable, name: str = "s", connection: int = 0, **fields: Any) -> Session:
+    message = request(session_id=name, endpoint="reset", **fields)
+    session = sessions.session(connection, message)
+    sessions.begin(session, message)
+    return session
+
+
+class TestSlotsAndRows:
+    def test_every_session_has_a_slot_of_its_own_and_a_freed_one_is_used_again(self) -> None:
+        table_ = table()
+        assert [begun(table_, name, connection=n % 2).slot for n, name in enumerate("abc")] == [0, 1, 2]
+        assert table_.drop_connection(1) == [1]
+        assert begun(table_, "d").slot == 1
+
+    def test_a_session_without_a_row_gets_the_one_with_the_fewest(self) -> None:
+        table_ = table(n_rows=3)
+        assert begun(table_, "a", row=1).row == 1
+        assert [begun(table_, name).row for name in "bcde"] == [0, 2, 0, 1]
+
+    def test_an_episode_is_what_the_client_says(self) -> None:
+        start = begun(table(), task="T", seed=7, run=2, row=1, horizon_steps=60).episode
+        assert start is not None
+        assert (start.task, start.seed, start.run, start.row, start.horizon_steps) == ("T", 7, 2, 1, 60)
+        assert start.instruction == "remember"
+
+    @pytest.mark.parametrize(
+        ("fields", "message"),
+        [
+            ({"row": 2}, "'row': expected a number from 0 to 1, found 2"),
+            ({"seed": -1}, "'seed': expected a number from 0"),
+            ({"seed": True}, "'seed'"),
+            ({"session_id": 5}, "'session_id': expected text"),
+            ({"prompt": " "}, "'prompt': expected the instruction"),
+        ],
+    )
+    def test_a_wrong_field_is_refused(self, fields: dict[str, Any], message: str) -> None:
+        table_, wrong = table(), request(endpoint="reset", **fields)
+        with pytest.raises(RequestError, match=message):
+            table_.begin(table_.session(0, wrong), wrong)
+
+
+class TestFrames:
+    def test_an_inference_is_given_the_unread_frames_in_order(self) -> None:
+        table_ = table()
+        session = begun(table_)
+        for step in range(3):
+            table_.observe(session, request(step=step))
+        assert [one.step for one in table_.window(session, request(step=3)).frames] == [0, 1, 2, 3]
+        assert [one.step for one in table_.window(session, request(step=4)).frames] == [4]
+
+    def test_a_policy_that_reads_the_last_frame_is_given_that_one(self) -> None:
+        table_ = table(reads="last")
+        session = begun(table_)
+        table_.observe(session, request(step=0))
+        assert [one.step for one in table_.window(session, request(step=1)).frames] == [1]
+
+    def test_frames_without_a_step_are_counted(self) -> None:
+        table_ = table()
+        session = begun(table_)
+        assert [table_.window(session, request()).last.step for _ in range(3)] == [0, 1, 2]
+
+    def test_a_frame_of_the_past_is_refused(self) -> None:
+        table_ = table()
+        session = begun(table_)
+        table_.observe(session, request(step=4))
+        with pytest.raises(RequestError, match="step 4 after step 4"):
+            table_.window(session, request(step=4))
+
+    def test_a_reset_forgets_the_frames(self) -> None:
+        table_ = table()
+        session = begun(table_)
+        table_.observe(session, request(step=0))
+        begun(table_)
+        assert len(table_.window(session, request(step=0)).frames) == 1
+
+    def test_unread_frames_are_limited(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sessions, "MAX_UNREAD_FRAMES", 2)
+        table_ = table()
+        session = begun(table_)
+        table_.observe(session, request())
+        table_.observe(session, request())
+        with pytest.raises(RequestError, match="at most 2 frames"):
+            table_.observe(session, request())
+
+
+class TestEpisodesWithoutReset:
+    def test_the_first_request_and_another_instruction_begin_an_episode(self) -> None:
+        table_ = table()
+        session = table_.session(0, request())
+        assert table_.begins(session, request())
+        table_.begin(session, request())
+        assert not table_.begins(session, request())
+        assert table_.begins(session, request(prompt="another"))
+
+    def test_an_episode_that_the_server_lost_is_not_continued(self) -> None:
+        table_ = table()
+        with pytest.raises(RequestError, match="step 8 of an episode that the server does not have"):
+            table_.begins(table_.session(0, request()), request(step=8))
+
+    def test_another_instruction_in_the_middle_of_an_episode_is_refused(self) -> None:
+        table_ = table()
+        with pytest.raises(RequestError, match="another instruction"):
+            table_.begins(begun(table_), request(prompt="another"))
+
+
+class TestLimits:
+    def test_an_idle_session_is_dropped_and_must_begin_again(self) -> None:
+        clock = Clock()
+        table_ = table(clock=clock)
+        idle, busy = begun(table_, "idle"), begun(table_, "busy")
+        busy.n_pending = 1
+        clock.seconds = 601.0
+        assert table_.drop_idle(600.0) == [idle.slot]
+        with pytest.raises(RequestError, match="'idle' was dropped"):
+            table_.session(0, request(session_id="idle"))
+        assert begun(table_, "idle").episode is not None
+
+    def test_the_number_of_sessions_is_limited(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sessions, "MAX_SESSIONS", 1)
+        table_ = table()
+        begun(table_, "a")
+        with pytest.raises(RequestError, match="at most 1 sessions"):
+            begun(table_, "b")
+
+
+class TestObservations:
+    @pytest.mark.parametrize(
+        ("fields", "message"),
+        [
+            (
+                {"observation/image": None},
+                r"no 'observation/image': expected an image \(128, 128, 3\)",
+            ),
+            (
+                {"observation/image": np.zeros((64, 128, 3), np.uint8)},
+                r"found an array \(64, 128, 3\)",
+            ),
+            ({"observation/image": np.zeros((128, 128, 3), np.float32)}, "found an array .* float32"),
+            ({"observation/state": np.zeros(8, np.float32)}, r"expected 9 numbers \(qpos\), found 8 numbers"),
+            ({"observation/state": np.zeros(9, np.int64)}, "float32; found an array .* int64"),
+            ({"observation/state": np.full(9, np.nan, np.float32)}, "expected finite numbers"),
+            ({"observation/state": [0.0] * 9}, "expected an array"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused(self, fields: dict[str, Any], message: str) -> None:
+        with pytest.raises(RequestError, match=message):
+            reader().read(request(**fields), step=0)
+
+    def test_a_mistyped_key_is_named(self) -> None:
+        mistyped = request()
+        mistyped["observation/imge"] = mistyped.pop("observation/image")
+        with pytest.raises(RequestError, match="Did you mean 'observation/imge'"):
+            reader().read(mistyped, step=0)
+
+    def test_the_25_numbers_are_pose_positions_and_velocities(self) -> None:
+        read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
+        assert read.state_layouts == STATE_NAMES
+        numbers = np.arange(25, dtype=np.float64)
+        state = read.read(request(**{"observation/state": numbers}), step=0).state
+        assert {name: (values[0], len(values)) for name, values in state.items()} == {
+            "tcp_pose": (0, 7),
+            "qpos": (7, 9),
+            "qvel": (16, 9),
+        }
+        assert all(values.dtype == np.float32 for values in state.values())
+
+    def test_ten_numbers_are_the_end_effector_for_a_policy_that_reads_it(self) -> None:
+        ten = request(**{"observation/state": np.arange(10, dtype=np.float32)})
+        read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
+        assert read.read(ten, step=0).state["eef"].tolist() == list(range(10))
+        with pytest.raises(RequestError, match=r"expected 25 numbers \(joints\), found 10"):
+            reader(states=("tcp_pose", "qpos", "qvel")).read(ten, step=0)

@@ -1,0 +1,109 @@
+"""`mikasa-vla serve`: one policy for many simulators, over WebSocket."""
+
+import argparse
+import ipaddress
+import logging
+import os
+import sys
+from typing import Any
+
+from vla_eval.errors import RecipeError
+
+DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
+evaluates it, and openpi's own client gets chunks from it. Requests of several clients share a pass of the
+network; an answer does not depend on who else is there."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+    """Declare the arguments."""
+    parser = subparsers.add_parser(
+        "serve",
+        help="serve a policy to simulators and other clients over WebSocket",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--policy", required=True, metavar="P", help="name in policies/, file, or folder of a checkpoint"
+    )
+    parser.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (127.0.0.1)")
+    parser.add_argument("--port", type=int, default=8000, metavar="N", help="TCP port; 0: a free one (8000)")
+    parser.add_argument(
+        "--max-batch", type=int, default=16, metavar="B", help="rows of a pass of the network (16)"
+    )
+    parser.add_argument(
+        "--api-key-env", metavar="VAR", help="environment variable with the key that clients must send"
+    )
+    parser.add_argument(
+        "--idle-seconds",
+        type=float,
+        default=600.0,
+        metavar="S",
+        help="drop sessions without a message for so long (600)",
+    )
+    parser.add_argument("--task", metavar="T", help="for policies that depend on the task")
+    parser.add_argument(
+        "--n-action-steps", type=int, metavar="K", help="for scripted policies: actions of a chunk (1)"
+    )
+    parser.add_argument("--device", metavar="D", help="auto, cpu, cuda, cuda:1 (as the recipe says)")
+    parser.add_argument("--debug", action="store_true", help="send errors with their traceback")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve; print the address when clients can connect."""
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from vla_eval.serving.host import HostOptions, host_policy
+    from vla_eval.serving.server import ServerOptions, run_server
+
+    options = ServerOptions(
+        host=args.host,
+        port=args.port,
+        api_key=_api_key(args.api_key_env),
+        idle_seconds=args.idle_seconds,
+        debug=args.debug,
+    )
+    if options.api_key is None and not _is_loopback(args.host):
+        print(
+            f"warning: {args.host} can be reached from other machines, and no key is asked for "
+            "(--api-key-env).",
+            file=sys.stderr,
+        )
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logging.getLogger("vla_eval.serving").setLevel(logging.INFO)
+    hosted = host_policy(
+        HostOptions(
+            policy=args.policy,
+            task=args.task,
+            n_action_steps=args.n_action_steps,
+            max_batch=args.max_batch,
+            device=args.device,
+        )
+    )
+    host = f"[{args.host}]" if ":" in args.host else args.host
+
+    def ready(port: int) -> None:
+        print(f"Serving {hosted.metadata.name} at ws://{host}:{port}", flush=True)
+
+    run_server(hosted, options, ready=ready)
+    return 0
+
+
+def _api_key(variable: str | None) -> str | None:
+    """Return the key that the environment variable holds.
+
+    Raises:
+        RecipeError: it is not set.
+    """
+    if variable is None:
+        return None
+    key = os.environ.get(variable, "")
+    if not key:
+        raise RecipeError(f"--api-key-env {variable}: expected a key in this variable, found it not set.")
+    return key
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,198 @@
+"""One client's connection: read its requests in order, send replies as they are ready.
+
+Several sessions may share a connection: a request does not wait for the reply to the one before it, and
+replies come in the order of completion. After an error the connection is closed, with its sessions.
+"""
+
+import asyncio
+import logging
+import time
+import traceback
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, cast  # Any: what a client sends
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from vla_eval.errors import VlaEvalError, did_you_mean
+from vla_eval.serving.batching import Batcher, Inference
+from vla_eval.serving.observations import RequestError
+from vla_eval.serving.sessions import Session, SessionTable
+from vla_eval.strict_json import shown
+from vla_eval.wire.codec import CodecError, packb, unpackb
+from vla_eval.wire.metadata import ServerMetadata
+
+ENDPOINTS = ("infer", "reset", "observe")
+MAX_PENDING = 1024  # requests of a connection without a reply
+INTERNAL_ERROR = 1011  # close code of RFC 6455, as openpi's server uses it
+MAX_ERROR_CHARACTERS = 4000
+
+_Done = Future[Inference] | Future[None]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """What all connections of a server share.
+
+    Attributes:
+        sessions: all sessions.
+        batcher: asks the policy.
+        debug: whether errors are sent with their traceback.
+    """
+
+    sessions: SessionTable
+    batcher: Batcher
+    debug: bool
+
+
+class ClientConnection:
+    """Answers the requests of one connection.
+
+    Args:
+        socket: the connection.
+        number: its number, different from that of every other one.
+        service: what it shares with others.
+    """
+
+    def __init__(self, socket: ServerConnection, number: int, service: Service) -> None:
+        self._socket, self._number, self._service = socket, number, service
+        self._replies: set[asyncio.Task[None]] = set()
+        self._previous_seconds: float | None = None
+        self._has_failed = False
+
+    async def serve(self, metadata: ServerMetadata) -> None:
+        """Say what is served, and answer until the connection ends; then drop its sessions."""
+        try:
+            await self._socket.send(packb(metadata.to_wire()))
+            async for data in self._socket:
+                try:
+                    self._take(data)
+                except VlaEvalError as exc:
+                    await self._fail(exc)
+        except ConnectionClosed:
+            pass  # the client is gone, or the server stops
+        finally:
+            for reply in self._replies:
+                reply.cancel()
+            for slot in self._service.sessions.drop_connection(self._number):
+                self._service.batcher.forget(slot)
+
+    async def finish_replies(self, seconds: float) -> None:
+        """Wait until what the policy has answered is sent; for a server that stops.
+
+        Args:
+            seconds: how long at most: a client may not read.
+        """
+        if self._replies:
+            await asyncio.wait(self._replies, timeout=seconds)
+
+    def _take(self, data: str | bytes) -> None:
+        """Begin to answer a request.
+
+        Raises:
+            RequestError: it cannot be answered.
+        """
+        if self._has_failed:  # the connection is being closed
+            return
+        request, begun = _read(data), time.monotonic()
+        endpoint = request.get("endpoint") or "infer"
+        if endpoint not in ENDPOINTS:
+            hint = did_you_mean(endpoint, ENDPOINTS) if isinstance(endpoint, str) else ""
+            raise RequestError(f"'endpoint': expected {', '.join(ENDPOINTS)}; found {shown(endpoint)}.{hint}")
+        if len(self._replies) >= MAX_PENDING:
+            raise RequestError(f"expected at most {MAX_PENDING} requests without a reply.")
+        sessions, batcher = self._service.sessions, self._service.batcher
+        session = sessions.session(self._number, request)
+        if endpoint == "reset":
+            start = sessions.begin(session, request)
+            self._answer_later(session, request, batcher.begin(start), begun)
+        elif endpoint == "observe":
+            if session.episode is None:
+                raise RequestError("'observe' without an episode. Send 'reset' first.")
+            sessions.observe(session, request)
+        else:
+            if sessions.begins(session, request):
+                batcher.begin(sessions.begin(session, request))  # if it fails, so does the inference
+            assert session.episode is not None
+            window = sessions.window(session, request)
+            self._answer_later(session, request, batcher.infer(session.episode, window), begun)
+
+    def _answer_later(
+        self,
+        session: Session,
+        request: Mapping[str, Any],
+        done: _Done,
+        begun: float,
+    ) -> None:
+        session.n_pending += 1
+        task = asyncio.create_task(self._answer(session, request, done, begun))
+        self._replies.add(task)
+        task.add_done_callback(self._replies.discard)
+
+    async def _answer(
+        self,
+        session: Session,
+        request: Mapping[str, Any],
+        done: _Done,
+        begun: float,
+    ) -> None:
+        """Send the reply to a request once the policy has answered."""
+        try:
+            result = await asyncio.wrap_future(cast("Future[Inference | None]", done))
+            now = time.monotonic()
+            reply = self._reset_reply(begun, now) if result is None else self._chunk_reply(result)
+            echo = {key: request[key] for key in ("session_id", "step") if request.get(key) is not None}
+            await self._socket.send(packb({**reply, **echo}))
+            self._previous_seconds = time.monotonic() - begun
+        except ConnectionClosed:
+            pass
+        except Exception as exc:  # whatever a policy returns has to be packed
+            await self._fail(exc)
+        finally:
+            session.n_pending -= 1
+            session.used_at = time.monotonic()
+
+    def _reset_reply(self, begun: float, now: float) -> dict[str, Any]:
+        return {"status": "reset", "server_timing": {"reset_ms": 1000 * (now - begun)}}
+
+    def _chunk_reply(self, result: Inference) -> dict[str, Any]:
+        timing = {"infer_ms": 1000 * result.infer_seconds, "queue_ms": 1000 * result.queue_seconds}
+        if self._previous_seconds is not None:
+            timing["prev_total_ms"] = 1000 * self._previous_seconds
+        return {"actions": result.chunk.actions, "server_timing": timing}
+
+    async def _fail(self, exc: Exception) -> None:
+        """Send the error as text and close the connection."""
+        if self._has_failed:
+            return
+        self._has_failed = True
+        text = str(exc) if isinstance(exc, VlaEvalError) else f"{type(exc).__name__}: {exc}"
+        if self._service.debug:
+            text = "".join(traceback.format_exception(exc))
+        logger.warning("connection %d: %s", self._number, text)
+        try:
+            await self._socket.send(text[:MAX_ERROR_CHARACTERS])
+            await self._socket.close(INTERNAL_ERROR, "error")
+        except ConnectionClosed:
+            pass
+
+
+def _read(data: str | bytes) -> dict[str, Any]:
+    """Return a request.
+
+    Raises:
+        RequestError: it is no map in msgpack.
+    """
+    if isinstance(data, str):
+        raise RequestError("expected a binary message (msgpack), found a text message.")
+    try:
+        request = unpackb(data)
+    except CodecError as exc:
+        raise RequestError(f"the request cannot be read: {exc}.") from exc
+    if not isinstance(request, dict):
+        raise RequestError(f"expected a map, found {shown(request)}.")
+    return request

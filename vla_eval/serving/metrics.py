@@ -1,0 +1,113 @@
+"""Counts of a server, for its log and for Prometheus. Knows nothing of sockets or policies."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+PREFIX = "mikasa_vla"
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of Prometheus' text format: https://prometheus.io/docs/instrumenting/exposition_formats/"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counts:
+    """What was counted since the start.
+
+    Attributes:
+        n_inferences: chunks.
+        n_passes: calls of the policy.
+        n_errors: inferences or beginnings of episodes at which the policy failed.
+        infer_seconds: in the policy.
+        queue_seconds: added up over all inferences: between the request and the beginning of its pass.
+    """
+
+    n_inferences: int = 0
+    n_passes: int = 0
+    n_errors: int = 0
+    infer_seconds: float = 0.0
+    queue_seconds: float = 0.0
+
+
+class ServerMetrics:
+    """Counts; the thread that infers writes them, others read.
+
+    Args:
+        clock: seconds; not of a calendar.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._counts = Counts()
+        self._reported, self._reported_at = Counts(), clock()
+
+    def count_pass(self, *, n_requests: int, infer_seconds: float, queue_seconds: float) -> None:
+        """Count a pass.
+
+        Args:
+            n_requests: chunks that it gave.
+            infer_seconds: how long it took.
+            queue_seconds: how long its requests had waited, added up.
+        """
+        with self._lock:
+            counts = self._counts
+            self._counts = replace(
+                counts,
+                n_inferences=counts.n_inferences + n_requests,
+                n_passes=counts.n_passes + 1,
+                infer_seconds=counts.infer_seconds + infer_seconds,
+                queue_seconds=counts.queue_seconds + queue_seconds,
+            )
+
+    def count_error(self) -> None:
+        """Count an error of the policy."""
+        with self._lock:
+            self._counts = replace(self._counts, n_errors=self._counts.n_errors + 1)
+
+    @property
+    def counts(self) -> Counts:
+        """What was counted since the start."""
+        with self._lock:
+            return self._counts
+
+    def line(self, *, n_sessions: int) -> str:
+        """Return one line of statistics since the last call."""
+        now, counts, before = self._clock(), self.counts, self._reported
+        seconds = now - self._reported_at
+        self._reported, self._reported_at = counts, now
+        n_inferences = counts.n_inferences - before.n_inferences
+        n_passes = counts.n_passes - before.n_passes
+        queue_seconds = counts.queue_seconds - before.queue_seconds
+        infer_seconds = counts.infer_seconds - before.infer_seconds
+        return (
+            f"sessions {n_sessions}, inferences/s {_ratio(n_inferences, seconds):.2f}, mean batch "
+            f"{_shown(n_inferences, n_passes)}, queue ms {_shown(1000 * queue_seconds, n_inferences)}, "
+            f"pass ms {_shown(1000 * infer_seconds, n_passes)}, errors {counts.n_errors - before.n_errors}"
+        )
+
+    def prometheus(self, *, n_sessions: int, n_connections: int) -> str:
+        """Return all counts in Prometheus' text format."""
+        counts = self.counts
+        rows: tuple[tuple[str, str, str, float], ...] = (
+            ("sessions", "gauge", "Sessions at the moment.", n_sessions),
+            ("connections", "gauge", "Open connections.", n_connections),
+            ("inferences_total", "counter", "Chunks of actions.", counts.n_inferences),
+            ("passes_total", "counter", "Calls of the policy.", counts.n_passes),
+            ("errors_total", "counter", "Failures of the policy.", counts.n_errors),
+            ("infer_seconds_total", "counter", "Time in the policy.", counts.infer_seconds),
+            ("queue_seconds_total", "counter", "Time of requests in the queue.", counts.queue_seconds),
+        )
+        return "".join(
+            f"# HELP {PREFIX}_{name} {text}\n# TYPE {PREFIX}_{name} {kind}\n{PREFIX}_{name} {value}\n"
+            for name, kind, text, value in rows
+        )
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole > 0 else 0.0
+
+
+def _shown(part: float, whole: float) -> str:
+    """Return a mean; a dash where there is nothing to take it of."""
+    return f"{part / whole:.2f}" if whole > 0 else "—"

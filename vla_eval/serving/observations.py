@@ -1,0 +1,155 @@
+"""From a request to an observation: cameras, proprioception, instruction; what does not fit is refused.
+
+Nothing is resized, converted or filled in here: that is the client's, which knows its own cameras.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any  # Any: what a client sends
+
+import numpy as np
+
+from vla_eval.core import FloatArray, ImageArray, Observation
+from vla_eval.errors import SpecMismatchError, VlaEvalError, did_you_mean, some_of
+from vla_eval.features import PROPRIO_STATES, STATE_NAMES
+from vla_eval.specs import EnvSpec, PolicySpec
+from vla_eval.strict_json import shown
+from vla_eval.wire.metadata import CameraImage
+
+CAMERA_WIRE_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/wrist_image"}
+"""Camera -> key of its image. Source: openpi's policy for LIBERO,
+https://github.com/Physical-Intelligence/openpi/blob/15a9616a00943ada6c20a0f158e3adb39df2ccac/src/openpi/policies/libero_policy.py"""
+STATE_WIRE_KEY = "observation/state"
+PROMPT_WIRE_KEY = "prompt"
+
+
+class RequestError(VlaEvalError):
+    """A client sent something that the server cannot answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationReader:
+    """Reads the observations that a policy needs.
+
+    Attributes:
+        cameras: camera of the policy -> key and size of its image.
+        states: the policy's states -> names of their numbers, in the order in which a request holds them.
+        end_effector: whether a state may also be the 10 numbers of the kind `eef`, which the policy reads.
+    """
+
+    cameras: Mapping[str, CameraImage]
+    states: Mapping[str, tuple[str, ...]]
+    end_effector: bool
+
+    @property
+    def state_layouts(self) -> dict[str, tuple[str, ...]]:
+        """Name of a layout -> names of its numbers; empty if the policy reads no state."""
+        if not self.states:
+            return {}
+        if tuple(self.states) == PROPRIO_STATES:
+            layouts = {"joints": STATE_NAMES["joints"]}
+        else:
+            joined = tuple(name for dims in self.states.values() for name in dims)
+            layouts = {"+".join(self.states): joined}
+        if self.end_effector:
+            layouts["eef"] = STATE_NAMES["eef"]
+        return layouts
+
+    def read(self, request: Mapping[str, Any], *, step: int) -> Observation:
+        """Return the observation that a request holds.
+
+        Args:
+            request: what the client sent, decoded.
+            step: control steps executed before it.
+
+        Raises:
+            RequestError: an image or the state is missing, or has another shape or type.
+        """
+        return Observation(
+            step=step,
+            images={name: _read_image(request, camera) for name, camera in self.cameras.items()},
+            state=self._read_state(request) if self.states else {},
+        )
+
+    def _read_state(self, request: Mapping[str, Any]) -> dict[str, FloatArray]:
+        sizes = {name: len(dims) for name, dims in self.state_layouts.items()}
+        expected = " or ".join(f"{size} numbers ({name})" for name, size in sizes.items())
+        vector = _required(request, STATE_WIRE_KEY, expected)
+        if not isinstance(vector, np.ndarray) or vector.dtype.kind != "f" or vector.ndim != 1:
+            raise RequestError(
+                f"'{STATE_WIRE_KEY}': expected an array of {expected}, float32; found {_described(vector)}."
+            )
+        if not np.isfinite(vector).all():
+            raise RequestError(
+                f"'{STATE_WIRE_KEY}': expected finite numbers, found {shown(vector.tolist())}."
+            )
+        values = vector.astype(np.float32)
+        if self.end_effector and len(values) == sizes["eef"]:
+            return {"eef": values}
+        if len(values) != sum(len(dims) for dims in self.states.values()):
+            raise RequestError(f"'{STATE_WIRE_KEY}': expected {expected}, found {len(values)} numbers.")
+        ends = np.cumsum([len(dims) for dims in self.states.values()])[:-1]
+        return {name: part.copy() for name, part in zip(self.states, np.split(values, ends), strict=True)}
+
+
+def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) -> ObservationReader:
+    """Return what reads the observations of a policy.
+
+    Args:
+        policy: which cameras and states it needs.
+        env: their sizes.
+        end_effector: whether the policy reads the kind `eef`.
+
+    Raises:
+        SpecMismatchError: the policy has a camera for which the wire has no key.
+    """
+    sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
+    for camera in policy.cameras:
+        if camera not in CAMERA_WIRE_KEYS:
+            raise SpecMismatchError(
+                f"policy '{policy.name}' needs the camera '{camera}', which cannot be sent to a server "
+                f"(it takes: {', '.join(CAMERA_WIRE_KEYS)}).{did_you_mean(camera, CAMERA_WIRE_KEYS)}"
+            )
+    dims = {state.name: state.dims for state in env.states}
+    return ObservationReader(
+        cameras={name: CameraImage(CAMERA_WIRE_KEYS[name], *sizes[name]) for name in policy.cameras},
+        states={name: dims[name] for name in policy.states},
+        end_effector=end_effector,
+    )
+
+
+def read_prompt(request: Mapping[str, Any]) -> str:
+    """Return the instruction of a request.
+
+    Raises:
+        RequestError: there is none.
+    """
+    prompt = _required(request, PROMPT_WIRE_KEY, "the instruction, text")
+    if not isinstance(prompt, str) or not prompt.strip():
+        raise RequestError(f"'{PROMPT_WIRE_KEY}': expected the instruction, found {shown(prompt)}.")
+    return prompt
+
+
+def _read_image(request: Mapping[str, Any], camera: CameraImage) -> ImageArray:
+    expected = f"an image ({camera.height_px}, {camera.width_px}, 3), uint8"
+    image = _required(request, camera.key, expected)
+    shape = (camera.height_px, camera.width_px, 3)
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
+        raise RequestError(f"'{camera.key}': expected {expected}; found {_described(image)}.")
+    return image
+
+
+def _required(request: Mapping[str, Any], key: str, expected: str) -> Any:
+    if request.get(key) is None:
+        names: Sequence[str] = sorted(request)
+        raise RequestError(
+            f"the request has no '{key}': expected {expected}; found {some_of(names) or 'no keys'}."
+            f"{did_you_mean(key, names)}"
+        )
+    return request[key]
+
+
+def _described(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape}, {value.dtype}"
+    return shown(value)

@@ -1,0 +1,225 @@
+"""Sessions of a server: one episode each, with its slot, its row of a pass and its unread frames.
+
+Used by the thread that reads messages alone. Knows nothing of sockets, and nothing of when an inference runs.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal  # Any: what a client sends
+
+from vla_eval.core import EpisodeStart, Observation, ObservationWindow
+from vla_eval.serving.observations import PROMPT_WIRE_KEY, ObservationReader, RequestError, read_prompt
+from vla_eval.strict_json import shown
+
+MAX_UNREAD_FRAMES = 1024  # 100 MB of two cameras of 128 px
+MAX_SESSIONS = 4096
+MAX_TEXT = 200  # characters of an id
+MAX_NUMBER = 2**63 - 1
+UNKNOWN_HORIZON_STEPS = 1_000_000  # for a client that does not say how long its episode is
+
+
+@dataclass(slots=True, kw_only=True)
+class Session:
+    """One client's episode.
+
+    Attributes:
+        connection: number of the connection that it belongs to.
+        name: its id within the connection; None: the connection itself.
+        slot: where the policy keeps what it remembers of it.
+        row: its row of a pass.
+        episode: what was begun last; None before.
+        was_reset: whether it was begun by a `reset`.
+        frames: frames that the policy has not been given yet.
+        step: the step of the newest frame; None before the first.
+        n_pending: requests that have no reply yet.
+        used_at: time of its last message, by the clock of the table.
+    """
+
+    connection: int
+    name: str | None
+    slot: int
+    row: int
+    used_at: float
+    episode: EpisodeStart | None = None
+    was_reset: bool = False
+    frames: list[Observation] = field(default_factory=list)
+    step: int | None = None
+    n_pending: int = 0
+
+
+class SessionTable:
+    """All sessions of a server.
+
+    Args:
+        reader: reads the observations.
+        reads: whether the policy is given every frame or only the last one.
+        n_rows: rows of a pass.
+        task: the task of an episode whose client names none.
+        clock: seconds; not of a calendar.
+    """
+
+    def __init__(
+        self,
+        reader: ObservationReader,
+        *,
+        reads: Literal["last", "every"],
+        n_rows: int,
+        task: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._reader, self._reads, self._n_rows, self._task = reader, reads, n_rows, task
+        self._clock = clock
+        self._sessions: dict[tuple[int, str | None], Session] = {}
+        self._dropped: set[tuple[int, str | None]] = set()  # for being idle; until their next reset
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def session(self, connection: int, request: Mapping[str, Any]) -> Session:
+        """Return the session of a request; a new one for an id that is new.
+
+        Raises:
+            RequestError: the id is no text, there are too many, or it was dropped for being idle.
+        """
+        name = _text(request, "session_id")
+        key = (connection, name)
+        if key in self._dropped and request.get("endpoint") != "reset":
+            raise RequestError(
+                f"session {name!r} was dropped, since no message came for too long (--idle-seconds): the "
+                "policy has forgotten its episode. Begin a new one with 'reset'."
+            )
+        self._dropped.discard(key)
+        found = self._sessions.get(key)
+        if found is None:
+            if len(self._sessions) >= MAX_SESSIONS:
+                raise RequestError(f"expected at most {MAX_SESSIONS} sessions at a time.")
+            found = Session(
+                connection=connection,
+                name=name,
+                slot=self._free_slot(),
+                row=self._emptiest_row(),
+                used_at=self._clock(),
+            )
+            self._sessions[key] = found
+        found.used_at = self._clock()
+        return found
+
+    def begin(self, session: Session, request: Mapping[str, Any]) -> EpisodeStart:
+        """Begin an episode in a session; all that it had is forgotten.
+
+        Raises:
+            RequestError: no instruction, or a field of another type or out of range.
+        """
+        row = _number(request, "row", most=self._n_rows - 1)
+        session.row = session.row if row is None else row
+        start = EpisodeStart(
+            slot=session.slot,
+            task=_text(request, "task") or self._task,
+            seed=_number(request, "seed") or 0,
+            run=_number(request, "run") or 0,
+            instruction=read_prompt(request),
+            horizon_steps=_number(request, "horizon_steps") or UNKNOWN_HORIZON_STEPS,
+            row=session.row,
+        )
+        session.episode, session.frames, session.step = start, [], None
+        session.was_reset = request.get("endpoint") == "reset"
+        return start
+
+    def begins(self, session: Session, request: Mapping[str, Any]) -> bool:
+        """Whether an `infer` begins an episode without a `reset`: openpi's client knows none.
+
+        Its first request does, and each one with another instruction.
+
+        Raises:
+            RequestError: it belongs to an episode that this session does not have.
+        """
+        if session.episode is not None:
+            is_same = request.get(PROMPT_WIRE_KEY) in (None, session.episode.instruction)
+            if session.was_reset and not is_same:
+                raise RequestError("another instruction in the middle of an episode. Send 'reset' first.")
+            return not is_same
+        step = _number(request, "step")
+        if step:
+            raise RequestError(
+                f"step {step} of an episode that the server does not have: the session is new. Begin the "
+                "episode again, with 'reset'."
+            )
+        return True
+
+    def observe(self, session: Session, request: Mapping[str, Any]) -> None:
+        """Keep a frame for the next inference, if the policy is given every frame.
+
+        Raises:
+            RequestError: the frame does not fit, or too many are unread.
+        """
+        step = self._next_step(session, request)
+        if self._reads == "last":
+            return
+        if len(session.frames) >= MAX_UNREAD_FRAMES:
+            raise RequestError(f"expected at most {MAX_UNREAD_FRAMES} frames between two inferences.")
+        session.frames.append(self._reader.read(request, step=step))
+
+    def window(self, session: Session, request: Mapping[str, Any]) -> ObservationWindow:
+        """Return what the policy is given for an inference: the unread frames, and the one of the request.
+
+        Raises:
+            RequestError: the frame does not fit.
+        """
+        newest = self._reader.read(request, step=self._next_step(session, request))
+        frames, session.frames = (*session.frames, newest), []
+        return ObservationWindow(slot=session.slot, frames=frames)
+
+    def drop_connection(self, connection: int) -> list[int]:
+        """Drop the sessions of a connection that has ended; return their slots."""
+        self._dropped = {key for key in self._dropped if key[0] != connection}
+        return self._drop(key for key in list(self._sessions) if key[0] == connection)
+
+    def drop_idle(self, seconds: float) -> list[int]:
+        """Drop the sessions without a message for so long and without a request under way; return slots."""
+        now = self._clock()
+        idle = [
+            key
+            for key, session in self._sessions.items()
+            if not session.n_pending and now - session.used_at > seconds
+        ]
+        self._dropped.update(idle)
+        return self._drop(idle)
+
+    def _drop(self, keys: Iterable[tuple[int, str | None]]) -> list[int]:
+        return [self._sessions.pop(key).slot for key in keys]
+
+    def _next_step(self, session: Session, request: Mapping[str, Any]) -> int:
+        """Return the step of a frame: as the client says, or else the number of frames so far."""
+        given = _number(request, "step")
+        expected = 0 if session.step is None else session.step + 1
+        if given is not None and given < expected:
+            raise RequestError(f"step {given} after step {session.step}: frames of an episode come in order.")
+        session.step = expected if given is None else given
+        return session.step
+
+    def _free_slot(self) -> int:
+        taken = {session.slot for session in self._sessions.values()}
+        return next(slot for slot in range(MAX_SESSIONS) if slot not in taken)
+
+    def _emptiest_row(self) -> int:
+        taken = Counter(session.row for session in self._sessions.values())
+        return min(range(self._n_rows), key=lambda row: (taken[row], row))
+
+
+def _text(request: Mapping[str, Any], key: str) -> str | None:
+    value = request.get(key)
+    if value is not None and not (isinstance(value, str) and 0 < len(value) <= MAX_TEXT):
+        raise RequestError(f"'{key}': expected text of at most {MAX_TEXT} characters, found {shown(value)}.")
+    return value
+
+
+def _number(request: Mapping[str, Any], key: str, *, most: int = MAX_NUMBER) -> int | None:
+    value = request.get(key)
+    if value is None:
+        return None
+    number = value.item() if hasattr(value, "item") and getattr(value, "ndim", None) == 0 else value
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number <= most:
+        raise RequestError(f"'{key}': expected a number from 0 to {most}, found {shown(value)}.")
+    return number

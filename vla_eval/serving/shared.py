@@ -1,0 +1,210 @@
+"""Server processes of an evaluation, on the loopback address: one per GPU, ended with their parent.
+
+Each is guarded like a worker: however the parent ends, its servers end with it.
+"""
+
+import logging
+import os
+import re
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vla_eval.errors import VlaEvalError
+from vla_eval.serving.host import HostOptions, host_policy
+from vla_eval.serving.server import ServerOptions, run_server
+from vla_eval.storage.provenance import nvidia_driver_version
+from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.workers.framing import BrokenMessageError, send_message
+from vla_eval.workers.inside import SharedStage, detach
+from vla_eval.workers.messages import Failed, as_exception, describe_error
+from vla_eval.workers.process import CLOSE_SECONDS, WorkerProcess
+from vla_eval.workers.start import worker_context
+
+KEY_VARIABLE = "MIKASA_VLA_SHARED_KEY"
+"""Environment variable with the key of an evaluation's servers, for its workers."""
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
+LOOPBACK = "127.0.0.1"
+POLL_SECONDS = 0.05
+_GPU_DEVICE = re.compile(r"nvidia\d+")
+
+logger = logging.getLogger(__name__)
+
+
+class SharedServerError(VlaEvalError):
+    """A server of an evaluation could not be started."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServeJob:
+    """What a server process is given: policy, key, and the GPU that it may use."""
+
+    host: HostOptions
+    api_key: str
+    gpu: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerReady:
+    """Clients can connect."""
+
+    port: int
+    metadata: ServerMetadata
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """Return the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` names them; no torch is needed."""
+    if nvidia_driver_version() is None:
+        return ()
+    named = os.environ.get(VISIBLE_GPUS)
+    if named is not None:
+        return tuple(name.strip() for name in named.split(",") if name.strip() not in ("", "-1"))
+    n_devices = sum(_GPU_DEVICE.fullmatch(name) is not None for name in os.listdir("/dev"))
+    return tuple(str(index) for index in range(n_devices))
+
+
+class SharedServers:
+    """The servers of one policy; a context manager that leaves none behind.
+
+    Args:
+        options: the policy.
+        logs: folder for what the servers write.
+        start_seconds: how long a server may take until clients can connect.
+        preload: modules that servers need and that take long to import.
+        stops: asked while the servers start; true: give up.
+    """
+
+    def __init__(
+        self,
+        options: HostOptions,
+        *,
+        logs: Path,
+        start_seconds: float,
+        preload: Sequence[str] = (),
+        stops: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._options, self._start_seconds, self._stops = options, start_seconds, stops
+        self._key = secrets.token_urlsafe(32)
+        context = worker_context(preload=preload)
+        self._gpus: tuple[str | None, ...] = visible_gpus() or (None,)
+        self._processes = [
+            WorkerProcess(serve_main, context, index=index, log=logs / f"server-{index}.log")
+            for index in range(len(self._gpus))
+        ]
+        self._ready: list[ServerReady] = []
+
+    @property
+    def urls(self) -> str:
+        """The addresses, with commas."""
+        return ",".join(f"ws://{LOOPBACK}:{ready.port}" for ready in self._ready)
+
+    @property
+    def metadata(self) -> ServerMetadata:
+        """What the servers say of themselves."""
+        return self._ready[0].metadata
+
+    @property
+    def was_stopped(self) -> bool:
+        """Whether it was given up before all servers were ready."""
+        return len(self._ready) < len(self._processes)
+
+    def __enter__(self) -> Self:
+        """Start all servers and wait for them; workers that start now know the key.
+
+        Raises:
+            VlaEvalError: one of them cannot be started.
+        """
+        os.environ[KEY_VARIABLE] = self._key
+        try:
+            for process, gpu in zip(self._processes, self._gpus, strict=True):
+                process.give(ServeJob(host=self._options, api_key=self._key, gpu=gpu))
+            for process in self._processes:
+                ready = self._wait_for(process)
+                if ready is None:
+                    break
+                self._ready.append(ready)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """End all servers: gently after success, at once after an exception."""
+        if kind is None:
+            for process in self._processes:
+                process.ask_to_close()
+            deadline = time.monotonic() + CLOSE_SECONDS
+            for process in self._processes:
+                process.wait(max(0.0, deadline - time.monotonic()))
+        self._end()
+
+    def _end(self) -> None:
+        os.environ.pop(KEY_VARIABLE, None)
+        for process in self._processes:
+            process.ask_to_end()
+        for process in self._processes:
+            process.end()
+
+    def _wait_for(self, process: WorkerProcess) -> ServerReady | None:
+        """Return what a server says when it is ready; None if the caller stops."""
+        deadline = time.monotonic() + self._start_seconds
+        while not self._stops():
+            try:
+                messages = process.read()
+            except (EOFError, OSError, BrokenMessageError) as exc:
+                raise self._not_started(process, f"ended ({exc!r})") from exc
+            for message in messages:
+                if isinstance(message, ServerReady):
+                    return message
+                if isinstance(message, Failed):
+                    raise as_exception(message.error)
+            if process.start_error is not None:
+                raise self._not_started(process, f"could not be started: {process.start_error!r}")
+            if time.monotonic() > deadline:
+                raise self._not_started(
+                    process,
+                    f"was not ready after {self._start_seconds:g} s (timeouts.setup_seconds)",
+                )
+            time.sleep(POLL_SECONDS)
+        return None
+
+    def _not_started(self, process: WorkerProcess, what: str) -> SharedServerError:
+        return SharedServerError(
+            f"the server of policy '{self._options.policy}' {what}. Its output is in {process.log}. To infer "
+            f"in the workers instead: --set inference=in_process\n{process.tail() or ''}"
+        )
+
+
+def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
+    """Serve a policy for the parent until it closes the connection; the entry point of the process."""
+    detach(log)
+    logging.getLogger("vla_eval.serving").setLevel(logging.INFO)
+    job: ServeJob = connection.recv()
+    if job.gpu is not None:
+        os.environ[VISIBLE_GPUS] = job.gpu  # before torch looks for GPUs
+    try:
+        hosted = host_policy(job.host)
+        run_server(
+            hosted,
+            ServerOptions(host=LOOPBACK, port=0, api_key=job.api_key),
+            ready=lambda port: send_message(connection, ServerReady(port=port, metadata=hosted.metadata)),
+            ends=lambda: _wait_for_parent(connection),
+        )
+    except BaseException as exc:  # also SystemExit: a policy must not end the server unseen
+        logger.exception("the server ends")
+        send_message(connection, Failed(error=describe_error(exc, "setup"), refused=False))
+
+
+def _wait_for_parent(connection: Connection) -> None:
+    """Return when the parent asks the server to end, or is gone."""
+    try:
+        connection.recv()
+    except (EOFError, OSError):
+        logger.info("the parent is gone")
