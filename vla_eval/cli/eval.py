@@ -73,6 +73,11 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
     )
+    parser.add_argument(
+        "--serve",
+        action="store_true",
+        help="load each model once, in a server that all workers share (inference: shared)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
     add_overrides(parser, help="change any field of the configuration")
     parser.add_argument(
@@ -169,6 +174,8 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             value = getattr(args, name)
             if value is not None:
                 data[name] = value
+        if args.serve:
+            data["inference"] = "shared"
         for kind in ("video", "rrd"):
             which = getattr(args, f"capture_{kind}")
             if which is not None:

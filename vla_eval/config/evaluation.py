@@ -8,6 +8,7 @@ from vla_eval.bounds import (
     MAX_EPISODES,
     MAX_PROCESSES,
     MAX_SECONDS,
+    MAX_SERVER_ROWS,
     MAX_SLOTS,
     MAX_STEPS,
     check_bounds,
@@ -61,6 +62,8 @@ class EvalConfig:
     reset_policy_at_step: int | None = None
     eager_rendering: bool = False
     slots_per_worker: int = 1
+    inference: Literal["auto", "in_process", "shared"] = "auto"
+    inference_max_batch: int = 8
     workers: int | Literal["auto"] = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: int = 10
@@ -74,6 +77,7 @@ class EvalConfig:
                 "episodes": (1, MAX_EPISODES),
                 "runs": (1, MAX_EPISODES),
                 "slots_per_worker": (1, MAX_SLOTS),
+                "inference_max_batch": (1, MAX_SERVER_ROWS),
                 "max_consecutive_errors": (1, MAX_EPISODES),
                 "workers": (1, MAX_PROCESSES),
                 "reset_policy_at_step": (1, MAX_STEPS),

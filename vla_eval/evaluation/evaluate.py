@@ -6,7 +6,7 @@ means, the same call resumes where it stopped.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -14,6 +14,7 @@ from typing import Protocol
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
+from vla_eval.evaluation.phases import phases, with_servers
 from vla_eval.evaluation.plan import (
     EpisodeJob,
     GroupKey,
@@ -25,7 +26,8 @@ from vla_eval.evaluation.plan import (
 )
 from vla_eval.evaluation.worker import Finished, worker_main
 from vla_eval.policies.registry import own_modules
-from vla_eval.records import EpisodeError, EpisodeRecord
+from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder
 from vla_eval.viz.capture import EpisodeCapture
@@ -124,7 +126,7 @@ def evaluate(
         n_workers = worker_count(config, plan, n_jobs=queue.n_batches)
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
         bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
-        was_stopped = bool(n_open) and _run(queue, bookkeeper, n_workers, _modules(config, plan))
+        was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished)
     return EvaluationSummary(
         out=path,
         n_episodes=len(plan.jobs),
@@ -162,14 +164,31 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
 def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
     """Return the slow imports of workers, except other packages' code, which may not work after a fork."""
     adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
+    if plan.shared:
+        adapters[REMOTE_ADAPTER] = None
     return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
+
+
+def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
+    """Run the episodes that have no result; return whether the observer stopped it."""
+    logs, config = bookkeeper.path / "logs", bookkeeper.config
+    logs.mkdir(exist_ok=True)
+    for phase in phases(plan):
+        if not JobQueue(phase.jobs, finished=finished).n_episodes:
+            continue
+        with with_servers(phase, config, plan, logs=logs, stops=bookkeeper.observer.on_tick) as jobs:
+            if jobs is None:
+                return True
+            queue = bookkeeper.queue = JobQueue(jobs, finished=finished)
+            n_workers = worker_count(config, plan, n_jobs=queue.n_batches)
+            if _run(queue, bookkeeper, n_workers, _modules(config, plan)):
+                return True
+    return False
 
 
 def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Sequence[str]) -> bool:
     """Run the queue's episodes; return whether the observer stopped it."""
-    logs = bookkeeper.path / "logs"
-    logs.mkdir(exist_ok=True)
-    config = bookkeeper.config
+    logs, config = bookkeeper.path / "logs", bookkeeper.config
     new_pool = WorkerPool[EpisodeBatch, Finished]
     main: WorkerMain = worker_main
     if config.capture.is_on:

@@ -15,6 +15,12 @@ from vla_eval.config.files import Recipe, digest_of, to_data
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.errors import RecipeError
+from vla_eval.evaluation.inference_choice import (
+    INFERENCE_FIELDS,
+    chosen_inference,
+    has_weights,
+    inference_fields,
+)
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
 from vla_eval.policies.recipe import bare_policy, load_policy_recipe
 from vla_eval.policies.registry import check_adapter
@@ -96,8 +102,10 @@ class Plan:
         servers: policy behind a socket -> what its server says of itself.
         task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
+        shared: policy whose inference is shared by all workers -> what the configuration calls it.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
-        max_workers: the most workers that `workers: auto` may start; None: no limit.
+        max_workers: the most workers that `workers: auto` may start, since each loads the policies that are
+            not shared; None: no limit.
     """
 
     jobs: tuple[EpisodeJob, ...]
@@ -106,6 +114,7 @@ class Plan:
     servers: Mapping[str, Mapping[str, Any]]  # Any: plain data
     task_versions: Mapping[str, int]
     policy_names: tuple[str, ...]
+    shared: Mapping[str, str]
     left_out: tuple[str, ...]
     max_workers: int | None
 
@@ -133,6 +142,7 @@ def make_plan(config: EvalConfig) -> Plan:
         for policy in policies
         if policy.value.adapter == REMOTE_ADAPTER
     }
+    shared = _shared(config, policies)
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
@@ -143,11 +153,16 @@ def make_plan(config: EvalConfig) -> Plan:
             if policy.value.needs_candidates and task.candidates is None:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
-            groups.extend(_groups(config, task, policy, instruction, servers.get(policy.name)))
+            n_rows = config.inference_max_batch if policy.name in shared else config.slots_per_worker
+            groups.extend(_groups(config, task, policy, instruction, servers.get(policy.name), n_rows=n_rows))
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, n_groups=len(groups))
-    limits = [policy.value.max_workers for policy in policies if policy.value.max_workers is not None]
+    limits = [
+        policy.value.max_workers
+        for policy in policies
+        if policy.value.max_workers is not None and policy.name not in shared
+    ]
     return Plan(
         jobs=tuple(
             EpisodeJob(
@@ -170,9 +185,18 @@ def make_plan(config: EvalConfig) -> Plan:
         servers={name: server.identity() for name, server in servers.items()},
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
+        shared=shared,
         left_out=tuple(left_out),
         max_workers=min(limits, default=None),
     )
+
+
+def _shared(config: EvalConfig, policies: Sequence[Recipe[PolicyRecipe]]) -> dict[str, str]:
+    """Return the policies whose inference is shared, see `Plan.shared`."""
+    if chosen_inference(config) == "in_process":
+        return {}
+    named = zip(config.policies, policies, strict=True)
+    return {policy.name: name for name, policy in named if has_weights(policy.value)}
 
 
 def _recipe_hashes(
@@ -197,6 +221,8 @@ def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     # So that runs of versions without these fields can be resumed.
     if config.slots_per_worker == 1:
         del data["slots_per_worker"]
+    data = {name: value for name, value in data.items() if name not in INFERENCE_FIELDS}
+    data |= inference_fields(config)
     data["policies"] = [bare_policy(name) for name in data["policies"]]
     if config.reset_policy_at_step is None:
         del data["reset_policy_at_step"]
@@ -244,8 +270,10 @@ def _groups(
     policy: Recipe[PolicyRecipe],
     instruction: str,
     server: ServerMetadata | None,
+    *,
+    n_rows: int,
 ) -> Iterable[EpisodeGroup]:
-    args, n_rows = policy.value.args, config.slots_per_worker
+    args = policy.value.args
     if server is not None:
         args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
         n_rows = server.batch_max or n_rows

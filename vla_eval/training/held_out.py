@@ -114,6 +114,7 @@ class HeldOut:
             env=settings.env,
             simulator=settings.simulator,
             slots_per_worker=settings.slots_per_worker,
+            inference="in_process",  # results of one training have to be comparable on any machine
             workers=settings.workers,
         )
 

@@ -1,0 +1,106 @@
+"""The parts of a run: episodes whose policy is in the workers, then one shared policy after another.
+
+A shared policy's servers start before its first episode and end after its last. Its workers have the adapter
+`remote` and the servers' addresses; records do not show the difference.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import digest_of
+from vla_eval.errors import RunChangedError
+from vla_eval.evaluation.plan import EpisodeJob, Plan
+from vla_eval.policies.registry import own_modules
+from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.serving.host import HostOptions
+from vla_eval.serving.shared import KEY_VARIABLE, SharedServers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phase:
+    """Episodes that are run before the next ones begin.
+
+    Attributes:
+        jobs: the episodes, as planned.
+        policy: the shared policy; None: policies that are in the workers.
+    """
+
+    jobs: tuple[EpisodeJob, ...]
+    policy: str | None
+
+
+def phases(plan: Plan) -> Iterator[Phase]:
+    """Return the parts of a run that have episodes, in order."""
+    in_workers = tuple(job for job in plan.jobs if job.group.key.policy not in plan.shared)
+    if in_workers:
+        yield Phase(jobs=in_workers, policy=None)
+    for policy in plan.shared:
+        jobs = tuple(job for job in plan.jobs if job.group.key.policy == policy)
+        if jobs:
+            yield Phase(jobs=jobs, policy=policy)
+
+
+@contextlib.contextmanager
+def with_servers(
+    phase: Phase,
+    config: EvalConfig,
+    plan: Plan,
+    *,
+    logs: Path,
+    stops: Callable[[], bool],
+) -> Iterator[Sequence[EpisodeJob] | None]:
+    """Give the episodes of a phase as workers get them; of a shared policy, while its servers are there.
+
+    Args:
+        phase: the episodes.
+        config: what is evaluated.
+        plan: what the servers' policies are called in the configuration.
+        logs: folder for what the servers write.
+        stops: asked while servers start; true: give up, and give None.
+
+    Raises:
+        VlaEvalError: a server cannot be started.
+        RunChangedError: the policy is not what it was when the run was planned.
+    """
+    if phase.policy is None:
+        yield phase.jobs
+        return
+    options = HostOptions(policy=plan.shared[phase.policy], max_batch=config.inference_max_batch)
+    adapters = [job.group.adapter for job in phase.jobs[:1]]
+    with SharedServers(
+        options,
+        logs=logs,
+        start_seconds=config.timeouts.setup_seconds,
+        preload=own_modules(adapters),
+        stops=stops,
+    ) as servers:
+        if servers.was_stopped:
+            yield None
+            return
+        _check_same(phase.policy, plan, servers)
+        yield [_remote(job, servers, config) for job in phase.jobs]
+
+
+def _check_same(policy: str, plan: Plan, servers: SharedServers) -> None:
+    planned, found = plan.recipe_hashes[f"policies/{policy}"], servers.metadata.recipe_sha256
+    if planned != found:
+        raise RunChangedError(
+            f"policy '{policy}': its recipe or checkpoint changed while the run was starting (expected the "
+            f"digest {planned:.12}…, found {found or 'none':.12}…). Start the run again."
+        )
+
+
+def _remote(job: EpisodeJob, servers: SharedServers, config: EvalConfig) -> EpisodeJob:
+    n_rows = servers.metadata.batch_max or 1
+    args = {
+        "url": servers.urls,
+        "identity_sha256": digest_of(servers.metadata.identity()),
+        "api_key_env": KEY_VARIABLE,
+        "timeout_seconds": config.timeouts.inference_seconds,
+        "connect_seconds": 0.0,
+    }
+    group = replace(job.group, adapter=REMOTE_ADAPTER, args=args, n_rows=n_rows)
+    return replace(job, group=group, row=job.row % n_rows)
