@@ -4,6 +4,8 @@ The markup is in `templates/`. Whatever a template is given is escaped, unless i
 `svg.py` and the JSON report.
 """
 
+import base64
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,12 +15,16 @@ from markupsafe import Markup
 from vla_eval import __version__
 from vla_eval.errors import ReportError
 from vla_eval.page import choice_sections, machine_sections, rates
+from vla_eval.page.episode_list import episode_list
 from vla_eval.page.material import Material, gather
 from vla_eval.results.table_formats import render
+from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun
 
 PAGE_FILE = "index.html"
 TEMPLATE = "page.html.j2"
+SCRIPT = "episodes.js"
+N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
 def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str:
@@ -34,28 +40,31 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
     """
     material = gather(runs, baseline=baseline)
     chunks = rates.chunk_plots(material)
-    return (
-        _templates()
-        .get_template(TEMPLATE)
-        .render(
-            title="Evaluation: " + ", ".join(dict.fromkeys(run.description.name for run in material.runs)),
-            summary=_summary(material),
-            version=__version__,
-            material=material,
-            results=rates.results(material),
-            success=rates.success_plots(material),
-            chunks=chunks,
-            sweep=rates.chunk_sweep(material) if chunks.charts else None,
-            paired=rates.paired_table(material),
-            steps=rates.steps_plots(material),
-            choices=choice_sections.choices(material),
-            latency=machine_sections.latency(material),
-            errors=machine_sections.errors_table(material),
-            videos=machine_sections.videos(material),
-            reproductions=[machine_sections.reproduction(run) for run in material.runs],
-            # `<` is escaped as JSON does it, so that no text in it can end the element.
-            report=Markup(render(material.table, "json").replace("<", "\\u003c")),
-        )
+    templates = _templates()
+    script = templates.get_template(SCRIPT).render()
+    return templates.get_template(TEMPLATE).render(
+        title="Evaluation: " + ", ".join(dict.fromkeys(run.description.name for run in material.runs)),
+        summary=_summary(material),
+        version=__version__,
+        material=material,
+        verdicts=verdicts(material.table),
+        episodes=episode_list(material),
+        script=Markup(script),
+        script_hash=_script_hash(script),
+        n_open_matrices=N_OPEN_MATRICES,
+        results=rates.results(material),
+        success=rates.success_plots(material),
+        chunks=chunks,
+        sweep=rates.chunk_sweep(material) if chunks.charts else None,
+        paired=rates.paired_table(material),
+        steps=rates.steps_plots(material),
+        choices=choice_sections.choices(material),
+        latency=machine_sections.latency(material),
+        errors=machine_sections.errors_table(material),
+        videos=machine_sections.videos(material),
+        reproductions=[machine_sections.reproduction(run) for run in material.runs],
+        # `<` is escaped as JSON does it, so that no text in it can end the element.
+        report=Markup(render(material.table, "json").replace("<", "\\u003c")),
     )
 
 
@@ -79,6 +88,12 @@ def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None 
     except OSError as exc:
         raise ReportError(f"{path}: cannot be written ({exc.strerror or exc}). Name another --html.") from exc
     return path
+
+
+def _script_hash(script: str) -> str:
+    """Return what the page's policy allows to run: this script and no other."""
+    digest = hashlib.sha256(script.encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode()}"
 
 
 def _templates() -> Environment:

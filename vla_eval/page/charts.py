@@ -5,7 +5,7 @@ This module imports matplotlib, so only code that builds a page imports it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -25,8 +25,10 @@ REFERENCES: Mapping[str, tuple[str, tuple[float, ...]]] = MappingProxyType(
 RATE_TICKS = (0, 0.25, 0.5, 0.75, 1)
 PX = 1 / 72  # inches, as matplotlib counts
 ROW_HEIGHT_PX = 24
-FOREST_WIDTH_PX = 320  # with its labels it is still legible on a phone
+FOREST_WIDTH_PX = 760  # with its labels as wide as the page
+NARROW_FOREST_WIDTH_PX = 180  # with its labels it is legible on a phone
 CURVES_SIZE_PX = (320, 180)
+DODGE = 0.014  # of the axis: points of several series at one x are beside each other
 SIGN_SIZE_PX = (26, 16)
 
 LineKind = Literal["solid", "chance", "ceiling"]
@@ -74,10 +76,11 @@ class Bar:
 
 
 class Chart(NamedTuple):
-    """A drawing and its title, which is not part of it."""
+    """A drawing and its title, which is not part of it; `narrow` is the drawing for a narrow screen."""
 
     title: str
     svg: Markup
+    narrow: Markup | None = None
 
 
 def forest(bars: Sequence[Bar], *, title: str, description: str) -> Chart:
@@ -88,28 +91,35 @@ def forest(bars: Sequence[Bar], *, title: str, description: str) -> Chart:
         title: of the plot.
         description: what it shows, for screen readers.
     """
-    labels = [_printable(bar.label) for bar in bars]
+    label = f"{title}. {description}"
     with own_style():
-        left = 16 + max(text_width_px(label) for label in labels)
-        figure, axes = _plot(
-            FOREST_WIDTH_PX, ROW_HEIGHT_PX * len(bars), left=left, right=20, top=4, bottom=26
+        return Chart(
+            title,
+            inline_svg(_forest(bars, FOREST_WIDTH_PX), label=label, css_class="wide"),
+            inline_svg(_forest(bars, NARROW_FOREST_WIDTH_PX), label=label, css_class="narrow"),
         )
-        axes.set(xlim=(0, 1), ylim=(len(bars) - 0.5, -0.5))
-        axes.set_xticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
-        axes.set_yticks(range(len(bars)), labels)
-        axes.tick_params(axis="y", pad=10)  # room for a marker at 0
-        axes.grid(visible=False, axis="y")
-        for y, bar in enumerate(bars):
-            for name, rate in (("chance", bar.chance), ("ceiling", bar.ceiling)):
-                if rate is not None:
-                    _reference(axes, name, [rate, rate], [y - 0.4, y + 0.4])
-            if bar.value is None:
-                axes.text(0.015, y, "no result", va="center_baseline")
-            else:
-                if bar.low is not None and bar.high is not None:
-                    axes.plot([bar.low, bar.high], [y, y], color=_color(bar.color), gid="whisker")
-                _marker(axes, bar.color, bar.value, y)
-        return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
+
+
+def _forest(bars: Sequence[Bar], width_px: float) -> Figure:
+    labels = [_printable(bar.label) for bar in bars]
+    left = 16 + max(text_width_px(label) for label in labels)
+    figure, axes = _plot(width_px, ROW_HEIGHT_PX * len(bars), left=left, right=20, top=4, bottom=26)
+    axes.set(xlim=(0, 1), ylim=(len(bars) - 0.5, -0.5))
+    axes.set_xticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
+    axes.set_yticks(range(len(bars)), labels)
+    axes.tick_params(axis="y", pad=10)  # room for a marker at 0
+    axes.grid(visible=False, axis="y")
+    for y, bar in enumerate(bars):
+        for name, rate in (("chance", bar.chance), ("ceiling", bar.ceiling)):
+            if rate is not None:
+                _reference(axes, name, [rate, rate], [y - 0.4, y + 0.4])
+        if bar.value is None:
+            axes.text(0.015, y, "no result", va="center_baseline")
+        else:
+            if bar.low is not None and bar.high is not None:
+                axes.plot([bar.low, bar.high], [y, y], color=_color(bar.color), gid="whisker")
+            _marker(axes, bar.color, bar.value, y)
+    return figure
 
 
 def curves(
@@ -131,9 +141,21 @@ def curves(
         axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks])
         axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
         axes.grid(visible=False, axis="x")
-        for one in sorted(series, key=lambda each: each.kind == "solid"):  # lines of reference behind
+        for one in _dodged(series, (x_ticks[-1] - x_ticks[0]) * DODGE):
             _draw_series(axes, one)
         return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
+
+
+def _dodged(series: Sequence[Series], distance: float) -> list[Series]:
+    """Return lines of reference first, which are behind, and points moved apart where series share an x."""
+    references = [one for one in series if one.kind != "solid"]
+    solid = [one for one in series if one.kind == "solid"]
+    moved = []
+    for i, one in enumerate(solid):
+        shift = 0.0 if one.is_step else (i - (len(solid) - 1) / 2) * distance
+        points = tuple(point._replace(x=point.x + shift) for point in one.points)
+        moved.append(replace(one, points=points))
+    return [*references, *moved]
 
 
 def sign(color: int, *, is_line: bool) -> Markup:

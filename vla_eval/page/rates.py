@@ -26,7 +26,7 @@ from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of
 
-N_STEP_TICKS = 5
+MAX_STEP_TICKS = 7
 
 
 class Sign(NamedTuple):
@@ -180,10 +180,11 @@ def steps_plots(material: Material) -> Plots:
             for row in material.rows_of(task)
             if (row.n_action_steps, row.variant) == (size, variant) and row.n_episodes
         ]
-        series = [_cumulative(material, row) for row in rows]
-        horizon = max((point.x for one in series for point in one.points), default=0)
+        # With `stop_at_success` only failures last until the horizon.
+        horizon = max((r.n_steps or 0 for row in rows for r in material.group_of(row).results), default=0)
         if not horizon:
             continue
+        series = [_cumulative(material, row, horizon) for row in rows]
         colors |= {row.policy: material.colors[row.policy] for row in rows}
         means = "; ".join(f"{material.name_of(row)}: {_steps(row)}" for row in rows)
         charts.append(
@@ -192,7 +193,7 @@ def steps_plots(material: Material) -> Plots:
                 title=f"{task}, K={size}" + (f", {variant}" if variant else ""),
                 description=f"Mean steps until success: {means}",
                 x_title="control step",
-                x_ticks=[round(horizon * i / (N_STEP_TICKS - 1)) for i in range(N_STEP_TICKS)],
+                x_ticks=_round_ticks(horizon),
             )
         )
     return Plots(legend=_signs(colors, is_line=True), charts=tuple(charts))
@@ -237,12 +238,22 @@ def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
     return series
 
 
-def _cumulative(material: Material, row: Row) -> Series:
+def _round_ticks(end: int) -> list[int]:
+    """Return 0 and multiples of 1, 2 or 5 times a power of ten, the last at or beyond the end."""
+    step = next(
+        size * 10**power
+        for power in range(9)
+        for size in (1, 2, 5)
+        if -(-end // (size * 10**power)) < MAX_STEP_TICKS
+    )
+    return list(range(0, end + step, step))
+
+
+def _cumulative(material: Material, row: Row, horizon: int) -> Series:
     results = material.group_of(row).results
     steps = sorted(record.success_step for record in results if record.success_step is not None)
-    end = max((record.n_steps or 0 for record in results), default=0)
     points = [Point(0, 0.0), *(Point(step, (i + 1) / len(results)) for i, step in enumerate(steps))]
-    points.append(Point(end, points[-1].y))
+    points.append(Point(horizon, points[-1].y))
     return Series(name=row.policy, color=material.colors[row.policy], points=tuple(points), is_step=True)
 
 

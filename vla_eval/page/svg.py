@@ -77,12 +77,13 @@ def text_width_px(text: str) -> float:
         return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
 
 
-def inline_svg(figure: Figure, *, label: str | None) -> Markup:
+def inline_svg(figure: Figure, *, label: str | None, css_class: str | None = None) -> Markup:
     """Return a figure as an `svg` element; call it within `own_style`.
 
     Args:
         figure: its colors are of `PALETTE`; nothing in it reaches beyond its axes.
         label: what it shows, for screen readers; None for a decoration.
+        css_class: of the element.
     """
     file = io.StringIO()
     with _missing_glyphs_allowed():
@@ -92,7 +93,8 @@ def inline_svg(figure: Figure, *, label: str | None) -> Markup:
     width, height = (round(inches * 72) for inches in figure.get_size_inches())
     size = {"viewBox": f"0 0 {width} {height}", "width": str(width), "height": str(height)}
     role = {"aria-hidden": "true"} if label is None else {"role": "img", "aria-label": label}
-    inline = ElementTree.Element("svg", {**size, **role})
+    named = {} if css_class is None else {"class": css_class}
+    inline = ElementTree.Element("svg", {**size, **role, **named})
     inline.extend(_parts(drawn, shapes))
     return Markup(ElementTree.tostring(inline, encoding="unicode"))
 

@@ -1,0 +1,87 @@
+"""The data of the page's list of episodes, as numbers; the browser draws the rows that are shown."""
+
+import json
+from typing import NamedTuple
+
+from markupsafe import Markup
+
+from vla_eval.page.material import Material, key_of
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.capture_files import video_file
+from vla_eval.tasks.item_names import item_names
+
+OUTCOMES = ("success", "failure", "error")
+FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video")
+
+
+class EpisodeList(NamedTuple):
+    """The number of episodes, and their data as JSON for a `script` element."""
+
+    n_episodes: int
+    data: Markup
+
+
+def episode_list(material: Material) -> EpisodeList:
+    """Return all episodes of the table's rows.
+
+    Each is a list in the order of `FIELDS`; what is undefined is null. Texts are numbers into lists of texts,
+    so that 30,000 episodes fit into a file of a few megabytes.
+    """
+    videos = _videos(material)
+    errors: dict[str, int] = {}
+    episodes = []
+    rows = []
+    for number, row in enumerate(material.table.rows):
+        group = material.grouping.groups[key_of(row)]
+        n_candidates = max((record.n_candidates or 0 for record in group.results), default=0)
+        rows.append(
+            {
+                "task": row.task,
+                "policy": row.policy,
+                "k": row.n_action_steps,
+                "variant": row.variant,
+                "items": item_names(row.task, n_candidates) if n_candidates else [],
+            }
+        )
+        for run in group.runs:
+            for record in run.records.values():
+                error = None
+                if record.error is not None:
+                    error = errors.setdefault(
+                        f"{record.error.kind}: {record.error.message[:200]}", len(errors)
+                    )
+                episodes.append(_episode(number, record, error, videos.get(id(record))))
+    data = {
+        "fields": FIELDS,
+        "outcomes": OUTCOMES,
+        "rows": rows,
+        "errors": list(errors),
+        "episodes": episodes,
+    }
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    # `<` is escaped as JSON does it, so that no text in it can end the element.
+    return EpisodeList(len(episodes), Markup(text.replace("<", "\\u003c")))
+
+
+def _episode(row: int, record: EpisodeRecord, error: int | None, video: str | None) -> list[object]:
+    return [
+        row,
+        record.run,
+        record.seed,
+        OUTCOMES.index(record.outcome),
+        record.success_step,
+        record.target,
+        record.first_choice,
+        error,
+        video,
+    ]
+
+
+def _videos(material: Material) -> dict[int, str]:
+    """Return the path of the video of each record that has one."""
+    return {
+        id(record): str(path)
+        for run in material.runs
+        for record in run.records
+        if (path := video_file(run.path, record)).is_file()
+    }
