@@ -12,10 +12,8 @@ Only the parent process writes here, but for shards and datasets. Knows nothing 
 
 import dataclasses
 import json
-import logging
 import shutil
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -23,6 +21,7 @@ from typing import Self
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.errors import DatasetError, RunFolderError
+from vla_eval.storage.continuing import continued, without_device
 from vla_eval.storage.durable import LineFile, sync_folder
 from vla_eval.storage.episodes_file import cut_tail, read_lines
 from vla_eval.storage.run_file import (
@@ -31,14 +30,11 @@ from vla_eval.storage.run_file import (
     JsonValue,
     RunDescription,
     RunFile,
-    Session,
     environment_changed,
     find_changes,
 )
 from vla_eval.storage.starting import StartedFolder, starting
 from vla_eval.strict_json import Source, as_dataclass, read_json
-
-logger = logging.getLogger(__name__)
 
 STATE_FOLDER = "recording"
 LOCK_FILE = "recording.lock"
@@ -79,7 +75,9 @@ class RecordingFolder:
         with starting(
             state, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a recording", make=make
         ) as started:
-            run_file = _continued(state, description, allow_environment_change)
+            run_file = continued(
+                state, description, shown=out, allow_environment_change=allow_environment_change
+            )
             run_file.save(state)
             sync_folder(out)
         return cls(out, started, run_file)
@@ -102,8 +100,7 @@ class RecordingFolder:
     @property
     def environment(self) -> Mapping[str, JsonValue]:
         """The environment that the recording was started in, without the device."""
-        environment = self._run_file.description.environment
-        return {name: value for name, value in environment.items() if name != DEVICE}
+        return without_device(self._run_file.description.environment)
 
     @property
     def device(self) -> dict[str, str]:
@@ -172,27 +169,6 @@ class RecordingFolder:
 
     def _task_folder(self, task: str) -> Path:
         return _made(self.out / STATE_FOLDER / task)
-
-
-def _continued(state: Path, description: RunDescription, allow_environment_change: bool) -> RunFile:
-    """Return what run.json must hold from now on."""
-    session = Session(
-        started_at=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=description.command,
-        options=description.options,
-    )
-    try:
-        known = RunFile.load(state)
-    except FileNotFoundError:
-        return RunFile(description=description, sessions=(session,))
-    known.check_unchanged(description, state.parent)
-    before = {name: value for name, value in known.description.environment.items() if name != DEVICE}
-    changes = find_changes(before, description.environment, prefix="environment")
-    if changes and not allow_environment_change:
-        raise environment_changed(changes, state.parent)
-    for change in changes:
-        logger.warning("%s: the environment has changed: %s", state.parent, change)
-    return known.with_session(dataclasses.replace(session, environment_changes=changes))
 
 
 def _refuse_foreign(out: Path) -> None:

@@ -11,14 +11,14 @@ Knows nothing of tasks, policies or statistics.
 import json
 import logging
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.storage.continuing import check_allowed, continued
 from vla_eval.storage.durable import LineFile, sync_folder
 from vla_eval.storage.episodes_file import (
     cut_tail,
@@ -31,12 +31,10 @@ from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, mak
 from vla_eval.storage.run_file import (
     DEVICE,
     RUN_FILE,
-    Change,
     JsonValue,
     RunDescription,
     RunFile,
     Session,
-    environment_changed,
     find_changes,
 )
 from vla_eval.storage.starting import StartedFolder, starting
@@ -204,25 +202,14 @@ class RunFolder:
 
     def _load(self, description: RunDescription) -> RunFile:
         """Return what run.json must hold from now on."""
-        session = Session(
-            started_at=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=description.command,
-            options=description.options,
+        run_file = continued(
+            self.path,
+            description,
+            shown=self.path,
+            allow_environment_change=self._allow_environment_change,
         )
-        try:
-            known = RunFile.load(self.path)
-        except FileNotFoundError:
-            return RunFile(description=description, sessions=(session,))
-        known.check_unchanged(description, self.path)
-        changes = find_changes(
-            _without_device(known.description.environment),
-            _without_device(description.environment),
-            prefix="environment",
-        )
-        self._check_allowed(changes)
-        updated = known.with_session(replace(session, environment_changes=changes))
         device = description.environment.get(DEVICE)
-        return self._with_device(updated, device) if isinstance(device, Mapping) else updated
+        return self._with_device(run_file, device) if isinstance(device, Mapping) else run_file
 
     def _with_device(self, run_file: RunFile, device: Mapping[str, JsonValue]) -> RunFile:
         recorded = run_file.description.environment.get(DEVICE)
@@ -231,16 +218,10 @@ class RunFolder:
         again = {name: device[name] for name in device if name in recorded}
         before = {name: recorded[name] for name in again}
         changes = find_changes(before, again, prefix=f"environment.{DEVICE}")
-        self._check_allowed(changes)
+        check_allowed(changes, shown=self.path, allowed=self._allow_environment_change)
         if not changes and again.keys() == device.keys():
             return run_file
         return run_file.with_device({**device, **recorded}, changes)
-
-    def _check_allowed(self, changes: tuple[Change, ...]) -> None:
-        if changes and not self._allow_environment_change:
-            raise environment_changed(changes, self.path)
-        for change in changes:
-            logger.warning("%s: the environment has changed: %s", self.path, change)
 
 
 def read_run(path: Path) -> StoredRun:
@@ -265,7 +246,3 @@ def read_run(path: Path) -> StoredRun:
         records=tuple(records.values()),
         sessions=run_file.sessions,
     )
-
-
-def _without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    return {name: value for name, value in environment.items() if name != DEVICE}
