@@ -6,7 +6,7 @@ from typing import Any, Literal
 from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import TimeoutConfig
-from vla_eval.config.files import check_run_name, digest_of, to_data
+from vla_eval.config.files import check_run_name, content_of, digest_of
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings, StateKind
 
@@ -83,18 +83,6 @@ OPTION_FIELDS = ("name", "description", "workers", "timeouts")
 """Fields of `DatasetRecipe` that content does not depend on: they may differ when a recording is resumed."""
 
 
-def content_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data
-    """Return the part of a recipe that the dataset's content depends on."""
-    data: dict[str, Any] = to_data(recipe)
-    return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
-
-
-def options_of(recipe: DatasetRecipe) -> dict[str, Any]:  # Any: plain data
-    """Return the part of a recipe that the dataset's content does not depend on."""
-    data: dict[str, Any] = to_data(recipe)
-    return {name: data[name] for name in OPTION_FIELDS}
-
-
 def fingerprint(recipe: DatasetRecipe) -> str:
     """Return the sha256 of the part of a recipe that the dataset's content depends on."""
-    return digest_of(content_of(recipe))
+    return digest_of(content_of(recipe, options=OPTION_FIELDS))

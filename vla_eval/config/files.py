@@ -177,6 +177,18 @@ def to_data(value: Any) -> Any:  # Any: plain data of whatever the recipe holds
     return value
 
 
+def content_of(value: Any, *, options: Sequence[str]) -> dict[str, Any]:  # Any: a recipe, its plain data
+    """Return the fields of a recipe as plain data without its options, on which no content depends."""
+    data: dict[str, Any] = to_data(value)
+    return {name: item for name, item in data.items() if name not in options}
+
+
+def options_of(value: Any, *, options: Sequence[str]) -> dict[str, Any]:  # Any: a recipe, its plain data
+    """Return the options of a recipe as plain data."""
+    data: dict[str, Any] = to_data(value)
+    return {name: data[name] for name in options}
+
+
 def digest_of(data: Any) -> str:  # Any: plain data
     """Return the sha256 of plain data, written as ASCII JSON with sorted keys."""
     return hashlib.sha256(json.dumps(data, sort_keys=True, ensure_ascii=True).encode()).hexdigest()

@@ -14,7 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, Protocol
 
-from vla_eval.config.dataset import DatasetRecipe, content_of, fingerprint, options_of
+from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
+from vla_eval.config.files import content_of, options_of
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
@@ -167,10 +168,10 @@ def run_plan(
     versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
         name=recipe.name,
-        config={**content_of(recipe), "task_versions": versions, "source": source},
+        config={**content_of(recipe, options=OPTION_FIELDS), "task_versions": versions, "source": source},
         recipes=plan.recipe_files,
         environment=collect_environment(),
-        options=options_of(recipe),
+        options=options_of(recipe, options=OPTION_FIELDS),
         command=command,
     )
     datasets: list[RecordedDataset] = []
@@ -325,7 +326,7 @@ class _Recorder:
             n_episodes=0,
             n_frames=0,
             n_failed_seeds=n_failed_seeds,
-            recipe=content_of(task.recipe),
+            recipe=content_of(task.recipe, options=OPTION_FIELDS),
             recipe_sha256=fingerprint(task.recipe),
             recipe_files=self.plan.recipe_files,
             environment=dict(self.folder.environment),

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
+from vla_eval.config.files import options_of
 from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.phases import phases, with_servers
@@ -21,7 +22,6 @@ from vla_eval.evaluation.plan import (
     Plan,
     fingerprint,
     make_plan,
-    options_of,
     results_config,
 )
 from vla_eval.evaluation.worker import Finished, worker_main
@@ -154,7 +154,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
         },
         recipes=dict(plan.recipe_hashes),
         environment=collect_environment(),
-        options=options_of(config),
+        options=options_of(config, options=OPTION_FIELDS),
         command=command,
         normalization=dict(plan.normalization),
         servers=dict(plan.servers),

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from vla_eval.bounds import MAX_EPISODES
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
-from vla_eval.config.files import Recipe, digest_of, to_data
+from vla_eval.config.files import Recipe, content_of, digest_of
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.errors import RecipeError
@@ -217,7 +217,7 @@ def _recipe_hashes(
 
 def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     """Return the part of a configuration that results depend on; compared when a run is resumed."""
-    data: dict[str, Any] = to_data(config)
+    data = content_of(config, options=OPTION_FIELDS)
     # So that runs of versions without these fields can be resumed.
     if config.slots_per_worker == 1:
         del data["slots_per_worker"]
@@ -226,13 +226,7 @@ def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     data["policies"] = [bare_policy(name) for name in data["policies"]]
     if config.reset_policy_at_step is None:
         del data["reset_policy_at_step"]
-    return {name: value for name, value in data.items() if name not in OPTION_FIELDS}
-
-
-def options_of(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
-    """Return the part of a configuration that moves no result; recorded only."""
-    data: dict[str, Any] = to_data(config)
-    return {name: data[name] for name in OPTION_FIELDS}
+    return data
 
 
 def fingerprint(config: EvalConfig) -> str:
