@@ -15,7 +15,7 @@ bench = evaluation_bench.bench
 
 # Executes what the recipe says for a seed at step 2.
 DOING_MODULE = """
-import os, pickle, signal, socket, stat, struct, subprocess, sys, time
+import contextlib, os, pickle, signal, socket, stat, struct, subprocess, sys, time
 from pathlib import Path
 import numpy as np
 from vla_eval.core import ActionChunk
@@ -30,6 +30,12 @@ def sockets():
 def write(data):
     for number in sockets():
         os.write(number, data)
+
+def write_into_all(data):
+    for name in os.listdir("/proc/self/fd"):
+        if int(name) > 2:  # standard error goes into the worker's log
+            with contextlib.suppress(OSError):  # it is for reading only
+                os.write(int(name), data)
 
 def start_daemon():
     code = "import os, sys, time; os.fork() and os._exit(0);"
@@ -111,6 +117,20 @@ def test_what_a_policy_writes_into_its_socket_is_an_error_of_that_episode_alone(
     assert "1,152,921,504,606,846,976 bytes" in messages[3]
     assert "found one of type str" in messages[4]
     assert "cannot be unpickled" in messages[5]
+
+
+def test_what_a_policy_writes_into_any_descriptor_ends_no_process_but_its_own(bench: Bench) -> None:
+    shared = (
+        "from multiprocessing.shared_memory import SharedMemory; block = SharedMemory(create=True, size=1)"
+    )
+    doing(bench, s1="write_into_all(b'rubbish')", s2=f"{shared}; block.close(); block.unlink()")
+    command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", TASK, "--policy", "night.yaml"]
+    command += ["--workers", "1", "--episodes", "3", "--out", "out", "--set", "simulator=fake"]
+    done = subprocess.run(command, cwd=bench.folder, capture_output=True, text=True, timeout=240)
+
+    errors = {seed: record.error for seed, record in bench.records("out").items() if record.error is not None}
+    assert {seed: error.kind for seed, error in errors.items()} == {1: "WorkerCrashed"}
+    assert "Traceback" not in done.stderr
 
 
 def test_an_exception_of_any_size_is_recorded_in_part(bench: Bench) -> None:

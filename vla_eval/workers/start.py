@@ -11,9 +11,10 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext
+from typing import Any  # private parts of multiprocessing
 
 from vla_eval.config.environment import Simulator
 from vla_eval.storage.provenance import nvidia_driver_version
@@ -57,9 +58,27 @@ def begin(
     The server keeps the environment of its own start, which may be of an earlier pool.
     """
     fork_guarded(lifeline)
+    _leave_helpers()
     os.environ.clear()
     os.environ.update(environment)
     main(*args)
+
+
+def _leave_helpers() -> None:
+    """Close the pipes to the server and to multiprocessing's resource tracker.
+
+    Both end with a traceback if a policy writes into what it has inherited. The tracker is started again if
+    the worker needs one.
+    """
+    owners: tuple[tuple[Any, str], ...] = (  # there are no public names
+        (forkserver._forkserver, "_forkserver_alive_fd"),
+        (resource_tracker._resource_tracker, "_fd"),
+    )
+    for owner, name in owners:
+        descriptor: int | None = getattr(owner, name, None)
+        if descriptor is not None:
+            os.close(descriptor)
+            setattr(owner, name, None)
 
 
 def server_is_stopped() -> bool:
