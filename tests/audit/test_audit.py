@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.evaluations import CONTROLS, Counts, audit_configs, audit_task, kind_of, verdict
+from vla_eval.audit.evaluations import CONTROLS, audit_configs, audit_task, kind_of, verdict
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.shipped_audit import Counts
 from vla_eval.tasks.catalog import TASKS, task_spec
 
 FAKE = ["--set", "simulator=fake", "--workers", "1"]

@@ -1,6 +1,5 @@
 """A report quotes the shipped audit for the tasks that it shows, and for nothing that was not audited."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,18 +7,11 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.evaluations import (
-    NEEDS_MEMORY,
-    SHORTCUTS,
-    UNDECIDED,
-    WITHOUT_ACTING,
-    Counts,
-    TaskAudit,
-    verdict,
-)
+from vla_eval.audit.evaluations import NEEDS_MEMORY, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
+from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
 from vla_eval.results.audit_notes import OTHER_VERDICTS, ROADS, audit_notes
-from vla_eval.results.shipped_audit import STRICT, protocol_of, shipped_verdicts
+from vla_eval.results.shipped_audit import STRICT, Counts, TaskAudit, protocol_of, shipped_audits
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import TASKS
 
@@ -49,9 +41,9 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ]
     monkeypatch.setattr(audited, "FILE", tmp_path / "shipped_audit.json")
     audited.FILE.write_text(render_audit(rows, "json"), encoding="utf-8")
-    shipped_verdicts.cache_clear()
+    shipped_audits.cache_clear()
     yield
-    shipped_verdicts.cache_clear()
+    shipped_audits.cache_clear()
 
 
 def run_of(task: str, **config: object) -> StoredRun:
@@ -107,13 +99,25 @@ def test_nothing_is_said_of_what_was_not_audited() -> None:
 
 def test_the_audit_that_ships_is_of_present_tasks_and_in_the_docs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    shipped_verdicts.cache_clear()
-    rows = json.loads(audited.FILE.read_text(encoding="utf-8"))
-    counted = [{**row, "counts": {name: Counts(**c) for name, c in row["counts"].items()}} for row in rows]
-    audits = [TaskAudit(**row) for row in counted]
+    shipped_audits.cache_clear()
+    audits = list(shipped_audits().values())
     assert {audit.task for audit in audits} <= set(TASKS)
     for one in audits:
-        assert shipped_verdicts()[one.task, one.protocol].words == tuple(one.verdict)
-        assert verdict(one.counts, one.chance) == tuple(one.verdict)  # nobody has edited it
+        assert verdict(one.counts, one.chance) == one.verdict  # nobody has edited it
     docs = Path(__file__).parents[2] / "docs" / "audit.md"
     assert render_audit(audits, "markdown") in docs.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        ("[{}]", r"expected the shipped audit, found no field 'audits.0.task'"),
+        ("[", "expected the shipped audit"),
+        ('{"a": 1, "a": 2}', "the field 'a' twice"),
+        ("null", "audits None .expected a list"),
+    ],
+)
+def test_a_damaged_audit_is_named(found: str, message: str) -> None:
+    audited.FILE.write_text(found, encoding="utf-8")
+    with pytest.raises(ReportError, match=message):
+        shipped_audits()

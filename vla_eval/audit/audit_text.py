@@ -4,7 +4,8 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from vla_eval.audit.evaluations import ALPHA, CONTROLS, Counts, TaskAudit
+from vla_eval.audit.evaluations import ALPHA, CONTROLS
+from vla_eval.results.shipped_audit import Counts, TaskAudit
 
 COLUMNS = tuple(dict.fromkeys(control for controls in CONTROLS.values() for control in controls))
 NOT_PLAYED = "–"

@@ -6,7 +6,6 @@ those that its controls try.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import p_above, p_more
-from vla_eval.results.shipped_audit import PROTOCOLS, AuditProtocol
+from vla_eval.results.shipped_audit import PROTOCOLS, AuditProtocol, Counts, TaskAudit
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
@@ -43,37 +42,6 @@ SHORTCUTS = {
     "one_frame": "won from single frames",
 }
 WITHOUT_ACTING = "won without acting"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Counts:
-    """The counts of one control on one task.
-
-    Attributes:
-        n_episodes: episodes with a result; an error is not a result.
-        success_once, success_at_end: in how many of them the success rule held at any step, at the last.
-        first_choice: in how many the first candidate touched was right; None without candidates.
-        chance: mean `chance_success` of the episodes; None if it has to be measured.
-    """
-
-    n_episodes: int
-    success_once: int
-    success_at_end: int
-    first_choice: int | None
-    chance: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskAudit:
-    """The counts of all controls on one task of this version under one protocol, and the verdict."""
-
-    task: str
-    version: int
-    protocol: AuditProtocol
-    chance: float | None
-    counts: Mapping[str, Counts]
-    verdict: tuple[str, ...]
-    n_errors: int
 
 
 def kind_of(task: TaskSpec) -> Kind:

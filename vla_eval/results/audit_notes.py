@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from vla_eval.results.shipped_audit import AuditProtocol, Verdict, protocol_of, shipped_verdicts
+from vla_eval.results.shipped_audit import AuditProtocol, TaskAudit, protocol_of, shipped_audits
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
@@ -28,7 +28,7 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
 
     Tasks with arguments, in another version than the audited one, or on the fake simulator are skipped.
     """
-    found: dict[AuditProtocol, dict[str, Verdict]] = {}
+    found: dict[AuditProtocol, dict[str, TaskAudit]] = {}
     for run in runs:
         config = run.description.config
         env = config.get("env") or {}
@@ -36,16 +36,16 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
         if protocol is None or config.get("simulator") == "fake":
             continue
         for task in sorted({record.task for record in run.records}):
-            verdict, spec = shipped_verdicts().get((task, protocol)), find_task(task)
-            if verdict is not None and spec is not None and verdict.version == spec.version:
-                found.setdefault(protocol, {})[task] = verdict
+            audit, spec = shipped_audits().get((task, protocol)), find_task(task)
+            if audit is not None and spec is not None and audit.version == spec.version:
+                found.setdefault(protocol, {})[task] = audit
     return [_note(protocol, found[protocol]) for protocol in RULES if protocol in found]
 
 
-def _note(protocol: AuditProtocol, verdicts: Mapping[str, Verdict]) -> str:
+def _note(protocol: AuditProtocol, audits: Mapping[str, TaskAudit]) -> str:
     tasks_of: dict[tuple[str, ...], list[str]] = {}
-    for task, verdict in verdicts.items():
-        tasks_of.setdefault(tuple(word for word in verdict.words if word in ROADS), []).append(task)
+    for task, audit in audits.items():
+        tasks_of.setdefault(tuple(word for word in audit.verdict if word in ROADS), []).append(task)
     won = (
         f"{', '.join(tasks)} {', or '.join(ROADS[word] for word in words)}"
         for words, tasks in tasks_of.items()
@@ -53,8 +53,8 @@ def _note(protocol: AuditProtocol, verdicts: Mapping[str, Verdict]) -> str:
     )
     said = [f"can be won without memory: {'; '.join(won)}"] if any(tasks_of) else []
     for words, meaning in OTHER_VERDICTS.items():
-        tasks = [task for task, verdict in verdicts.items() if words in verdict.words]
+        tasks = [task for task, audit in audits.items() if words in audit.verdict]
         said += [f"{meaning}: {', '.join(tasks)}"] if tasks else []
-    n_episodes = min(verdict.n_episodes for verdict in verdicts.values())
+    n_episodes = min(audit.n_episodes for audit in audits.values())
     under = f"audit under {RULES[protocol]}, {n_episodes} episodes per control: docs/audit.md"
     return f"{'; '.join(said)} ({under})."

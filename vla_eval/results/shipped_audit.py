@@ -6,11 +6,13 @@ Imports neither statistics nor simulators, so that a report can quote it.
 """
 
 import functools
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from vla_eval.errors import ReportError
+from vla_eval.strict_json import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
 
 AuditProtocol = Literal["paper", "strict"]
 STRICT: Mapping[str, bool] = {
@@ -25,32 +27,71 @@ FILE = Path(__file__).with_suffix(".json")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """The audit's verdict on a task.
+class Counts:
+    """The counts of one control on one task.
 
     Attributes:
-        version: of the task, when it was audited.
-        words: the shortcuts, which need no memory; or that none was found.
-        n_episodes: of each control.
+        n_episodes: episodes with a result; an error is not a result.
+        success_once, success_at_end: in how many of them the success rule held at any step, at the last.
+        first_choice: in how many the first candidate touched was right; None without candidates.
+        chance: mean `chance_success` of the episodes; None if it has to be measured.
     """
 
-    version: int
-    words: tuple[str, ...]
-    n_episodes: int
+    n_episodes: Count
+    success_once: Count
+    success_at_end: Count
+    first_choice: Count | None
+    chance: Rate | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskAudit:
+    """The counts of all controls on one task of this version under one protocol, and the verdict.
+
+    Attributes:
+        verdict: the shortcuts, which need no memory; or that none was found.
+    """
+
+    task: str
+    version: Positive
+    protocol: AuditProtocol
+    chance: Rate | None
+    counts: dict[str, Counts]
+    verdict: tuple[str, ...]
+    n_errors: Count
+
+    @property
+    def n_episodes(self) -> int:
+        """How many episodes each control has, at least."""
+        return min(one.n_episodes for one in self.counts.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Shipped:
+    """So that a message says `audits.0.task`."""
+
+    audits: tuple[TaskAudit, ...]
 
 
 @functools.cache
-def shipped_verdicts() -> Mapping[tuple[str, AuditProtocol], Verdict]:
-    """Return (task, protocol) -> the verdict of the shipped audit."""
-    rows = json.loads(FILE.read_text(encoding="utf-8"))
-    return {
-        (row["task"], row["protocol"]): Verdict(
-            version=row["version"],
-            words=tuple(row["verdict"]),
-            n_episodes=min(counts["n_episodes"] for counts in row["counts"].values()),
-        )
-        for row in rows
-    }
+def shipped_audits() -> Mapping[tuple[str, AuditProtocol], TaskAudit]:
+    """Return (task, protocol) -> the shipped audit of it.
+
+    Raises:
+        ReportError: the file is damaged.
+    """
+    source = Source(
+        where=str(FILE),
+        what="the shipped audit",
+        remedy="The file was changed by another program; install mikasa-vla-eval again.",
+        error=ReportError,
+    )
+    try:
+        rows = loads(read_file(FILE, source))
+    except ValueError as exc:
+        raise source.refuse("something else", shorten(str(exc))) from exc
+    audits = as_dataclass(_Shipped, {"audits": rows}, source).audits
+    return {(one.task, one.protocol): one for one in audits}
 
 
 def protocol_of(env: Mapping[str, Any]) -> AuditProtocol | None:  # Any: arguments of tasks
