@@ -12,6 +12,12 @@ EXIT_EPISODE_ERRORS = 3
 """All episodes were run, and some ended in an error."""
 
 
+def add_verb(subparsers: "argparse._SubParsersAction[Any]", name: str, **texts: str) -> Any:
+    """Add a verb whose texts are printed as they are written; its flags cannot be abbreviated."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    return subparsers.add_parser(name, formatter_class=formatter, allow_abbrev=False, **texts)
+
+
 def typed_command() -> str:
     """Return the command that is running, as a shell takes it."""
     return shlex.join(["mikasa-vla", *sys.argv[1:]])
@@ -25,6 +31,31 @@ def workers_argument(text: str) -> int | str:
         return int(text)
     except ValueError as exc:
         raise argparse.ArgumentTypeError(f"expected 'auto' or a number, found '{text}'") from exc
+
+
+def add_workers(parser: argparse.ArgumentParser, *, default: str | None = None) -> None:
+    """Declare `--workers W`; without a default the recipe says how many."""
+    parser.add_argument(
+        "--workers",
+        type=workers_argument,
+        default=default,
+        metavar="W",
+        help="processes, or 'auto': one per core",
+    )
+
+
+def add_allow_environment_change(parser: argparse.ArgumentParser, *, consequence: str = "") -> None:
+    """Declare `--allow-environment-change`."""
+    parser.add_argument(
+        "--allow-environment-change",
+        action="store_true",
+        help=f"resume although package versions or the machine have changed{consequence}",
+    )
+
+
+def set_flags(data: dict[str, Any], args: argparse.Namespace, names: Sequence[str]) -> None:  # Any: YAML
+    """Set the fields of a recipe whose flags were given."""
+    data.update({name: value for name in names if (value := getattr(args, name)) is not None})
 
 
 def add_overrides(parser: argparse.ArgumentParser, *, help: str) -> None:

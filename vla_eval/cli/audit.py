@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, typed_command, workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, add_verb, add_workers, typed_command
 from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
@@ -20,13 +20,12 @@ first choice is final. The same command resumes a stopped audit."""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "audit",
         help="find the tasks that can be won without memory",
         description=DESCRIPTION,
         epilog="docs/audit.md explains controls, tests and verdicts.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument(
         "--task",
@@ -38,9 +37,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     parser.add_argument("--episodes", type=int, default=30, metavar="N", help="per task and control (30)")
     parser.add_argument("--protocol", choices=("paper", "strict", "both"), default="both", help="(both)")
-    parser.add_argument(
-        "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
-    )
+    add_workers(parser, default="auto")
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
     add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.cli import checkpoint_fetch, checkpoint_openvla, checkpoint_spatialvla
+from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.checkpoint_arguments import add_gripper
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
@@ -18,13 +19,12 @@ LoRA adapter into its base. Only fetch downloads anything."""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "checkpoint",
         help="check a checkpoint, or convert an original one",
         description=DESCRIPTION,
         epilog="docs/octo.md, docs/openvla.md and docs/spatialvla.md explain converting.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     verify = actions.add_parser("verify", help="load it strictly and let it act once", allow_abbrev=False)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.output import FORMATS
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
@@ -16,13 +17,12 @@ Each RUN is a folder that `mikasa-vla eval` made; several are put together."""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "compare",
         help="compare chunk lengths or policies with a reference",
         description=DESCRIPTION,
         epilog="docs/chunk_sizes.md explains the columns.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
     # Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.

@@ -3,14 +3,17 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vla_eval.cli.arguments import (
     EXIT_EPISODE_ERRORS,
+    add_allow_environment_change,
     add_old_flag,
     add_overrides,
+    add_verb,
+    add_workers,
+    set_flags,
     typed_command,
-    workers_argument,
 )
 from vla_eval.cli.output import add_table_arguments
 from vla_eval.config.decoding import decode, set_field
@@ -20,9 +23,6 @@ from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
 from vla_eval.policies.recipe import policy_name
 
-if TYPE_CHECKING:
-    pass
-
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
 CONFIG is a file, or the name of one in configs/ (`mikasa-vla list configs`). Without it, name at least
@@ -30,17 +30,17 @@ one --task and one --policy. Flags go on top of the file, --set on top of flags.
 resumes where it stopped, and retries episodes that ended in an error."""
 EPILOG = """exit codes: 0 every episode has a result; 1 a mistake (see the message); 3 some episodes ended in
 an error (the same command retries them); 130, 143 stopped by Ctrl-C, SIGTERM."""
+RECIPE_FLAGS = ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers")
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "eval",
         help="run or resume an evaluation, and print its table",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     _add_run_arguments(parser)
@@ -70,9 +70,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task, policy and run (100)")
     parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
     parser.add_argument("--runs", type=int, metavar="R", help="independent runs over the same seeds (1)")
-    parser.add_argument(
-        "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
-    )
+    add_workers(parser)
     parser.add_argument(
         "--serve",
         action="store_true",
@@ -80,11 +78,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
     add_overrides(parser, help="change any field of the configuration")
-    parser.add_argument(
-        "--allow-environment-change",
-        action="store_true",
-        help="resume although package versions or the machine have changed; the table will say so",
-    )
+    add_allow_environment_change(parser, consequence="; the table will say so")
 
 
 def _add_capture_arguments(parser: argparse.ArgumentParser) -> None:
@@ -170,10 +164,9 @@ def _config(args: argparse.Namespace) -> EvalConfig:
     """Return the configuration: the file, flags on top of it, `--set` on top of those."""
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        for name in ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers"):
-            value = getattr(args, name)
-            if value is not None:
-                data[name] = value
+        set_flags(
+            data, args, ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers")
+        )
         if args.serve:
             data["inference"] = "shared"
         for kind in ("video", "rrd"):

@@ -5,7 +5,7 @@ import contextlib
 import sys
 from typing import Any
 
-from vla_eval.cli.arguments import add_old_flag, add_overrides, typed_command
+from vla_eval.cli.arguments import add_old_flag, add_overrides, add_verb, set_flags, typed_command
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -24,13 +24,12 @@ Then: mikasa-vla eval --policy RUN --task TASK"""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "finetune",
         help="train a policy on a dataset, or resume the training",
         description=DESCRIPTION,
         epilog="docs/finetuning.md explains recipes, memory and resuming.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     parser.add_argument(
@@ -86,9 +85,7 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
     """Return the configuration: the file, flags on top of it, `--set` on top of those."""
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        for name in ("dataset", "run_seed", "device", "out"):
-            if getattr(args, name) is not None:
-                data[name] = getattr(args, name)
+        set_flags(data, args, ("dataset", "run_seed", "device", "out"))
         if args.policy is not None:
             data["policy"] = _one_policy(args.policy)
         if args.allow_unreplayed:

@@ -5,7 +5,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import add_overrides, typed_command, workers_argument
+from vla_eval.cli.arguments import (
+    add_allow_environment_change,
+    add_overrides,
+    add_verb,
+    add_workers,
+    set_flags,
+    typed_command,
+)
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
@@ -27,28 +34,21 @@ SIGTERM (the same command resumes)."""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "record",
         help="record demonstrations as LeRobot datasets, or resume recording",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("recipe", nargs="?", metavar="RECIPE", help="file, or name in datasets/")
     parser.add_argument("--task", nargs="+", action="extend", dest="tasks", metavar="T", help="task ids")
     parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task (250)")
     parser.add_argument("--seed-start", type=int, metavar="S", help="the first seed that is tried (1000)")
-    parser.add_argument(
-        "--workers", type=workers_argument, metavar="W", help="processes, or 'auto': one per core"
-    )
+    add_workers(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
     add_overrides(parser, help="change any field of the recipe")
-    parser.add_argument(
-        "--allow-environment-change",
-        action="store_true",
-        help="resume although package versions or the machine have changed",
-    )
+    add_allow_environment_change(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,10 +95,7 @@ def _recipe(args: argparse.Namespace) -> DatasetRecipe:
     """Return the recipe: the file, flags on top of it, `--set` on top of those."""
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        for name in ("tasks", "episodes", "seed_start", "workers"):
-            value = getattr(args, name)
-            if value is not None:
-                data[name] = value
+        set_flags(data, args, ("tasks", "episodes", "seed_start", "workers"))
         apply_overrides(data, args.overrides, cls=DatasetRecipe)
 
     if args.recipe is not None:

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import workers_argument
+from vla_eval.cli.arguments import add_verb, add_workers
 from vla_eval.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -23,20 +23,17 @@ EPILOG = "exit codes: 0 no mismatch; 1 a mismatch, or a mistake; 130, 143 stoppe
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "replay",
         help="check a dataset by running its episodes again",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
     parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
-    parser.add_argument(
-        "--workers", type=workers_argument, default="auto", metavar="W", help="processes, or 'auto'"
-    )
+    add_workers(parser, default="auto")
     parser.add_argument(
         "--rebuild",
         type=Path,

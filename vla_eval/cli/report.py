@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.output import add_table_arguments, print_table
 
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
@@ -16,13 +17,12 @@ With --html, a page with plots, choices, errors and videos is written instead, a
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "report",
         help="print the success table of run folders",
         description=DESCRIPTION,
         epilog="The columns are explained in docs/statistics.md.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
     add_table_arguments(parser)

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from vla_eval.cli.arguments import add_verb
+
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
 
 RUN may also be a dataset (OUT/TASK of `mikasa-vla record`, or any LeRobotDataset v3): its episodes are shown.
@@ -19,13 +21,12 @@ RUN_FLAGS = {"--task": "task", "--policy": "policy", "--n-action-steps": "n_acti
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "view",
         help="open captured episodes, or a dataset's, in the rerun viewer",
         description=DESCRIPTION,
         epilog="docs/captures.md says what is in the files.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder (runs/…), or a dataset")
     parser.add_argument("--seed", type=int, metavar="S", help="only this seed")
