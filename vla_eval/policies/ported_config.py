@@ -3,7 +3,6 @@
 Neither class is registered with lerobot: only a policy's own configuration has a name. Knows no network.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any  # lerobot is untyped
 
@@ -11,8 +10,9 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.features import ACTION_KEY
 from vla_eval.policies.steps.gripper import Gripper
-from vla_eval.policies.steps.normalization import Normalization
+from vla_eval.policies.steps.normalization import Normalization, mask_all_but
 from vla_eval.policies.steps.precision import DTYPES
 
 
@@ -119,9 +119,15 @@ class PromptedConfig(PortedConfig):
         encoding: Any = self.gripper  # `Gripper` checks it
         return Gripper(encoding=encoding)
 
-    def normalizations(self) -> Mapping[str, Normalization]:
-        """Return how each field is normalised."""
-        raise NotImplementedError
+    def normalizations(self) -> dict[str, Normalization]:
+        """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
+
+        Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
+        prismatic/vla/datasets/rlds/utils/data_utils.py#L52-L90, and of SpatialVLA data/utils/data_utils.py;
+        data.norm.* of the golden files of both.
+        """
+        mask = mask_all_but(int(self.action_feature.shape[0]), left_alone=(-1,))
+        return {ACTION_KEY: Normalization(kind="q01_q99", mask=mask, clip=True)}
 
     @property
     def encoder_settings(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.errors import RecipeError
-from vla_eval.features import ACTION_KEY, STATE_KEY
+from vla_eval.features import STATE_KEY
 from vla_eval.policies.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.policies.openvla.sizes import Head, NetworkOptions, NetworkSizes
 from vla_eval.policies.ported_config import PromptedConfig
@@ -110,15 +110,8 @@ class MikasaOpenVLAConfig(PromptedConfig):
         )
 
     def normalizations(self) -> dict[str, Normalization]:
-        """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
-
-        Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
-        prismatic/vla/datasets/rlds/utils/data_utils.py#L52-L90.
-        """
-        n_dims = int(self.action_feature.shape[0])
-        fields = {
-            ACTION_KEY: Normalization(kind="q01_q99", mask=mask_all_but(n_dims, left_alone=(-1,)), clip=True)
-        }
+        """Return how fields are normalised; proprioception, if it is read, like the action."""
+        fields = super().normalizations()
         if self.use_proprio:
             n_state = int(self.robot_state_feature.shape[0])
             # In an evaluation the original cuts the whole state: experiments/robot/openvla_utils.py#L669.

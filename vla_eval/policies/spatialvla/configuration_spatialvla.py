@@ -29,7 +29,7 @@ from vla_eval.policies.spatialvla.sizes import (
     NetworkSizes,
 )
 from vla_eval.policies.steps.network_sizes import with_changes
-from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
+from vla_eval.policies.steps.normalization import Normalizer
 
 TYPE = "mikasa_spatialvla"
 GRIDS = ("refitted", "kept", "uniform")
@@ -192,14 +192,6 @@ class MikasaSpatialVLAConfig(PromptedConfig):
                 "(sizes)."
             )
         return grid
-
-    def normalizations(self) -> dict[str, Normalization]:
-        """Return how fields are normalised: q01 … q99 to [-1, 1], cut there; the gripper stays as it is.
-
-        Source: data.norm.* of the golden files; the original's data/utils/data_utils.py.
-        """
-        mask = mask_all_but(N_ACTION, left_alone=(-1,))
-        return {ACTION_KEY: Normalization(kind="q01_q99", mask=mask, clip=True)}
 
     def lora_defaults(self) -> dict[str, Any]:
         """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
