@@ -164,9 +164,7 @@ def _config(args: argparse.Namespace) -> EvalConfig:
     """Return the configuration: the file, flags on top of it, `--set` on top of those."""
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        set_flags(
-            data, args, ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers")
-        )
+        set_flags(data, args, RECIPE_FLAGS)
         if args.serve:
             data["inference"] = "shared"
         for kind in ("video", "rrd"):

@@ -83,7 +83,6 @@ class RecordingFolder:
         return cls(out, started, run_file)
 
     def __enter__(self) -> Self:
-        """Return the folder."""
         return self
 
     def __exit__(

@@ -71,7 +71,6 @@ class ShardWriter:
         self._dataset = create_dataset(self._draft, format)
 
     def __enter__(self) -> Self:
-        """Return the writer."""
         return self
 
     def add_episode(self, episode: RecordedEpisode, frames: Iterable[dict[str, Any]]) -> None:

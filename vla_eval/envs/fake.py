@@ -48,8 +48,6 @@ Vector = NDArray[np.float64]
 
 @dataclass(slots=True, kw_only=True)
 class _Episode:
-    """One running episode."""
-
     seed: int
     candidates_m: Vector
     targets: tuple[int, ...]

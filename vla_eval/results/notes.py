@@ -88,7 +88,6 @@ def comparison_notes(rows: Sequence[Row], compared: Mapping[str, Mapping[RowKey,
 
 
 def _chance_notes(rows: Sequence[Row]) -> list[str]:
-    """Return the notes on the source of chance."""
     notes = []
     if any(row.chance_source == "cue_blind" for row in rows):
         notes.append("chance: `cue_blind` as measured on the same task at the same n_action_steps.")

@@ -102,7 +102,6 @@ class WorkerPool[J: Job, A]:
         self._workers: dict[int, _Worker[J]] = {}
 
     def __enter__(self) -> Self:
-        """Return the pool."""
         return self
 
     def __exit__(
