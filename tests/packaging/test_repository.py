@@ -80,3 +80,25 @@ def test_every_make_verb_is_listed_by_help() -> None:
 
 def test_the_changelog_names_changes_that_affect_results() -> None:
     assert "### Results-affecting" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+OF_NO_ROOM = {"docs", "packaging", "fuzz", "gpu", "golden"}
+"""Folders of tests that belong to no room of the package."""
+
+
+def test_the_tree_of_the_readme_is_the_tree() -> None:
+    tree = (ROOT / "README.md").read_text(encoding="utf-8").split("```")
+    shown = next(block for block in tree if "vla_eval/\n" in block)
+    package = ROOT / "vla_eval"
+    rooms = {f"{file.parent.name}/" for file in package.glob("*/__init__.py")}
+    files = {file.name for file in package.glob("*.py")} - {"__init__.py"}
+    missing = [name for name in sorted({*rooms, *files}) if not re.search(rf"(^|\s){re.escape(name)}", shown)]
+    assert not missing
+    named = set(re.findall(r"^  (\w+/)", shown, flags=re.MULTILINE))
+    assert named <= rooms  # a room that is gone is gone from the README
+
+
+def test_a_folder_of_tests_is_of_a_room() -> None:
+    rooms = {file.parent.name for file in (ROOT / "vla_eval").glob("*/__init__.py")}
+    folders = {file.parent.name for file in (ROOT / "tests").glob("*/*.py")}
+    assert folders <= rooms | OF_NO_ROOM
