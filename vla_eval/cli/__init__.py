@@ -1,1 +1,1 @@
-"""The command line: one file per verb; each verb imports what it needs."""
+"""The command line: one file per verb, which reads flags and prints. Knows no statistics and no models."""

@@ -1,1 +1,1 @@
-"""Datasets of demonstrations: record, check, replay. What is on the disk: `features`, `manifest`."""
+"""Datasets of demonstrations: record, replay, convert, share. Knows nothing of training."""

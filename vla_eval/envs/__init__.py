@@ -1,1 +1,1 @@
-"""Environments: the ManiSkill adapter, an arrays-only fake, and the factory that chooses."""
+"""Environments: the ManiSkill adapter, an arrays-only fake, the factory. Knows nothing of policies."""

@@ -1,1 +1,1 @@
-"""Privileged experts: the controllers of each task family. State in, action out."""
+"""Privileged experts: the controllers of each task family. State in, action out; no simulator."""

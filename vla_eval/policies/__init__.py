@@ -1,1 +1,1 @@
-"""Policies: the chunk executor, scripted controls, and one adapter per model family."""
+"""Policies: scripted controls, and one adapter per model family. Knows nothing of simulators and runs."""

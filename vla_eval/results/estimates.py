@@ -1,6 +1,7 @@
 """Estimates from counts: intervals, paired tests, corrections. Pure functions of numbers.
 
-An undefined value is None, never 0. Knows nothing of episodes, tasks or files.
+scipy and statsmodels compute; ours are the cases that they answer with NaN or rounding. An undefined value
+is None, never 0. Knows nothing of episodes, tasks or files.
 """
 
 import math

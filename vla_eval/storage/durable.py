@@ -1,6 +1,7 @@
 """Write files so that a killed process, a full disk or a power cut loses nothing that was promised.
 
-Knows nothing of episodes: it deals in lines and whole files.
+Ours, since a record has to be a line of plain text that is durable when `append` returns, and gone if the
+disk was full: Python's files promise neither, and a database is no text. Knows nothing of episodes.
 """
 
 import contextlib

@@ -1,1 +1,1 @@
-"""The MIKASA-Robo tasks. `catalog` names them without importing a simulator."""
+"""The MIKASA-Robo tasks; `catalog` names them without a simulator. Knows nothing of policies."""

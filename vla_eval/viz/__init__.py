@@ -1,1 +1,1 @@
-"""Videos and rerun files of episodes. The loop knows nothing of this room."""
+"""Videos and rerun files of episodes. Knows nothing of policies; the loop knows nothing of this room."""

@@ -1,5 +1,8 @@
 """Worker processes with a watchdog: every job gets an answer, whatever a worker does.
 
+Ours, since neither `multiprocessing.Pool` nor `concurrent.futures` limits the time of a job or survives the
+death of a worker with the other jobs unharmed.
+
 A worker that exceeds a time limit writes its stack to its log and is killed; one that dies is replaced.
 Both give an `EpisodeError` with the cause. A process does the jobs of one setup key
 only: whatever a policy changes in its process, from the default dtype to numpy's functions, ends with
