@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lerobot.policies.act.configuration_act import ACTConfig
 from safetensors.numpy import save_file
 
-from vla_eval.errors import VlaEvalError
+from tests.fuzz.json_cases import accepted_or_refused
 from vla_eval.policies import lerobot_loading
 from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import checkpoint_sha256
@@ -90,18 +90,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name).write_bytes(written(data))
     (tmp_path / "policy_postprocessor.json").write_bytes(written({"steps": []}))
     return tmp_path
-
-
-def accepted_or_refused(ask: Callable[[], object]) -> bool:
-    """Return whether it is accepted; what the command line would not print as one message is a failure."""
-    try:
-        ask()
-    except VlaEvalError as exc:
-        assert str(exc).strip()
-        assert len(str(exc)) < 10_000
-        str(exc).encode("utf-8")  # the command line can print it
-        return False
-    return True
 
 
 def read_processor(folder: Path) -> None:

@@ -8,6 +8,7 @@ number of workers.
 import functools
 import importlib
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -235,17 +236,7 @@ class _Recorder:
             lambda seed: AttemptJob(plan=task, seed=seed),
         )
         self._begin(task, "trying seeds", n_done=queue.n_kept)
-        n_tries: dict[int, int] = {}
-        for event in self.pool.run(queue):
-            answered = self._look_at(event)
-            if answered is None:
-                continue
-            job, answer = answered
-            assert isinstance(job, AttemptJob)  # the queue makes no others
-            if isinstance(answer, Failed):
-                n_tries[job.seed] = _raise_if_hopeless(answer, n_tries.get(job.seed, 0), f"seed {job.seed}")
-                queue.give_back(job.seed)
-                continue
+        for _, answer in self._answers(queue):
             assert isinstance(answer, Attempt)
             self.folder.append(task.task, answer)
             queue.add(answer)
@@ -257,7 +248,7 @@ class _Recorder:
         open_jobs = [job for job in jobs if not job.path.exists()]
         n_done = len(kept) - sum(len(job.attempts) for job in open_jobs)
         self._begin(task, "rendering", n_done=n_done)
-        for done in self._finish(open_jobs):
+        for done, _ in self._answers(JobList(open_jobs)):
             assert isinstance(done, ShardJob)
             n_done += len(done.attempts)
             self.observer.on_progress(n_done=n_done)
@@ -272,24 +263,25 @@ class _Recorder:
             failed=tuple(FailedSeed(seed=one.seed, n_steps=one.n_steps) for one in selection.failed),
             facts=self._facts(task, n_failed_seeds=len(selection.failed)),
         )
-        for _ in self._finish([job]):
+        for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)
 
-    def _finish(self, jobs: Sequence[RecordingJob]) -> Iterable[RecordingJob]:
-        """Run the jobs, each again if it fails once; yields each when it is done."""
-        queue = JobList(jobs)
-        n_tries: dict[int, int] = {}
+    def _answers(
+        self, queue: SeedQueue[AttemptJob] | JobList[ShardJob] | JobList[JoinJob]
+    ) -> Iterable[tuple[RecordingJob, RecordingAnswer]]:
+        """Run the jobs, each again if it fails once; yield each with its answer when it is done."""
+        n_failed: Counter[str] = Counter()
         for event in self.pool.run(queue):
             answered = self._look_at(event)
             if answered is None:
                 continue
             job, answer = answered
             if isinstance(answer, Failed):
-                where = f"{job.setup_key.kind} of {job.setup_key.task}"
-                n_tries[id(job)] = _raise_if_hopeless(answer, n_tries.get(id(job), 0), where)
-                queue.give_back(job)
+                n_failed[job.name] += 1
+                _raise_if_last(answer, n_failed[job.name], job.name)
+                queue.give_back(job)  # type: ignore[arg-type]  # it is the queue's own
             else:
-                yield job
+                yield job, answer
 
     def _look_at(self, event: object) -> "tuple[RecordingJob, RecordingAnswer | Failed] | None":
         """Return job and answer, if the event is one; else see to it."""
@@ -335,14 +327,13 @@ class _Recorder:
         )
 
 
-def _raise_if_hopeless(failed: Failed, n_tries: int, where: str) -> int:
-    """Return how often the job has been tried; raise if it makes no sense to try it again."""
+def _raise_if_last(failed: Failed, n_failed: int, name: str) -> None:
+    """Raise if it makes no sense to try the job again."""
     if failed.refused:
         raise as_exception(failed.error)
-    if n_tries + 1 >= MAX_TRIES:
+    if n_failed >= MAX_TRIES:
         error = failed.error
         raise RecordingError(
-            f"{where}: failed {MAX_TRIES} times, the last time during {error.stage}: {error.kind}: "
+            f"{name}: failed {MAX_TRIES} times, the last time during {error.stage}: {error.kind}: "
             f"{error.message}\n{error.details or ''}\nWhat was recorded is kept; the same command resumes."
         )
-    return n_tries + 1

@@ -66,6 +66,11 @@ class AttemptJob:
         """See `workers.Job`."""
         return SetupKey(self.plan.task, "attempt")
 
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.plan.task}, seed {self.seed}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShardJob:
@@ -80,6 +85,11 @@ class ShardJob:
     def setup_key(self) -> SetupKey:
         """See `workers.Job`."""
         return SetupKey(self.plan.task, "render")
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.plan.task}, {self.path.name}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +114,11 @@ class JoinJob:
     def setup_key(self) -> SetupKey:
         """See `workers.Job`."""
         return SetupKey(self.plan.task, "join")
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.plan.task}, joining the shards"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ it are known to succeed or are being tried, so that none is left out and few are
 
 from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.demonstrations import Attempt
@@ -25,7 +26,15 @@ class Selection:
     failed: tuple[Attempt, ...]
 
 
-class SeedQueue[J]:
+class SeedJob(Protocol):
+    """A job of one seed."""
+
+    @property
+    def seed(self) -> int:
+        """The seed to try."""
+
+
+class SeedQueue[J: SeedJob]:
     """A `JobSource` of seeds to try.
 
     Args:
@@ -64,9 +73,9 @@ class SeedQueue[J]:
         self._in_flight.discard(attempt.seed)
         self._known[attempt.seed] = attempt
 
-    def give_back(self, seed: int) -> None:
+    def give_back(self, job: J) -> None:
         """A seed could not be tried: it is handed out again."""
-        self._in_flight.discard(seed)
+        self._in_flight.discard(job.seed)
 
     def selection(self) -> Selection:
         """Return what is kept, once nothing is left to try."""
