@@ -83,7 +83,7 @@ def test_the_changelog_names_changes_that_affect_results() -> None:
 
 
 OF_NO_ROOM = {"docs", "packaging", "fuzz", "gpu", "golden"}
-"""Folders of tests that belong to no room of the package."""
+"""Folders of tests that are neither of a room nor of a distribution in `plugins/`."""
 
 
 def test_the_tree_of_the_readme_is_the_tree() -> None:
@@ -98,7 +98,8 @@ def test_the_tree_of_the_readme_is_the_tree() -> None:
     assert named <= rooms  # a room that is gone is gone from the README
 
 
-def test_a_folder_of_tests_is_of_a_room() -> None:
-    rooms = {file.parent.name for file in (ROOT / "vla_eval").glob("*/__init__.py")}
+def test_a_folder_of_tests_is_of_a_room_or_of_a_plugin() -> None:
+    places = ("vla_eval/*/__init__.py", "plugins/*/*/__init__.py")
+    rooms = {file.parent.name for place in places for file in ROOT.glob(place)}
     folders = {file.parent.name for file in (ROOT / "tests").glob("*/*.py")}
     assert folders <= rooms | OF_NO_ROOM
