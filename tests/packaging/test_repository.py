@@ -82,7 +82,7 @@ def test_the_changelog_names_changes_that_affect_results() -> None:
     assert "### Results-affecting" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
-OF_NO_ROOM = {"docs", "packaging", "fuzz", "gpu", "golden"}
+OF_NO_ROOM = {"docs", "packaging", "fuzz", "gpu", "golden", "peers"}
 """Folders of tests that are neither of a room nor of a distribution in `plugins/`."""
 
 
