@@ -103,3 +103,17 @@ def test_a_folder_of_tests_is_of_a_room_or_of_a_plugin() -> None:
     rooms = {file.parent.name for place in places for file in ROOT.glob(place)}
     folders = {file.parent.name for file in (ROOT / "tests").glob("*/*.py")}
     assert folders <= rooms | OF_NO_ROOM
+
+
+MAX_LINES = 400
+
+
+def test_no_file_of_code_is_longer_than_one_subject_needs() -> None:
+    places = ("vla_eval", "tests", "plugins", "scripts")
+    files = [file for place in places for file in (ROOT / place).rglob("*.py")]
+    long = {
+        str(file.relative_to(ROOT)): n_lines
+        for file in files
+        if (n_lines := len(file.read_text(encoding="utf-8").split("\n")) - 1) > MAX_LINES
+    }
+    assert not long

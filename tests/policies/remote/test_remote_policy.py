@@ -1,7 +1,6 @@
 """A policy behind a socket: what is sent, what is taken for an answer, and what is refused."""
 
 import contextlib
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +19,6 @@ from vla_eval.errors import (
     RemoteChangedError,
     RemoteConnectionError,
     RemoteReplyError,
-    RemoteTimeoutError,
     VlaEvalError,
 )
 from vla_eval.policies.context import PolicyContext
@@ -374,27 +372,6 @@ def test_conversion_leaves_what_is_not_sound_for_the_loop_to_refuse() -> None:
         pytest.raises(InvalidActionError, match="nan"),
     ):
         run(policy, 7)
-
-
-def test_an_error_of_the_server_ends_the_episode_with_its_words() -> None:
-    with (
-        remote(answering(lambda one: "the state has a wrong length")) as policy,
-        pytest.raises(RemoteReplyError, match="the state has a wrong length"),
-    ):
-        run(policy, 7)
-
-
-def test_a_reply_after_the_timeout_is_never_used() -> None:
-    def late(request: dict[str, Any]) -> Any:
-        time.sleep(0.4)
-        return echo(request)
-
-    with remote(answering(late), timeout_seconds=0.1) as policy:
-        with pytest.raises(RemoteTimeoutError):
-            run(policy, 7)
-        time.sleep(0.5)
-        with pytest.raises(RemoteConnectionError):
-            policy.act(window(0))
 
 
 def test_a_worker_takes_the_server_with_the_fewest_sessions_and_leaves_the_others() -> None:
