@@ -1,5 +1,6 @@
 """Shared inference: records are those of inference in the workers, for any number of workers."""
 
+import contextlib
 import json
 import os
 import signal
@@ -13,10 +14,13 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
-from vla_eval.errors import RunChangedError, VlaEvalError
+from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
 from vla_eval.evaluation import inference_choice
+from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.inference_choice import chosen_inference
-from vla_eval.evaluation.plan import make_plan, results_config
+from vla_eval.evaluation.plan import Plan, make_plan, results_config
+from vla_eval.records import EpisodeRecord
+from vla_eval.serving import shared as shared_module
 
 # A recurrent network that infers for all rows of a pass at once: its bits depend on the size of a pass and on
 # the row, as those of any network do.
@@ -143,6 +147,45 @@ def test_the_servers_of_a_run_end_with_it_even_if_it_is_killed(network: Bench) -
         (server,) = network.worker_pids()
         process.send_signal(signal.SIGKILL)
     wait_until(lambda: not Path(f"/proc/{server}").exists())
+
+
+def test_with_several_gpus_each_has_a_server_and_records_are_the_same(
+    network: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared(network, "one", workers=2)
+    for path in network.folder.glob("pid-*"):
+        path.unlink()
+    monkeypatch.setattr(shared_module, "visible_gpus", lambda: ("0", "1"))
+    shared(network, "two", workers=2)
+
+    assert len(network.worker_pids()) == 2
+    assert network.lines("one") == network.lines("two")
+
+
+def test_a_server_that_dies_costs_errors_that_a_resume_heals(network: Bench) -> None:
+    class Kills:
+        def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+            pass
+
+        def on_record(self, record: EpisodeRecord) -> None:
+            for pid in network.worker_pids():
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+        def on_tick(self) -> bool:
+            return False
+
+    fields: dict[str, Any] = {
+        **{"episodes": 10, "n_action_steps": [2], "inference": "shared", "inference_max_batch": ROWS},
+        **{"workers": 2, "max_consecutive_errors": 3},
+    }
+    with pytest.raises(TooManyErrorsError, match="Remote"):
+        evaluate(network.config(**fields), out=network.folder / "killed", observer=Kills())
+    outcomes = [record.outcome for record in network.records("killed").values()]
+    assert outcomes.count("error") >= 3
+    shared(network, "killed", workers=2)
+    shared(network, "undisturbed", workers=2)
+    assert network.lines("killed") == network.lines("undisturbed")
 
 
 class TestTheChoice:
