@@ -143,6 +143,8 @@ def test_an_audit_is_refused_before_it_starts(
         (["--n-action-steps", "0"], "n_action_steps is 0"),
         (["--loader", "--samples", "0"], "samples is 0"),
         (["--loader", "--repeats", "0"], "repeats is 0"),
+        (["--serve", "--sessions", "1", "0"], "sessions is 0"),
+        (["--serve", "--seconds", "0"], "seconds is 0"),
     ],
 )
 def test_a_bench_is_refused_before_it_starts(

@@ -1,4 +1,4 @@
-"""`mikasa-vla bench`: lazy against eager rendering, loader against loader, as ratios from one run."""
+"""`mikasa-vla bench`: rendering, loading, and a policy behind a socket, as ratios from one run."""
 
 import argparse
 from pathlib import Path
@@ -6,12 +6,17 @@ from pathlib import Path
 from vla_eval.bounds import MAX_STEPS, check_bounds
 
 SYNTHETIC = "synthetic"
+SMALL = ""  # the policy of --serve that is made for it
 MAX_REPEATS, MAX_SAMPLES = 1000, 1_000_000
+MAX_SESSIONS, MAX_SECONDS = 256, 3600
+MIB = 2**20
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the verb to the command line."""
-    parser = subparsers.add_parser("bench", help="measure rendering or loading, as ratios from one run")
+    parser = subparsers.add_parser(
+        "bench", help="measure rendering, loading or serving, as ratios from one run"
+    )
     parser.add_argument("--task", default="RememberColor3-v0", help="task id (default: %(default)s)")
     parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
@@ -24,12 +29,33 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="instead: samples per second of a dataset (a made-up one if none is named)",
     )
     parser.add_argument("--samples", type=int, default=200, help="with --loader (default: %(default)s)")
+    parser.add_argument(
+        "--serve",
+        nargs="?",
+        const=SMALL,
+        metavar="POLICY",
+        help="instead: a policy behind a socket against copies of it (a small transformer if none is named)",
+    )
+    parser.add_argument(
+        "--sessions", type=int, nargs="+", default=[1, 4, 8, 16], metavar="N", help="with --serve"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="of each rate, with --serve (default: %(default)s)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print the table."""
-    bounds = {"n_action_steps": (1, MAX_STEPS), "repeats": (1, MAX_REPEATS), "samples": (1, MAX_SAMPLES)}
+    bounds = {
+        "n_action_steps": (1, MAX_STEPS),
+        "repeats": (1, MAX_REPEATS),
+        "samples": (1, MAX_SAMPLES),
+        "sessions": (1, MAX_SESSIONS),
+        "seconds": (0.1, MAX_SECONDS),
+    }
     check_bounds(args, bounds, prefix="bench: ")
+    if args.serve is not None:
+        return _serving(args)
     return _loader(args) if args.loader else _rendering(args)
 
 
@@ -72,3 +98,40 @@ def _rendering(args: argparse.Namespace) -> int:
         )
     print("States and actions of lazy and eager episodes were bit-equal.")
     return 0
+
+
+def _serving(args: argparse.Namespace) -> int:
+    from vla_eval.bench.serving import run_serving_bench
+
+    report = run_serving_bench(args.serve or None, sessions=args.sessions, seconds=args.seconds)
+    n_parameters = report.n_parameters
+    size = "" if n_parameters is None else f", {n_parameters / 1e6:.1f} M parameters"
+    print(
+        f"{report.policy}{size}; {report.device or 'no GPU'}; {report.n_cores} cores, which "
+        f"{report.load:.1f} other processes wanted when it began"
+    )
+    print(
+        f"A policy that computes nothing, two images of 128 x 128, {report.n_latencies} inferences in turn: "
+        f"{report.direct.p50:.2f} ms in the process, {report.served.p50:.2f} ms behind the loopback address "
+        f"(p99 {report.direct.p99:.2f} and {report.served.p99:.2f}): {report.added.p50:.2f} ms added "
+        f"(p99 {report.added.p99:.2f})."
+    )
+    print("| sessions | served/s | MiB | GPU MiB | copies | copies/s | MiB | GPU MiB |")
+    print("|--:|--:|--:|--:|--:|--:|--:|--:|")
+    for row in report.rows:
+        served, copies = (
+            f"{load.per_second:.1f} | {load.resident_bytes / MIB:.0f} | {_mib(load.device_bytes)}"
+            for load in (row.served, row.copies)
+        )
+        print(f"| {row.n_sessions} | {served} | {row.n_copies} | {copies} |")
+    print("Copies are processes with one thread each, no more than there are cores.")
+    for one in report.rounding:
+        print(
+            f"{one.precision}: actions of a pass with {one.n_rows} rows and of one with a single row differ "
+            f"by at most {one.largest:.1e}; the largest action is {one.scale:.2g}."
+        )
+    return 0
+
+
+def _mib(n_bytes: int | None) -> str:
+    return "—" if n_bytes is None else f"{n_bytes / MIB:.0f}"

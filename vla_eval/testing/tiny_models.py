@@ -9,7 +9,7 @@ import importlib
 from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal  # lerobot and transformers are untyped
+from typing import Any, Literal, NamedTuple  # lerobot and transformers are untyped
 from unittest.mock import patch
 
 from vla_eval.evaluation.worker import worker_main
@@ -37,13 +37,22 @@ TINY_POLICY: dict[str, Any] = {
 """Fields of the policy's configuration for the tiny model."""
 
 
+class Sizes(NamedTuple):
+    """Sizes of a model of the π0 family: layers, and the widths of language model and action expert."""
+
+    depth: int = 2
+    width: int = 64
+    expert_width: int = 32
+
+
 @contextlib.contextmanager
-def tiny_paligemma(family: Family = "pi0") -> Iterator[None]:
-    """Make lerobot build the tiny model instead of the full one, within the context."""
+def tiny_paligemma(family: Family = "pi0", made: Sizes = Sizes()) -> Iterator[None]:  # noqa: B008
+    """Make lerobot build a model of these sizes instead of the full one, within the context."""
     modeling: Any = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
-    sizes = {"depth": 2, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}  # 8 heads are hard-coded
-    vlm = modeling.GemmaConfig(width=64, mlp_dim=128, **sizes)
-    expert = modeling.GemmaConfig(width=32, mlp_dim=64, **sizes)
+    # 8 heads are hard-coded
+    sizes = {"depth": made.depth, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}
+    vlm = modeling.GemmaConfig(width=made.width, mlp_dim=2 * made.width, **sizes)
+    expert = modeling.GemmaConfig(width=made.expert_width, mlp_dim=2 * made.expert_width, **sizes)
     full_vlm = modeling.PaliGemmaForConditionalGenerationWithPiGemma
     full_expert: Any = getattr(modeling, "PiGemmaForCausalLM", None)  # π0-FAST has no expert
 

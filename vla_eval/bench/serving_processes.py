@@ -1,0 +1,228 @@
+"""Start what is measured: a policy server, or copies of the policy, each in processes of its own."""
+
+import multiprocessing
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from queue import Empty
+from typing import Any
+
+import numpy as np
+import torch
+
+from vla_eval.chunking import ChunkingSpec
+from vla_eval.core import BatchPolicy, EpisodeStart, FloatArray, Observation, ObservationWindow, Policy
+from vla_eval.errors import RemotePolicyError
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.recipe import load_policy_recipe
+from vla_eval.policies.registry import make_from_adapter
+from vla_eval.policies.remote.policy import RemotePolicy, make_remote
+from vla_eval.tasks.interface import env_spec
+
+INSTRUCTION = "look and move"
+N_OBSERVATIONS = 16  # drawn once; a policy is shown them in turn
+IMAGE_PX = 128
+STATE_SIZES = {"tcp_pose": 7, "qpos": 9, "qvel": 9}
+START_SECONDS = 900.0  # importing torch, and loading the weights
+STOP_SECONDS = 30.0
+REPLY_SECONDS = 300.0
+KIB = 1024
+SERVING = re.compile(r"at (ws://\S+)")
+
+
+class Asker:
+    """One episode of a policy, shown random images, one inference after the other.
+
+    Args:
+        policy: asked by nobody else at the same time, unless it is for the same thread.
+        seed: of the images.
+        row: of a pass.
+    """
+
+    def __init__(self, policy: Policy, *, seed: int = 0, row: int = 0) -> None:
+        self._policy, self._row = policy, row
+        draws = np.random.default_rng(seed)
+        self._drawn = [_drawn(draws) for _ in range(N_OBSERVATIONS)]
+        self._step = 0
+        start = EpisodeStart(
+            slot=0, task="bench", seed=seed, run=0, instruction=INSTRUCTION, horizon_steps=10**6, row=row
+        )
+        policy.reset([start])
+
+    def ask(self) -> FloatArray:
+        """Return the actions (T, A) for the next observation."""
+        drawn = self._drawn[self._step % N_OBSERVATIONS]
+        spec = self._policy.spec
+        frame = Observation(
+            step=self._step,
+            images={name: image for name, image in drawn.images.items() if name in spec.cameras},
+            state={name: drawn.state[name] for name in spec.states},
+        )
+        self._step += 1
+        window = ObservationWindow(slot=0, frames=(frame,))
+        if isinstance(self._policy, BatchPolicy):
+            return self._policy.act_batch([window])[0].actions
+        return self._policy.act(window).actions
+
+
+def _drawn(draws: np.random.Generator) -> Observation:
+    pose = np.array([0, 0, 0.2, 0, 1, 0, 0], np.float32)
+    pose[:3] += draws.normal(0, 0.05, 3).astype(np.float32)
+    state = {name: draws.normal(0, 0.1, n).astype(np.float32) for name, n in STATE_SIZES.items()}
+    return Observation(
+        step=0,
+        images={
+            name: draws.integers(0, 256, (IMAGE_PX, IMAGE_PX, 3), dtype=np.uint8)
+            for name in ("base_camera", "hand_camera")
+        },
+        state={**state, "tcp_pose": pose},
+    )
+
+
+def context(name: str, *, n_rows: int) -> PolicyContext:
+    """Return what a policy of this name is made for: any task, so many rows of a pass."""
+    chunking = ChunkingSpec(n_action_steps=1)
+    return PolicyContext(name=name, env=env_spec(), chunking=chunking, n_candidates=0, n_slots=n_rows)
+
+
+def make_in_process(policy: str, *, n_rows: int, **args: Any) -> Policy:
+    """Make the policy of a recipe in this process; `args` replace those of the recipe."""
+    recipe = load_policy_recipe(policy)
+    made = {**recipe.value.args, **args}
+    return make_from_adapter(recipe.value.adapter, context(recipe.name, n_rows=n_rows), made)
+
+
+# ------------------------------------------------------------------------------------------ a server
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Server:
+    """A policy server in a process of its own."""
+
+    url: str
+    pid: int
+
+    def connect(self) -> RemotePolicy:
+        """Return the policy behind it, with one session on a connection of its own."""
+        return make_remote(context("served", n_rows=1), url=self.url, timeout_seconds=REPLY_SECONDS)
+
+
+@contextmanager
+def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
+    """Serve a policy on a free port, and end the server afterwards.
+
+    Raises:
+        RemotePolicyError: it does not start.
+    """
+    command = [sys.executable, "-m", "vla_eval.cli", "serve", "--policy", policy]
+    command += ["--port", "0", "--max-batch", str(n_rows)]
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        try:
+            assert process.stdout is not None  # it is a pipe
+            found = SERVING.search(process.stdout.readline())
+            if found is None:
+                process.wait(STOP_SECONDS)
+                errors.seek(0)
+                raise RemotePolicyError(f"bench: the server of '{policy}' ended: {errors.read()[-2000:]}")
+            yield Server(url=found.group(1), pid=process.pid)
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+# ------------------------------------------------------------------------------------------ copies
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Load:
+    """What was measured of something that infers.
+
+    Attributes:
+        per_second: inferences.
+        resident_bytes: memory of its processes.
+        device_bytes: memory of the GPU that they took; None: there is none.
+    """
+
+    per_second: float
+    resident_bytes: int
+    device_bytes: int | None
+
+
+def measure_copies(policy: str, *, n_copies: int, seconds: float) -> Load:
+    """Let so many processes infer, each with its own copy of the policy and one thread, for some seconds.
+
+    Raises:
+        RemotePolicyError: a copy could not be made, or ended.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    free_before = free_device_bytes()
+    barrier, results = spawn.Barrier(n_copies), spawn.Queue()
+    processes = [
+        spawn.Process(target=_infer_alone, args=(policy, seconds, index, barrier, results), daemon=True)
+        for index in range(n_copies)
+    ]
+    for process in processes:
+        process.start()
+    try:
+        found = [results.get(timeout=START_SECONDS + seconds) for _ in processes]
+        on_device = taken_bytes(free_before)
+    except Empty as exc:
+        raise RemotePolicyError(
+            f"bench: a copy of '{policy}' gave no result; see its message above."
+        ) from exc
+    finally:
+        for process in processes:
+            process.terminate()
+            process.join()
+    return Load(
+        per_second=sum(per_second for per_second, _ in found),
+        resident_bytes=sum(resident for _, resident in found),
+        device_bytes=on_device,
+    )
+
+
+def _infer_alone(policy: str, seconds: float, seed: int, barrier: Barrier, results: Any) -> None:
+    torch.set_num_threads(1)
+    asker = Asker(make_in_process(policy, n_rows=1), seed=seed)
+    asker.ask()
+    barrier.wait(START_SECONDS)
+    n, begun = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - begun) < seconds:
+        asker.ask()
+        n += 1
+    results.put((n / elapsed, resident_bytes("self")))
+    time.sleep(START_SECONDS)  # until it is ended: the memory of all is measured while all are there
+
+
+def resident_bytes(pid: int | str) -> int:
+    """Return the resident memory of a process."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    found = re.search(r"^VmRSS:\s+(\d+) kB", text, re.MULTILINE)
+    if found is None:
+        raise OSError(f"/proc/{pid}/status has no VmRSS: the process has ended")
+    return KIB * int(found.group(1))
+
+
+def free_device_bytes() -> int | None:
+    """Return the free memory of the GPU; None if there is none."""
+    return int(torch.cuda.mem_get_info()[0]) if torch.cuda.is_available() else None
+
+
+def taken_bytes(free_before: int | None) -> int | None:
+    """Return how much less memory of the GPU is free now than before; None if there is no GPU."""
+    free = free_device_bytes()
+    return None if free is None or free_before is None else free_before - free
