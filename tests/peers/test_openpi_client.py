@@ -1,4 +1,4 @@
-"""openpi's own client, from its wheel with numpy 1, drives a server of `mikasa_vla_client`."""
+"""openpi's own client, from its wheel with numpy 1, drives `mikasa-vla serve`."""
 
 import sys
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.peers.conftest import versions
-from tests.peers.programs import PLUGIN, example, free_port, run_python, running, with_path
+from tests.peers.programs import PLUGIN, ROOT, example, free_port, run_python, running, with_path
 
 pytestmark = pytest.mark.peer
 
@@ -31,6 +31,19 @@ def run_client(python: Path, port: int, folder: Path) -> str:
     done = run_python(python, "client.py", cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+@pytest.mark.parametrize("max_batch", [1, 8])
+def test_openpis_client_gets_chunks_of_a_policy_with_memory(
+    openpi: Path, max_batch: int, tmp_path: Path
+) -> None:
+    port = free_port()
+    serve = [sys.executable, "-m", "vla_eval.cli", "serve", "--policy", "memory_color3", "--port", str(port)]
+    with running([*serve, "--max-batch", str(max_batch)], port, cwd=tmp_path, env=with_path(ROOT)):
+        printed = run_client(openpi, port, tmp_path)
+    name, *shapes = printed.splitlines()
+    assert name == "memory_color3"
+    assert len(shapes) == 3 and len(set(shapes)) == 1 and shapes[0].endswith(", 7)")
 
 
 def test_openpis_client_gets_chunks_of_the_plugins_server(openpi: Path, tmp_path: Path) -> None:
