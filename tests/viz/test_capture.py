@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.experimental import RrdReader
 
 from vla_eval.chunking import ChunkingSpec
@@ -27,6 +28,7 @@ from vla_eval.specs import PolicySpec
 from vla_eval.storage.capture_files import rrd_file, thumbnail_file, video_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.viz.arm_figure import arm_points_m
+from vla_eval.viz.frames import PANEL_PX, PHASE_COLORS, VIEW_PX, compose
 from vla_eval.viz.rerun_log import events, n_overlapping, write_rrd
 from vla_eval.viz.tape import Tapes
 from vla_eval.viz.video import write_video
@@ -119,8 +121,25 @@ def test_a_video_opens_and_is_as_long_as_what_was_captured(tmp_path: Path) -> No
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264" and stream.codec_context.pix_fmt == "yuv420p"
         n_frames = sum(1 for _ in container.decode(stream))
+    with Image.open(path.with_suffix(".jpg")) as poster:
+        assert poster.size == (2 * stream.width, stream.height)  # the first and the last frame
     assert n_frames == 3 + 5  # steps 0, 4, 8, not 3 and 6, where the policy looked; the last one stays
     assert not list(path.parent.glob("*.part"))
+
+
+def test_facts_are_above_the_images_where_a_player_covers_nothing() -> None:
+    _, record, tapes = play(captured=True, stride=4)
+    tape = tapes.episodes[0]
+    frame = compose(tape, tape.captured()[0], record)
+    images = tape.captured()[0].result.observation.images
+    assert frame.shape[:2] == (VIEW_PX + PANEL_PX, VIEW_PX + VIEW_PX // 2)
+    # The viewer's image, below its label, reaches the lower edge; the strip is in the first rows.
+    viewer = np.asarray(
+        Image.fromarray(images[HUMAN_CAMERA]).resize((VIEW_PX, VIEW_PX), Image.Resampling.NEAREST)
+    )
+    assert np.array_equal(frame[PANEL_PX + 40 :, :VIEW_PX], viewer[40:])
+    colors = {tuple(map(int, color)) for color in frame[8, :: VIEW_PX // 64]}
+    assert colors & set(PHASE_COLORS.values())
 
 
 def test_a_video_that_cannot_be_written_says_where_and_of_what(tmp_path: Path) -> None:

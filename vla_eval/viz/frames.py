@@ -1,4 +1,7 @@
-"""Compose the frames of a video: the cameras side by side, and facts about the step below them."""
+"""Compose the frames of a video: the cameras side by side, and facts about the step above them.
+
+They are above, because the controls of a player cover the lower edge.
+"""
 
 from dataclasses import dataclass
 
@@ -29,7 +32,7 @@ SUCCESS_COLOR, FAILURE_COLOR = (47, 196, 154), (255, 138, 61)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caption:
-    """What is written below the images of one step."""
+    """What is written above the images of one step."""
 
     instruction: str
     episode: str
@@ -51,15 +54,21 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Image
     width = VIEW_PX + VIEW_PX // 2
     canvas = Image.new("RGB", (width, VIEW_PX + PANEL_PX), PAPER)
     large = HUMAN_CAMERA if HUMAN_CAMERA in images else small[0]
-    canvas.paste(_scaled(images[large], VIEW_PX), (0, 0))
+    canvas.paste(_scaled(images[large], VIEW_PX), (0, PANEL_PX))
     draw = ImageDraw.Draw(canvas)
+    if large == HUMAN_CAMERA:
+        _label(draw, (6, PANEL_PX + 4), "viewer camera, not seen by the policy")
     for row, name in enumerate(small[:2]):
-        top = row * VIEW_PX // 2
+        top = PANEL_PX + row * VIEW_PX // 2
         canvas.paste(_scaled(images[name], VIEW_PX // 2), (VIEW_PX, top))
-        draw.text((VIEW_PX + 6, top + 4), name, font=_font(13), fill=INK, stroke_width=2, stroke_fill=PAPER)
+        _label(draw, (VIEW_PX + 6, top + 4), name)
     _write(draw, _caption(tape, taped, record), width)
     _draw_strip(draw, tape, taped, record, width)
     return np.asarray(canvas, dtype=np.uint8)
+
+
+def _label(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str) -> None:
+    draw.text(place, text, font=_font(13), fill=INK, stroke_width=2, stroke_fill=PAPER)
 
 
 def _scaled(image: ImageArray, size_px: int) -> Image.Image:
@@ -97,7 +106,7 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Capt
 
 
 def _write(draw: ImageDraw.ImageDraw, caption: Caption, width: int) -> None:
-    top = VIEW_PX + STRIP_PX + 8
+    top = STRIP_PX + 10
     font, bold = _font(17), _font(18)
     lines = ((caption.instruction, bold, INK), (caption.episode, font, FAINT), (caption.step, font, INK))
     for index, (text, fitting, color) in enumerate(lines):
@@ -124,7 +133,7 @@ def _draw_strip(
 ) -> None:
     """Draw the episode as a strip: phases, chunk boundaries as ticks, success, and the current step."""
     n_steps = max(tape.start.horizon_steps, 1)
-    top, bottom = VIEW_PX + 2, VIEW_PX + 2 + STRIP_PX
+    top, bottom = 2, 2 + STRIP_PX
 
     def x_of(step: int) -> float:
         return step / n_steps * (width - 1)

@@ -1,10 +1,11 @@
-"""Write a taped episode as an H.264 mp4 that opens in a browser, and its last frame as a JPEG."""
+"""Write a taped episode as an H.264 mp4 that opens in a browser, and its first and last frame as a JPEG."""
 
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
 
 import av
+import numpy as np
 from PIL import Image
 
 from vla_eval.errors import ViewingError
@@ -27,7 +28,8 @@ def write_video(
         tape: the episode.
         record: its record.
         path: the mp4; it is there whole or not at all.
-        thumbnail: the JPEG.
+        thumbnail: the JPEG: the first frame, which shows the cue, and beside it the last one, which shows
+            what was chosen.
         frame_rate_hz: captured steps per second of the episode, so that the video is as fast as the episode.
 
     Raises:
@@ -50,7 +52,9 @@ def write_video(
             for frame in [*frames, *frames[-1:] * round(HOLD_SECONDS * frame_rate_hz)]:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
             container.mux(stream.encode())
-        Image.fromarray(frames[-1]).save(thumbnail, format="JPEG", quality=JPEG_QUALITY)
+        Image.fromarray(np.concatenate([frames[0], frames[-1]], axis=1)).save(
+            thumbnail, format="JPEG", quality=JPEG_QUALITY
+        )
         unfinished.replace(path)
     except (OSError, av.error.FFmpegError, ValueError) as exc:
         raise ViewingError(

@@ -27,7 +27,9 @@
   };
 
   function fill(name, values) {
-    for (const value of [...new Set(values)]) form.elements[name].add(new Option(value, value));
+    const several = [...new Set(values)];
+    for (const value of several) form.elements[name].add(new Option(value, value));
+    form.elements[name].closest("label").hidden = several.length < (name === "error" ? 1 : 2);
   }
   fill("task", data.rows.map((row) => row.task));
   fill("policy", data.rows.map((row) => row.policy));
