@@ -68,6 +68,19 @@ def test_an_example_passes_both_checks(
     assert done.stdout.count("ok  ") > 10
 
 
+def test_the_lowest_versions_that_it_declares_are_enough(
+    make_environment: Callable[..., Path], elsewhere: dict[str, Path], tmp_path: Path
+) -> None:
+    if not versions(elsewhere["wheel"])["python"].startswith("3.8."):
+        pytest.skip("msgpack 1.0.0 has wheels for Python 3.8 and no later one")
+    python = make_environment(str(PLUGIN), "numpy==1.22.0", "msgpack==1.0.0", "websockets==13.0")
+    port = free_port()
+    name = "memory_policy.py"
+    (tmp_path / name).write_text(example(PAGE, name).replace("8000", str(port)))
+    with running([python, name], port, cwd=tmp_path):
+        assert "requirements checked, all met" in mikasa_vla("check", f"ws://127.0.0.1:{port}")
+
+
 @pytest.mark.parametrize(
     ("simulator", "n_episodes"), [("fake", 12), pytest.param("maniskill", 4, marks=pytest.mark.slow)]
 )
