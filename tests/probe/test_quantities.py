@@ -151,3 +151,19 @@ def test_the_share_left_is_a_ratio_of_the_same_episodes() -> None:
     assert interval.low is not None and interval.high is not None
     assert 0 < interval.low < 0.5 < interval.high <= 1
     assert share_left(~before & before, after) is None
+
+
+def test_where_all_draws_are_alike_the_intervals_still_have_a_width() -> None:
+    all_follow = np.ones(12, dtype=bool)
+    found = share_left(all_follow, all_follow)
+    low = wilson_interval(12, 12)
+    assert found is not None and low is not None
+    assert found == (1.0, pytest.approx((low.low, 1 / low.low)))
+    none_left = share_left(all_follow, ~all_follow)
+    most = wilson_interval(0, 12)
+    assert none_left is not None and most is not None
+    assert none_left == (0.0, pytest.approx((0.0, most.high / low.low)))
+    # From 12 of 12 to 0 of 12 between delays of 10 and 20: half way by the line, anywhere by the data.
+    sudden = half_life(followed(12, 12, 0, of=12), chance=0.0)
+    assert sudden is not None
+    assert (sudden.steps, sudden.interval) == (15.0, Range(10, 20))

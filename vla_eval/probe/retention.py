@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from vla_eval.results.estimates import CONFIDENCE, p_above
+from vla_eval.results.estimates import CONFIDENCE, Interval, p_above, wilson_interval
 
 N_DRAWS = 1000
 BOOTSTRAP_SEED = 20260927
@@ -72,8 +72,14 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
         for _ in range(N_DRAWS)
     ]
     low, high = _quantiles(drawn)
+    steps = _halved_at(delays, episodes.mean(axis=1), chance)
+    if (
+        low == high and steps != BEYOND
+    ):  # all draws are alike: then no more is known than between which delays
+        low = max((delay for delay in delays if delay < steps), default=delays[0])
+        high = min(delay for delay in delays if delay >= steps)
     return HalfLife(
-        steps=_known(_halved_at(delays, episodes.mean(axis=1), chance)),
+        steps=_known(steps),
         interval=Range(_known(low), _known(high)),
         longest_delay=delays[-1],
     )
@@ -95,7 +101,12 @@ def _halved_at(delays: Sequence[int], rates: NDArray[np.float64], chance: float)
 
 
 def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
-    """Return after / before, with its interval by bootstrap over seeds; None if there was nothing before."""
+    """Return after / before, with its interval; None if there was nothing before.
+
+    The interval is that of the bootstrap over seeds. Where all draws are alike, as with 12 of 12, it would
+    have no width, as if there were no uncertainty. Then it is that of the least and the most that both
+    Wilson intervals allow.
+    """
     if not before.any():
         return None
     rng = np.random.default_rng(BOOTSTRAP_SEED)
@@ -106,7 +117,17 @@ def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
         n_before = int(before[chosen].sum())
         drawn.append(int(after[chosen].sum()) / n_before if n_before else BEYOND)
     low, high = _quantiles(drawn)
+    if low == high:
+        least_before, most_before = _wilson(before)
+        least_after, most_after = _wilson(after)
+        low, high = least_after / most_before, most_after / least_before
     return float(after.sum() / before.sum()), Range(_known(low), _known(high))
+
+
+def _wilson(followed: Followed) -> Interval:
+    found = wilson_interval(int(followed.sum()), len(followed))
+    assert found is not None  # there is an episode: the caller has found one that follows the cue
+    return found
 
 
 def _quantiles(values: Sequence[float]) -> tuple[float, float]:
