@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vla_eval.envs.fake import ACTION, CAMERAS, STATES
 from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.policies.remote.actions import as_rows, converted
 from vla_eval.policies.remote.images import resized
 from vla_eval.policies.remote.settings import ActionSettings, remote_settings, settings_digest
 from vla_eval.policies.remote.state_layouts import axis_angle, state_layout
 from vla_eval.specs import EnvSpec, StateSpec
+from vla_eval.tasks.interface import ACTION, env_spec
 
-ENV = EnvSpec(task="T-v0", cameras=CAMERAS, states=STATES, action=ACTION, horizon_steps=1, control_hz=20.0)
+ENV = env_spec()
 STATE = {
     # 0.1, 0.2, 0.3 m; a quarter turn about z: cos and sin of an eighth of a turn.
     "tcp_pose": np.array([0.1, 0.2, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)], dtype=np.float32),
