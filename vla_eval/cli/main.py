@@ -32,6 +32,7 @@ VERBS = (
     "show",
     "doctor",
     "bench",
+    "completion",
 )
 FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
 
