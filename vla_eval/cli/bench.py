@@ -128,7 +128,7 @@ def _serving(args: argparse.Namespace) -> int:
     for one in report.rounding:
         print(
             f"{one.precision}: actions of a pass with {one.n_rows} rows and of one with a single row differ "
-            f"by at most {one.largest:.1e}; the largest action is {one.scale:.2g}."
+            f"by at most {one.largest:.2g}; the largest action is {one.scale:.2g}."
         )
     return 0
 
