@@ -1,5 +1,6 @@
 """What a fine-tuning is told: recipes, datasets, bases and options; what cannot be trained is refused."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,18 @@ class TestRefusals:
         else:  # also with the waiver: it waives ignorance, not a mismatch
             with pytest.raises(DatasetError, match=r"episode 2: other states"):
                 training_dataset(recorded, allow_unreplayed=True)
+
+    def test_a_folder_that_holds_one_dataset_stands_for_it(self, recorded: Path, tmp_path: Path) -> None:
+        shutil.copytree(recorded, tmp_path / "demos" / "one")
+        assert training_dataset(tmp_path / "demos", allow_unreplayed=True).root == tmp_path / "demos" / "one"
+
+    def test_a_folder_that_holds_several_datasets_is_answered_by_their_names(
+        self, recorded: Path, tmp_path: Path
+    ) -> None:
+        for name in ("one", "two"):
+            shutil.copytree(recorded, tmp_path / "demos" / name)
+        with pytest.raises(DatasetError, match=r"expected one dataset, found 2: one, two\. Name one"):
+            training_dataset(tmp_path / "demos", allow_unreplayed=True)
 
     def test_a_changed_file_is_refused(self, recorded: Path) -> None:
         (recorded / "meta/stats.json").write_text("{}")

@@ -39,7 +39,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         help="recipe in policies/ with a `finetune` section; of a table: its rows",
     )
     parser.add_argument("--task", nargs="+", dest="tasks", metavar="T", help="of a table: its tasks")
-    parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset")
+    parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset, or a folder that holds one")
     parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")
     parser.add_argument("--batch-size", type=int, metavar="B", help="samples per step (the recipe's)")
     parser.add_argument("--run-seed", type=int, metavar="S", help="seed of weights, order and noise (0)")

@@ -9,10 +9,11 @@ from typing import Any  # lerobot is untyped
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.imported import ImportFacts
+from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import FileDigest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
-from vla_eval.errors import DatasetError
+from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import CAMERA_KEYS
 
 RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # of the actions in our demonstrations
@@ -45,11 +46,14 @@ class TrainingDataset:
 def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
     """Return a dataset that is complete and, unless that is waived, was replayed without a mismatch.
 
+    Args:
+        root: the folder of a dataset, or a folder that holds exactly one.
+        allow_unreplayed: return it although no replay has confirmed it.
+
     Raises:
-        DatasetError: it is not.
+        DatasetError: it is not, or the folder holds several.
     """
-    if not root.is_dir():
-        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
+    root = _one_dataset(root)
     facts = check_complete(root)
     is_import = isinstance(facts, ImportFacts)
     report = None if is_import else require_passed(root)
@@ -79,6 +83,21 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
         was_replayed=report is not None,
         meta=opened.meta,
     )
+
+
+def _one_dataset(root: Path) -> Path:
+    """Return the folder itself, or the one dataset in it: `record --out DIR` makes DIR/TASK."""
+    if not root.is_dir():
+        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
+    if (root / INFO_FILE).is_file():
+        return root
+    held = sorted(path for path in root.iterdir() if (path / INFO_FILE).is_file())
+    if len(held) > 1:
+        raise DatasetError(
+            f"{root}: expected one dataset, found {len(held)}: {some_of(path.name for path in held)}. Name "
+            f"one, for example --dataset {held[0]}"
+        )
+    return held[0] if held else root
 
 
 def files_sha256(files: Mapping[str, FileDigest]) -> str:
