@@ -56,29 +56,23 @@ def check_policy(
         SpecMismatchError: the policy needs what the environment does not provide.
         ConformanceError: a requirement is not met.
     """
-    met: list[str] = []
-
-    def note(requirement: str) -> None:
-        met.append(requirement)
-        report(requirement)
-
     policy = make()
-    spec = policy.spec
-    check_compatible(spec, env)
-    note(f"{env.task} provides what it reads: {', '.join((*spec.cameras, *spec.states)) or 'nothing'}.")
-    runs = _Runs(spec, env, observe, instruction)
+    check_compatible(policy.spec, env)
+    runs = _Runs(policy.spec, env, observe, instruction)
+    met = _Requirements(report)
+    met.note(f"{env.task} provides what it reads: {_inputs(policy.spec)}.")
     alone = [runs.run(policy, _Episode(slot=slot, seed=seed))[0] for slot, seed in enumerate((2, 1))]
-    note(f"A chunk is float32 of shape {runs.chunk_shape} and finite.")
-    note("It leaves the observations as they are.")
-    note("No two chunks share a buffer.")
+    met.note(f"A chunk is float32 of shape {runs.chunk_shape} and finite.")
+    met.note("It leaves the observations as they are.")
+    met.note("No two chunks share a buffer.")
+    _check_independence(make, policy, runs, alone, met)
+    return met.requirements
 
-    def same(found: Sequence[_Episode], where: str, advice: str) -> None:
-        for episode in found:
-            expected = alone[episode.slot].chunks
-            pairs = zip(expected, episode.chunks, strict=True)
-            equal = all(np.array_equal(a.actions, b.actions) for a, b in pairs)
-            claim(equal, f"{SAME} {where}.", advice=advice)
-        note(f"{SAME} {where}.")
+
+def _check_independence(
+    make: Callable[[], Policy], policy: Policy, runs: "_Runs", alone: Sequence[_Episode], met: "_Requirements"
+) -> None:
+    """Compare episodes in all kinds of company with the same ones alone."""
 
     def first() -> _Episode:
         return _Episode(slot=0, seed=2)
@@ -86,14 +80,38 @@ def check_policy(
     def second(begins_after: int = 0) -> _Episode:
         return _Episode(slot=1, seed=1, begins_after=begins_after)
 
-    same(runs.run(policy, first()), "after another episode", FORGET)
+    met.same(alone, runs.run(policy, first()), "after another episode", FORGET)
     runs.run(policy, _Episode(slot=1, seed=3))
-    same(runs.run(policy, second()), "after another episode in the same slot", FORGET)
-    same(runs.run(make(), second()), "in a new policy", FORGET)
-    same(runs.run(policy, first(), second()), "beside another episode", BY_SLOT)
+    met.same(alone, runs.run(policy, second()), "after another episode in the same slot", FORGET)
+    met.same(alone, runs.run(make(), second()), "in a new policy", FORGET)
+    met.same(alone, runs.run(policy, first(), second()), "beside another episode", BY_SLOT)
     meanwhile = runs.run(policy, first(), second(begins_after=1))
-    same(meanwhile, "when another episode begins or ends meanwhile", BY_SLOT)
-    return met
+    met.same(alone, meanwhile, "when another episode begins or ends meanwhile", BY_SLOT)
+
+
+class _Requirements:
+    """The requirements that are met so far."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self.requirements: list[str] = []
+        self._report = report
+
+    def note(self, requirement: str) -> None:
+        """Add one."""
+        self.requirements.append(requirement)
+        self._report(requirement)
+
+    def same(self, alone: Sequence[_Episode], found: Sequence[_Episode], where: str, advice: str) -> None:
+        """Require the actions that each episode has alone; `alone` is in the order of the slots."""
+        for episode in found:
+            pairs = zip(alone[episode.slot].chunks, episode.chunks, strict=True)
+            equal = all(np.array_equal(a.actions, b.actions) for a, b in pairs)
+            claim(equal, f"{SAME} {where}.", advice=advice)
+        self.note(f"{SAME} {where}.")
+
+
+def _inputs(spec: PolicySpec) -> str:
+    return ", ".join((*spec.cameras, *spec.states)) or "nothing"
 
 
 class _Runs:
