@@ -44,6 +44,8 @@ USED = {
         "format",
         "baseline",
         "paper",
+        "preset",
+        "wide",
         "tiny",
         "html",
         "help",
@@ -295,6 +297,7 @@ def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.
         ("eval", "--episodes", "3"),
         ("eval", "--seed-start", "0"),
         ("eval", "--set", "runs=2"),
+        ("eval", "--serve"),
         ("finetune", "--run-seed", "0"),
         ("finetune", "--held-out-episodes", "3"),
         ("finetune", "--set", "batch_size=2"),
@@ -303,8 +306,8 @@ def test_flags_that_a_table_sets_itself_are_refused(small: Path, capsys: pytest.
 def test_no_flag_is_passed_over(
     small: Path, tmp_path: Path, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    verb, flag, value = flags
-    assert main([verb, str(small), flag, value, "--out", str(tmp_path / "out")]) == 1
+    verb, flag, *value = flags
+    assert main([verb, str(small), flag, *value, "--out", str(tmp_path / "out")]) == 1
     assert f"{flag}: a table of learned policies sets this itself" in capsys.readouterr().err
 
 

@@ -39,6 +39,7 @@ EVAL_FLAGS = {
     "overrides": "--set",
     "capture_video": "--capture-video",
     "capture_rrd": "--capture-rrd",
+    "serve": "--serve",
 }
 """Flags that a table does not take, by the name of their value.
 
@@ -227,7 +228,8 @@ def _free_memory() -> None:
 
 
 def _refuse(args: argparse.Namespace, flags: Mapping[str, str]) -> None:
-    given = [flag for name, flag in flags.items() if getattr(args, name) not in (None, [])]
+    values = {flag: getattr(args, name) for name, flag in flags.items()}
+    given = [flag for flag, value in values.items() if not (value is None or value is False or value == [])]
     if given:
         raise RecipeError(
             f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "
