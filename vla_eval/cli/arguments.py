@@ -1,6 +1,7 @@
 """Shared by several verbs: kinds of arguments, exit codes, the typed command."""
 
 import argparse
+import math
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -61,6 +62,38 @@ def set_flags(data: dict[str, Any], args: argparse.Namespace, names: Sequence[st
 def add_overrides(parser: argparse.ArgumentParser, *, help: str) -> None:
     """Declare `--set A.B=C`, as often as one likes."""
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="A.B=C", help=help)
+
+
+def add_dry_run(parser: argparse.ArgumentParser) -> None:
+    """Declare `--dry-run` and the rate that it assumes."""
+    parser.add_argument(
+        "--dry-run", action="store_true", help="show what would run and what it takes; run nothing"
+    )
+    parser.add_argument(
+        "--tflops",
+        type=positive_argument,
+        metavar="N",
+        help="with --dry-run: rate to assume, 10^12 operations per second (100 for a GPU)",
+    )
+
+
+def positive_argument(text: str) -> float:
+    """Read a number above zero."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, found '{text}'")
+    return number
+
+
+def memory_argument(text: str) -> float:
+    """Read a size of memory, `80GB` or `80GiB`, in bytes."""
+    for unit, n_bytes in (("GiB", 1 << 30), ("GB", 10**9)):
+        if text.endswith(unit):
+            return positive_argument(text.removesuffix(unit)) * n_bytes
+    raise argparse.ArgumentTypeError(f"expected a size such as 80GB or 80GiB, found '{text}'")
 
 
 def add_old_flag(

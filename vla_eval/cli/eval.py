@@ -12,6 +12,7 @@ from vla_eval.cli.arguments import (
     add_overrides,
     add_verb,
     add_workers,
+    positive_argument,
     set_flags,
     typed_command,
 )
@@ -78,7 +79,26 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
     add_overrides(parser, help="change any field of the configuration")
+    _add_dry_run_arguments(parser)
     add_allow_environment_change(parser, consequence="; the table will say so")
+
+
+def _add_dry_run_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--dry-run", action="store_true", help="show what would run and what it takes; run nothing"
+    )
+    parser.add_argument(
+        "--steps-per-second",
+        type=positive_argument,
+        metavar="N",
+        help="with --dry-run: control steps of a worker to assume (20)",
+    )
+    parser.add_argument(
+        "--inference-seconds",
+        type=positive_argument,
+        metavar="S",
+        help="with --dry-run: an inference of a learned policy to assume (0.2)",
+    )
 
 
 def _add_capture_arguments(parser: argparse.ArgumentParser) -> None:
@@ -118,6 +138,8 @@ def run(args: argparse.Namespace) -> int:
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
+    if args.dry_run:
+        return _dry_run(config, args)
     check_table_arguments(args)
     check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
@@ -148,6 +170,15 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_html([found], args)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
+
+
+def _dry_run(config: EvalConfig, args: argparse.Namespace) -> int:
+    from vla_eval.evaluation.dry_run import AssumedRates, describe_evaluation
+
+    named = {name: getattr(args, name) for name in ("steps_per_second", "inference_seconds")}
+    rates = AssumedRates(**{name: value for name, value in named.items() if value is not None})
+    print("\n".join(describe_evaluation(config, out=args.out, rates=rates)))
+    return 0
 
 
 def _which(text: str, *, flag: str) -> str | int:

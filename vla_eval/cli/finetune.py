@@ -5,7 +5,15 @@ import contextlib
 import sys
 from typing import Any
 
-from vla_eval.cli.arguments import add_old_flag, add_overrides, add_verb, set_flags, typed_command
+from vla_eval.cli.arguments import (
+    add_dry_run,
+    add_old_flag,
+    add_overrides,
+    add_verb,
+    memory_argument,
+    set_flags,
+    typed_command,
+)
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -61,19 +69,39 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
     )
     add_overrides(parser, help="change any field of the recipe's `finetune` section")
+    add_dry_run(parser)
+    parser.add_argument(
+        "--device-memory",
+        type=memory_argument,
+        metavar="SIZE",
+        help="with --dry-run: memory of the device, 80GB (the GPU's here)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Fine-tune; lines for a person go to standard error, the checkpoint's folder to standard output."""
     if args.config is not None and is_model_table(args.config):
-        from vla_eval.cli.model_table import finetune_table
+        from vla_eval.cli.model_table import describe_table, finetune_table
 
+        if args.dry_run:
+            with contextlib.redirect_stdout(sys.stderr):
+                lines = describe_table(args)
+            print("\n".join(lines))
+            return 0
         return finetune_table(args)
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from tqdm import tqdm
 
     from vla_eval.training.finetune import finetune
 
+    if args.dry_run:
+        from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
+
+        options = DryRunOptions(device_bytes=args.device_memory, tflops=args.tflops)
+        with contextlib.redirect_stdout(sys.stderr):
+            lines = describe_finetuning(_config(args), options)
+        print("\n".join(lines))
+        return 0
     command = typed_command()
     with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
         summary = finetune(_config(args), command=command, say=lambda line: tqdm.write(line, file=sys.stderr))

@@ -32,6 +32,7 @@ FINETUNE_FLAGS = {
     "overrides": "--set",
 }
 EVAL_FLAGS = {
+    "dry_run": "--dry-run",
     "n_action_steps": "--n-action-steps",
     "episodes": "--episodes",
     "seed_start": "--seed-start",
@@ -67,6 +68,25 @@ def finetune_table(args: argparse.Namespace) -> int:
     for one in finetunings(work.table, work.out):
         print(one.config.out)
     return 0
+
+
+def describe_table(args: argparse.Namespace) -> list[str]:
+    """Return what fine-tuning the table takes, for a person: all of it, then each row on its first task."""
+    from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
+
+    _refuse(args, FINETUNE_FLAGS)
+    work = _work(args, rows=args.policy)
+    n_finished = len(finetunings(work.table, work.out)) - len(_unfinished(work))
+    lines = [describe_effort(work.table, n_finished=n_finished)]
+    options = DryRunOptions(device_bytes=args.device_memory, tflops=args.tflops)
+    seen: set[str] = set()
+    for one in finetunings(work.table, work.out):
+        if one.row.name in seen:
+            continue
+        seen.add(one.row.name)
+        config = replace(one.config, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
+        lines += ["", f"{one.row.name}:", *describe_finetuning(config, options)]
+    return lines
 
 
 def evaluate_table(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
-from vla_eval.training.description import describe_model
+from vla_eval.training.estimate import RateWatch, estimate
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
@@ -81,9 +81,17 @@ def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None)
     """Return what gets the progress: a person, a tracker of metrics, the evaluation of checkpoints."""
     steps = job.recipe.steps
 
+    watches: list[RateWatch] = []
+
     def describe(model: Any) -> None:  # Any: a torch module of lerobot's
-        for line in describe_model(model).lines():
+        found = estimate(model, job.policy, job.recipe, device=job.device)
+        watches.append(RateWatch(found, job.first_step, say))
+        for line in found.model.lines():
             say(line)
+
+    def time_step(step: int, seconds: float) -> None:
+        if _is_first_process():
+            watches[0].on_step(step, seconds)
 
     def report(line: Mapping[str, float]) -> None:
         seconds = line["update_s"] + line["dataloading_s"]
@@ -97,7 +105,7 @@ def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None)
         if held_out is not None and held_out.is_due(int(checkpoint.name)):
             held_out.evaluate(checkpoint)
 
-    return Listeners(on_model=describe, on_metrics=report, on_checkpoint=evaluate)
+    return Listeners(on_model=describe, on_metrics=report, on_checkpoint=evaluate, on_step=time_step)
 
 
 def _held_out(job: TrainingJob, say: Say, track: Log) -> HeldOut | None:

@@ -57,11 +57,13 @@ class Listeners:
         on_model: called with the model before its optimizer is made.
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
+        on_step: called with each step, counted from 1, and its seconds, loading included.
     """
 
     on_model: Callable[[Any], None]
     on_metrics: Callable[[Mapping[str, float]], None]
     on_checkpoint: Callable[[Path], None]
+    on_step: Callable[[int, float], None]
 
 
 def train(job: TrainingJob, listeners: Listeners) -> None:
@@ -86,7 +88,9 @@ def train(job: TrainingJob, listeners: Listeners) -> None:
         wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
         silent = not (is_main and sys.stderr.isatty())
         for step in tqdm(range(job.first_step + 1, recipe.steps + 1), desc="Training", disable=silent):
+            started = time.perf_counter()
             training.do_step(step)
+            listeners.on_step(step, time.perf_counter() - started)
             if step % recipe.log_every_steps == 0:
                 line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
                 if is_main:

@@ -148,12 +148,12 @@ def _address_ours(
 @contextlib.contextmanager
 def local_files_only(job: TrainingJob) -> Iterator[None]:
     """Let the policy's processors use the recipe's tokenizer, and nothing run code that a file names."""
-    with _tokenizer_from(job.recipe.tokenizer, job.recipe.type), no_foreign_code(job.recipe.type):
+    with tokenizer_from(job.recipe.tokenizer, job.recipe.type), no_foreign_code(job.recipe.type):
         yield
 
 
 @contextlib.contextmanager
-def _tokenizer_from(folder: str | None, kind: str) -> Iterator[None]:
+def tokenizer_from(folder: str | None, kind: str) -> Iterator[None]:
     """Replace the tokenizer of new processors: lerobot has the names of π0's written into its code."""
     if folder is None:
         yield

@@ -1,0 +1,147 @@
+"""A dry run says what a fine-tuning takes, from shapes alone, and changes nothing."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from tests.training import tiny_trainings
+from vla_eval.cli.main import main
+from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.training import dry_run
+from vla_eval.training.dry_run import DryRunOptions, assumed_config, describe_finetuning
+from vla_eval.training.estimate import ASSUMED_STEPS, RateWatch, estimate, unfilled_model
+from vla_eval.training.finetune import finetune
+from vla_eval.training.job import load_finetune_recipe
+from vla_eval.training.sample_cost import SAVED_PER_LINEAR, sample_cost
+
+offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own
+GEMMA_EMBEDDINGS = 257_152 * 2_048
+"""Of PaliGemma: a published file has them once, lerobot's network twice, as input and as unused output."""
+
+
+def recipe_of(policy: str) -> FinetuneRecipe:
+    from vla_eval.config.finetuning import FinetuneConfig
+
+    return load_finetune_recipe(FinetuneConfig(policy=policy, dataset="demos")).value
+
+
+@pytest.mark.parametrize(
+    ("policy", "published"),
+    [
+        # Bytes of the published float32 files (docs/hardware.md): 4 per number, and a header.
+        ("pi0", 14_005_618_584 / 4),
+        ("pi05", 14_467_165_872 / 4),
+    ],
+)
+def test_the_pi0_family_has_the_published_number_of_parameters(policy: str, published: float) -> None:
+    recipe = recipe_of(policy)
+    model = unfilled_model(assumed_config(recipe), recipe)
+    n_parameters = sum(x.numel() for x in model.parameters()) - GEMMA_EMBEDDINGS
+    assert 0 < published - n_parameters < 50_000  # 812 names, shapes and offsets as JSON
+
+
+def test_octo_and_openvla_have_the_published_number_of_parameters() -> None:
+    octo, openvla = recipe_of("octo_small"), recipe_of("openvla_oft")
+    model = unfilled_model(assumed_config(octo), octo)
+    assert sum(x.numel() for x in model.parameters()) == 136_670_604  # with T5; docs/hardware.md
+    assert sum(x.numel() for x in model.parameters() if x.requires_grad) == 1_703_564
+    found = estimate(
+        unfilled_model(assumed_config(openvla), openvla), assumed_config(openvla), openvla, device="cpu"
+    )
+    # LoRA of rank 32 (110 to 113 million, docs/openvla.md) and the head of 151 million.
+    assert 110e6 < found.model.n_trained - 151_084_039 < 113e6
+
+
+class Network(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.transformer = nn.ModuleDict({"fc": nn.Linear(10, 20)}).requires_grad_(False)
+        self.head = nn.ModuleDict({"first": nn.Linear(20, 30), "last": nn.Linear(30, 7)})
+
+
+def test_operations_and_activations_are_those_of_the_layers_that_gradients_reach() -> None:
+    config: Any = SimpleNamespace(type="mikasa_octo", window=2)
+    cost = sample_cost(Network(), config)
+    assert cost is not None
+    tokens = 16 + 337 * 2
+    trunk, head = 2 * 10 * 20 * tokens, 2 * (20 * 30 + 30 * 7) * 2
+    assert cost.inference_operations == trunk + head
+    assert cost.step_operations == trunk + 3 * head  # forward; by weights and by inputs for the head alone
+    kept, working = SAVED_PER_LINEAR * 2 * (20 + 30 + 30 + 7), tokens * (10 + 20)
+    assert cost.saved_bytes == pytest.approx(4 * (kept + working))
+    assert sample_cost(Network(), SimpleNamespace(type="act")) is None
+
+
+def test_the_largest_batch_is_what_fits_beside_weights_gradients_and_optimizer() -> None:
+    recipe = FinetuneRecipe(type="mikasa_octo", steps=100, batch_size=8)
+    found = estimate(
+        Network(), SimpleNamespace(type="mikasa_octo", window=2), recipe, device="cpu", tflops=2.0
+    )
+    n_frozen, n_trained = 10 * 20 + 20, 20 * 30 + 30 + 30 * 7 + 7
+    assert found.fixed_bytes == 4 * (n_frozen + 4 * n_trained)  # weights; and gradient and AdamW's moments
+    assert found.cost is not None
+    device = (found.fixed_bytes + 3.5 * found.cost.saved_bytes) / 0.95
+    assert found.largest_batch(device) == 3
+    assert found.largest_batch(1.0) == 0
+    assert found.step_seconds == pytest.approx(8 * found.cost.step_operations / 2e12)
+
+
+def test_after_the_first_steps_the_real_rate_replaces_the_assumed_one_once() -> None:
+    recipe = FinetuneRecipe(type="mikasa_octo", steps=1_050, batch_size=8)
+    found = estimate(Network(), SimpleNamespace(type="mikasa_octo", window=2), recipe, device="cpu")
+    lines: list[str] = []
+    watch = RateWatch(found, 0, lines.append)
+    for step in range(1, ASSUMED_STEPS + 20):
+        watch.on_step(step, 100.0 if step <= ASSUMED_STEPS // 2 else 3.6)
+    (line,) = lines
+    assert "3.600 s per step" in line and "assumed were" in line and "1.0 h left for 1,000 steps" in line
+
+
+def test_what_is_not_there_is_named_with_the_command_that_gets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = [
+        "--policy",
+        "octo_small",
+        "--dataset",
+        "demos/RC3",
+        "--device-memory",
+        "24GB",
+        "--device",
+        "cpu",
+    ]
+    assert main(["finetune", *arguments, "--dry-run"]) == 0
+    printed = capsys.readouterr().out
+    assert (
+        "mikasa-vla checkpoint fetch octo_small" in printed and "not there: the dataset demos/RC3" in printed
+    )
+    assert "trained: 1,703,564 of 136,670,604" in printed
+    assert "50,000 of 64 samples, 3,200,000 samples" in printed
+    assert "largest batch in 24 GB, estimated:" in printed and "assumptions:" in printed
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_describes_the_real_dataset_and_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    config = tiny_trainings.act(recorded, out)
+    lines = "\n".join(describe_finetuning(config, DryRunOptions()))
+    assert "55 frames begin a sample; 0.1 passes over them" in lines  # 4 steps of 2, of 13 + 14 + 15 + 13
+    assert not out.exists()
+    finetune(config)
+    assert "resuming from step 4" in "\n".join(describe_finetuning(config, DryRunOptions()))
+
+
+def test_a_size_of_memory_has_a_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["finetune", "--policy", "act", "--dataset", "d", "--dry-run", "--device-memory", "80"])
+    assert "expected a size such as 80GB" in capsys.readouterr().err
+
+
+def test_no_memory_of_a_gpu_is_assumed_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert dry_run._memory_here() is None

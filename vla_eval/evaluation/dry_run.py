@@ -1,0 +1,153 @@
+"""`eval --dry-run`: what would run, and what it takes. Starts no worker and writes nothing."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.evaluation.evaluate import default_run_folder, worker_count
+from vla_eval.evaluation.job_queue import JobQueue
+from vla_eval.evaluation.plan import EpisodeJob, Plan, make_plan
+from vla_eval.policies.checkpoint import find_checkpoint, weights_file
+from vla_eval.records import EpisodeKey
+from vla_eval.storage.run_file import RUN_FILE
+from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.catalog import task_spec
+
+N_CAMERAS = 2
+LEARNED = "checkpoint"  # the argument of adapters that load weights
+GB = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AssumedRates:
+    """What is assumed of a machine.
+
+    Attributes:
+        steps_per_second: control steps of one worker, images included.
+        inference_seconds: of one inference of a learned policy; scripted ones take none.
+    """
+
+    steps_per_second: float = 20.0
+    inference_seconds: float = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationEffort:
+    """What is left of an evaluation; steps, inferences and frames at most, as if no episode ended early.
+
+    Attributes:
+        n_episodes, n_finished: of all, and those that have a result.
+        n_steps: control steps.
+        n_inferences: of all policies.
+        n_learned_inferences: of those that load weights.
+        n_frames: images that are rendered, of two cameras, at each inference.
+        n_workers: processes.
+        copies: learned policies -> bytes of their weights; each worker loads its own copy.
+    """
+
+    n_episodes: int
+    n_finished: int
+    n_steps: int
+    n_inferences: int
+    n_learned_inferences: int
+    n_frames: int
+    n_workers: int
+    copies: dict[str, int]
+
+    def seconds(self, rates: AssumedRates) -> float:
+        """Return how long it takes at these rates, all workers busy to the end."""
+        busy = self.n_steps / rates.steps_per_second + self.n_learned_inferences * rates.inference_seconds
+        return busy / self.n_workers
+
+
+def describe_evaluation(config: EvalConfig, *, out: Path | None, rates: AssumedRates) -> list[str]:
+    """Return lines for a person.
+
+    Raises:
+        VlaEvalError: a mistake in the configuration, a recipe or a checkpoint; a folder of another run.
+    """
+    path = out or default_run_folder(config)
+    return list(_lines(config, path, evaluation_effort(config, out=path), rates))
+
+
+def evaluation_effort(config: EvalConfig, *, out: Path) -> EvaluationEffort:
+    """Return what is left to run.
+
+    Raises:
+        VlaEvalError: see `describe_evaluation`.
+    """
+    plan = make_plan(config)
+    finished = _finished(out)
+    ahead = [job for job in plan.jobs if job.key not in finished]
+    queue = JobQueue(plan.jobs, finished=finished)
+    steps = [_horizon(job) for job in ahead]
+    inferences = [_inferences(job) for job in ahead]
+    learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
+    return EvaluationEffort(
+        n_episodes=len(plan.jobs),
+        n_finished=len(plan.jobs) - len(ahead),
+        n_steps=sum(steps),
+        n_inferences=sum(inferences),
+        n_learned_inferences=sum(learned),
+        n_frames=N_CAMERAS * sum(inferences),
+        n_workers=worker_count(config, plan, n_jobs=queue.n_batches),
+        copies=_copies(plan),
+    )
+
+
+def _lines(config: EvalConfig, out: Path, effort: EvaluationEffort, rates: AssumedRates) -> Iterator[str]:
+    yield f"evaluation: {config.name}, to {out}"
+    yield (
+        f"tasks {', '.join(config.tasks)}; policies {', '.join(config.policies)}; {config.runs} runs of "
+        f"{config.episodes} episodes"
+    )
+    yield (
+        f"episodes: {effort.n_episodes - effort.n_finished:,} to run, {effort.n_finished:,} of "
+        f"{effort.n_episodes:,} have a result"
+    )
+    yield (
+        f"at most: {effort.n_steps:,} control steps, {effort.n_inferences:,} inferences, {effort.n_frames:,} "
+        f"frames of {N_CAMERAS} cameras"
+    )
+    yield f"workers: {effort.n_workers}"
+    for name, n_bytes in effort.copies.items():
+        yield (
+            f"  {name}: {n_bytes / GB:.2f} GB of weights × {effort.n_workers} copies, "
+            f"{effort.n_workers * n_bytes / GB:.1f} GB"
+        )
+    yield f"time, estimated: {effort.seconds(rates) / 3600:.2g} h"
+    yield (
+        f"assumptions: {rates.steps_per_second:g} control steps per second and worker, "
+        f"{rates.inference_seconds:g} s per inference of a learned policy, every worker busy to the end, no "
+        "episode ends early; starting and loading not counted. The run's progress bar shows the real rate"
+    )
+
+
+def _finished(out: Path) -> frozenset[EpisodeKey]:
+    if not (out / RUN_FILE).is_file():
+        return frozenset()
+    return frozenset(record.key for record in read_run(out).records if record.error is None)
+
+
+def _horizon(job: EpisodeJob) -> int:
+    own = job.group.env.kwargs.get("horizon_steps")
+    return int(own) if own is not None else task_spec(job.group.key.task).horizon_steps
+
+
+def _inferences(job: EpisodeJob) -> int:
+    return math.ceil(_horizon(job) / job.group.key.n_action_steps)
+
+
+def _copies(plan: Plan) -> dict[str, int]:
+    """Return the bytes of the weights of each learned policy."""
+    copies: dict[str, int] = {}
+    for job in plan.jobs:
+        checkpoint = job.group.args.get(LEARNED)
+        if checkpoint is None or job.group.key.policy in copies:
+            continue
+        file = weights_file(find_checkpoint(Path(str(checkpoint))))
+        assert file is not None  # `find_checkpoint` looks for it
+        copies[job.group.key.policy] = file.stat().st_size
+    return copies

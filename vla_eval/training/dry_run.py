@@ -1,0 +1,132 @@
+"""`finetune --dry-run`: what would run, and what it takes. Writes nothing; loads no weights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import draccus
+from lerobot.configs import FeatureType, PolicyFeature
+
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
+from vla_eval.policies.bases import how_to_get
+from vla_eval.policies.checkpoint import find_checkpoint
+from vla_eval.policies.conversion.octo import SIZES
+from vla_eval.policies.lerobot_device import choose_device
+from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
+from vla_eval.training.dataset import training_dataset
+from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
+from vla_eval.training.job import default_out, load_finetune_recipe
+from vla_eval.training.lora import check_lora_targets
+from vla_eval.training.policy_config import policy_config, used_frames
+from vla_eval.training.run_folder import newest_step
+
+EEF_NUMBERS = 10  # of the state that recordings have
+PUBLISHED_SIZES: Mapping[str, Mapping[str, Any]] = {"octo_base": SIZES["base"]}
+"""Base -> fields that its `config.json` will have, where they are not the defaults of the type."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DryRunOptions:
+    """What is assumed of a device.
+
+    Attributes:
+        device_bytes: its memory; None: of the GPU that is here, if any.
+        tflops: its rate; None: a usual one.
+    """
+
+    device_bytes: float | None = None
+    tflops: float | None = None
+
+
+def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[str]:
+    """Return lines for a person.
+
+    Raises:
+        VlaEvalError: a mistake in the configuration, the recipe, or a dataset that is there.
+    """
+    loaded = load_finetune_recipe(config)
+    recipe = loaded.value
+    check_lora_targets(recipe)
+    out = Path(config.out) if config.out is not None else default_out(config)
+    found, missing, frames = _estimate(config, recipe, options.tflops)
+    done = newest_step(out)
+    kind = "full" if recipe.lora is None else f"LoRA of rank {recipe.lora.rank}"
+    lines = [
+        f"fine-tuning: {loaded.name} ({recipe.type}, {kind}) on {config.dataset}, "
+        f"run seed {config.run_seed}, to {out}" + (f", resuming from step {done}" if done else ""),
+        *(f"not there: {line}" for line in missing),
+    ]
+    if frames is not None:
+        passes = recipe.steps * recipe.batch_size / frames
+        lines.append(f"dataset: {frames:,} frames begin a sample; {passes:.1f} passes over them")
+    return [*lines, *estimate_lines(found, device_bytes=options.device_bytes or _memory_here())]
+
+
+def _estimate(
+    config: FinetuneConfig, recipe: FinetuneRecipe, tflops: float | None
+) -> tuple[Estimate, list[str], int | None]:
+    """Return the estimate, what is missing for the real run, and the number of frames, if it is known."""
+    device = choose_device(config.device)
+    missing, dataset = [], None
+    if Path(config.dataset).is_dir():
+        dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    else:
+        missing.append(f"the dataset {config.dataset}; its fields are taken to be those of recordings")
+    base = recipe.base_checkpoint
+    if base is not None and not _is_there(base):
+        missing.append(
+            f"the base {base}; its sizes are taken to be the defaults of '{recipe.type}'.{how_to_get(base)}"
+        )
+    if dataset is not None and (base is None or _is_there(base)):
+        policy = policy_config(recipe, dataset, device="cpu")
+        frames: int | None = used_frames(policy, dataset).n_used
+    else:
+        policy, frames = assumed_config(recipe), None
+    model = unfilled_model(policy, recipe)
+    return estimate(model, policy, recipe, device=device, tflops=tflops), missing, frames
+
+
+def assumed_config(recipe: FinetuneRecipe) -> Any:
+    """Return the policy's configuration without base and dataset: published sizes, fields of recordings.
+
+    Raises:
+        RecipeError: a field that the policy does not have, or a value that it refuses.
+    """
+    cls = config_class(recipe.type, where="finetune.type")
+    known = cls.__dataclass_fields__
+    closed = {name: value for name, value in NO_DOWNLOADS.items() if name in known}
+    sizes = PUBLISHED_SIZES.get(Path(str(recipe.base_checkpoint)).name, {})
+    data = {**closed, **sizes, **recipe.policy, "device": "cpu", "push_to_hub": False}
+    if "action_grid" in known:
+        data["action_grid"] = "uniform"
+    try:
+        policy: Any = draccus.decode(cls, data)
+    except Exception as exc:  # draccus and the policies raise what they like
+        raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
+    height, width, n_colors = IMAGE_SHAPE
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(n_colors, height, width))
+    fields = {recipe.rename_cameras.get(name, name): image for name in CAMERA_KEYS.values()}
+    if getattr(policy, "reads_state", True):
+        fields[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(EEF_NUMBERS,))
+    policy.input_features = fields
+    policy.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
+    if hasattr(policy, "fit_to_actions"):
+        policy.fit_to_actions(None, {})  # a uniform grid needs neither
+    return policy
+
+
+def _is_there(base: str) -> bool:
+    try:
+        find_checkpoint(Path(base))
+    except CheckpointError:
+        return False
+    return True
+
+
+def _memory_here() -> float | None:
+    import torch
+
+    return float(torch.cuda.get_device_properties(0).total_memory) if torch.cuda.is_available() else None
