@@ -3,7 +3,7 @@
 # If it is set, each of the many test processes compiles torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-all lint docs bench clean
+.PHONY: help setup demo test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
 # Each takes about 2 GB, and 10 s to start.
@@ -24,7 +24,13 @@ test: setup  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)
 
 test-all: setup  ## run every test this machine can run
-	$(PYTEST) -m "not network and not parity and not peer"
+	$(PYTEST) -m "not network and not parity and not peer and not full_size"
+
+rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory and disk
+	REHEARSAL_TABLE=rehearsal.jsonl $(BIN)/python -m pytest -n 0 -m full_size tests/testing/test_full_size.py
+
+gpu-check: setup  ## measure a machine with a GPU: at most 30 minutes, resumable, writes runs/gpu_check
+	$(BIN)/python scripts/gpu_check.py
 
 lint: setup  ## ruff, mypy --strict and import-linter
 	$(BIN)/python -m ruff check .

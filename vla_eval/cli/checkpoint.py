@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli import checkpoint_fetch, checkpoint_openvla, checkpoint_spatialvla
+from vla_eval.cli import checkpoint_fetch, checkpoint_openvla, checkpoint_rehearse, checkpoint_spatialvla
 from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.checkpoint_arguments import add_gripper
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
 fetch: get a published base from the Hub, check it, and convert it where needed.
+rehearse: try a recipe at its true size with random weights.
 convert-octo, convert-openvla, convert-spatialvla: make a LeRobot checkpoint of an original one. merge: put a
 LoRA adapter into its base. Only fetch downloads anything."""
 
@@ -39,6 +40,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     checkpoint_fetch.add_parsers(actions)
     checkpoint_openvla.add_parsers(actions)
     checkpoint_spatialvla.add_parsers(actions)
+    checkpoint_rehearse.add_parsers(actions)
     for sub in (verify, convert):
         sub.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
 
@@ -48,6 +50,8 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.redirect_stdout(sys.stderr):  # some policies print while they are made
         if args.action == checkpoint_fetch.FETCH:
             lines = checkpoint_fetch.run(args)
+        elif args.action == checkpoint_rehearse.REHEARSE:
+            lines = checkpoint_rehearse.run(args)
         elif args.action in (checkpoint_openvla.CONVERT, checkpoint_openvla.MERGE):
             lines = checkpoint_openvla.run(args)
         elif args.action == checkpoint_spatialvla.CONVERT:

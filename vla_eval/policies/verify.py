@@ -150,14 +150,14 @@ def _act(loaded: LoadedPolicy) -> Tensor:
     if shape is not None:
         extra["noise"] = torch.randn(1, *shape, generator=draws).to(config.device)
     if callable(getattr(loaded.policy, "remember", None)):
-        extra["memory"] = loaded.policy.remember(loaded.preprocessor(_batch(config, (0,), draws)), None)
+        extra["memory"] = loaded.policy.remember(loaded.preprocessor(random_batch(config, (0,), draws)), None)
     loaded.policy.reset()
-    batch = loaded.preprocessor(_batch(config, history(config), draws))
+    batch = loaded.preprocessor(random_batch(config, history(config), draws))
     actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))
     return actions
 
 
-def _batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -> dict[str, Any]:
+def random_batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -> dict[str, Any]:
     """Return random fields of one episode, (1, …), or with frames in time (1, T, …)."""
     batch: dict[str, Any] = {"task": [INSTRUCTION]}
     times = (len(deltas),) if deltas else ()

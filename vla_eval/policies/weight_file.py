@@ -3,7 +3,8 @@
 Knows only files and tensors. A tensor that is read is a copy: the file is mapped only while it is copied.
 """
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any  # safetensors is untyped
 
@@ -26,6 +27,7 @@ DTYPES: Mapping[str, torch.dtype] = {
     "BOOL": torch.bool,
 }
 """Types of numbers by safetensors' names."""
+ALIGNMENT = 8  # bytes; the header is filled up with spaces
 
 
 class WeightFile(Mapping[str, Tensor]):
@@ -85,3 +87,42 @@ def _described(part: Any) -> Tensor:
     if kind not in DTYPES:
         raise ValueError(f"numbers of type {kind}; known are {', '.join(DTYPES)}")
     return torch.empty(part.get_shape(), dtype=DTYPES[kind], device="meta")
+
+
+def write_weights(
+    path: Path, described: Mapping[str, Tensor], parts: Callable[[str], Iterable[Tensor]]
+) -> None:
+    """Write a safetensors file part by part, so that no tensor has to be in memory as a whole.
+
+    Source of the format: https://github.com/huggingface/safetensors/blob/
+    v0.8.0/README.md#format (length of the header, header as JSON, bytes of the tensors).
+
+    Args:
+        path: of the file.
+        described: name -> a tensor of that shape and type; its values are not read.
+        parts: name -> the tensor's numbers in order, in pieces of any size.
+
+    Raises:
+        CheckpointError: the pieces of a tensor have another type, or are more or fewer numbers.
+    """
+    names = {dtype: name for name, dtype in DTYPES.items()}
+    header: dict[str, object] = {"__metadata__": {"format": "pt"}}
+    end = 0
+    for name, tensor in described.items():
+        begin, end = end, end + tensor.numel() * tensor.element_size()
+        kind, shape = names[tensor.dtype], list(tensor.shape)
+        header[name] = {"dtype": kind, "shape": shape, "data_offsets": [begin, end]}
+    encoded = json.dumps(header, separators=(",", ":")).encode()
+    encoded += b" " * (-len(encoded) % ALIGNMENT)
+    with path.open("wb") as file:
+        file.write(len(encoded).to_bytes(8, "little") + encoded)
+        for name, tensor in described.items():
+            n_left = tensor.numel()
+            for part in parts(name):
+                n_left -= part.numel() if part.dtype == tensor.dtype else tensor.numel() + 1
+                if n_left >= 0:
+                    file.write(part.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+            if n_left != 0:
+                raise CheckpointError(
+                    f"{path}: {name}: expected {tensor.numel():,} numbers of {tensor.dtype}, found others."
+                )

@@ -107,21 +107,27 @@ def write_tiny_fast_tokenizer(folder: Path) -> Path:
     return folder
 
 
-def write_tiny_smolvlm(folder: Path) -> Path:
-    """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot."""
+def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] | None = None) -> Path:
+    """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot.
+
+    Args:
+        folder: where.
+        sizes: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
+    """
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
     from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
     tokenizer = _tokenizer(SMOLVLM_TOKENS)
     special = {f"{name}_token_id": getattr(tokenizer, f"{name}_token_id") for name in ("pad", "bos", "eos")}
+    own = sizes or {"vision": {}, "text": {}, "whole": {}}
     heads = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
     text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4}
     vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
     config: Any = SmolVLMConfig
     config(
-        vision_config={**vision, "image_size": 64, "patch_size": 16},
-        text_config={**text, **heads, **special, "vocab_size": len(tokenizer)},
-        scale_factor=2,
+        vision_config={**vision, "image_size": 64, "patch_size": 16, **own["vision"]},
+        text_config={**text, **heads, **special, "vocab_size": len(tokenizer), **own["text"]},
+        **{"scale_factor": 2, **own["whole"]},
         image_token_id=tokenizer.convert_tokens_to_ids(SMOLVLM_TOKENS["image_token"]),
         pad_token_id=tokenizer.pad_token_id,
     ).save_pretrained(str(folder))

@@ -10,7 +10,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, IMAGE_SHAPE
 from vla_eval.policies.conversion.parts import check_free, folder_when_whole, stated_gripper
 from vla_eval.policies.foreign_code import no_foreign_code
-from vla_eval.policies.lerobot_loading import make_empty_policy
+from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.lerobot_processors import save_tokenizers
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
 from vla_eval.policies.octo.flax_names import from_flax
@@ -53,7 +53,7 @@ def convert(
     encoding = stated_gripper(source, gripper)
     config = octo_config({**fields, **named, "gripper_encoding": encoding})
     statistics = read_statistics(source if source.is_dir() else source.parent, dataset=dataset)
-    policy = make_empty_policy(config)
+    policy = make_unfilled_policy(config)
     put_weights(policy, _with_shared(policy, from_flax(read_parameters(source))), where=str(source))
     with no_foreign_code(config.type):
         before, after = make_mikasa_octo_pre_post_processors(config, {ACTION_KEY: dict(statistics)})

@@ -29,8 +29,8 @@ from vla_eval.policies.conversion.parts import (
     stated_gripper,
     write_checkpoint,
 )
+from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.openvla.configuration_openvla import AUGMENTATION, MikasaOpenVLAConfig
-from vla_eval.policies.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.policies.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
 from vla_eval.policies.openvla.prompt import prompt_text
 from vla_eval.policies.openvla.sizes import NetworkSizes
@@ -93,7 +93,7 @@ def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
     if not options.sizes:
         _check_backbones(source, described)
     config = _config(source, options)
-    policy = MikasaOpenVLAPolicy(config)
+    policy = make_unfilled_policy(config)
     weights = read_original(source, options, config.network_sizes())
     where = str(source)
     put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)

@@ -26,10 +26,10 @@ from vla_eval.policies.conversion.parts import (
     read_safetensors,
     write_checkpoint,
 )
+from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.spatialvla.action_grid import AXES
 from vla_eval.policies.spatialvla.configuration_spatialvla import MikasaSpatialVLAConfig
 from vla_eval.policies.spatialvla.described import GRID_PARTS, PROCESSOR_FILE, check_described
-from vla_eval.policies.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.policies.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
 from vla_eval.policies.spatialvla.prompt import finished, prompt_text
 from vla_eval.policies.spatialvla.sizes import Attention, NetworkSizes
@@ -84,7 +84,7 @@ def convert_spatialvla(source: Path, out: Path, options: ConvertOptions) -> Path
     has_own_head = _settle_head(source, described, weights, options.head)
     config = _config(source, processor, options, has_own_head=has_own_head)
     check_described(source, config.network_sizes())
-    policy = MikasaSpatialVLAPolicy(config)
+    policy = make_unfilled_policy(config)
     named = {f"network.{name}": value for name, value in to_ours(weights).items()}
     put_weights(policy, named, where=str(source), cast=True)
     statistics = read_statistics(source, processor, config, options.unnorm_key)

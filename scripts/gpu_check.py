@@ -1,0 +1,313 @@
+"""What to run on the first machine with a GPU: measures, writes gpu_check.json and a page of Markdown.
+
+Each part is stored when it has ended; the same command resumes with the next one. A part that cannot run
+here says why. `--device cpu --tiny` tries the script itself, in minutes, on tiny networks.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # torch's modules and lerobot's policies hold anything
+
+ROOT = Path(__file__).resolve().parent.parent
+TASK = "RememberColor3-v0"
+SEEDS, RENDERED_STEPS = (1, 2), 10
+BATCHES = (1, 8, 16)
+TRAINING_STEPS = 5
+GB = 1e9
+REHEARSED = ("smolvla", "pi0", "openvla_oft")
+LEFT_OVER = ("rehearsal", "training")
+LORA = ("pi0_lora", "openvla_oft")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """How to check.
+
+    Attributes:
+        device: `cuda` or `cpu`.
+        tiny: tiny networks and the fake simulator, to try the script.
+        out: folder of the results.
+    """
+
+    device: str
+    tiny: bool
+    out: Path
+
+
+class CannotRunError(Exception):
+    """A part cannot run on this machine; the message says why."""
+
+
+def doctor(check: Check) -> dict[str, Any]:
+    """Return what `mikasa-vla doctor` prints."""
+    done = _command("doctor", may_fail=True)
+    return {"exit_code": done.returncode, "lines": done.stdout.splitlines()}
+
+
+def rendering(check: Check) -> dict[str, Any]:
+    """Compare frames of the GPU's renderer with the processor's, for the CPU simulator."""
+    if check.tiny:
+        raise CannotRunError("--tiny has no renderer: its simulator is a fake")
+    import numpy as np
+
+    own = _frames("cpu")
+    other = _frames("gpu" if check.device == "cuda" else "cpu")
+    difference = np.abs(own.astype(np.int16) - other.astype(np.int16))
+    return {
+        "renderers": ["cpu", "gpu" if check.device == "cuda" else "cpu"],
+        "frames": len(own),
+        "share_of_pixels_that_differ": float((difference.max(axis=-1) > 0).mean()),
+        "largest_difference_levels": int(difference.max()),
+        "mean_difference_levels": float(difference.mean()),
+    }
+
+
+def rendering_speed(check: Check) -> dict[str, Any]:
+    """Return control steps per second at K = 1, 4 and 8, as `mikasa-vla bench` measures them."""
+    if check.tiny:
+        raise CannotRunError("--tiny has no renderer: its simulator is a fake")
+    return {"lines": _command("bench").stdout.splitlines()}
+
+
+def golden(check: Check) -> dict[str, Any]:
+    """Compare OpenVLA-OFT's tiny network with the original's stored actions in several precisions."""
+    import torch
+
+    _find_tests()
+    from tests.policies.openvla import openvla_golden
+    from vla_eval.policies.openvla.network import Inputs
+
+    expected = openvla_golden.values()["infer.img2.prompt1.actions_normalized"]
+    found: dict[str, Any] = {}
+    for name, dtype, tf32 in (
+        ("float32", torch.float32, False),
+        ("float32, TF32", torch.float32, True),
+        ("bfloat16", torch.bfloat16, False),
+    ):
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = tf32
+        network = openvla_golden.network().to(check.device, dtype)
+        network.action_head.float()
+        prompts = openvla_golden.prompts("prompt1")
+        moved = type(prompts)(*(x.to(check.device) for x in prompts))
+        inputs = Inputs(openvla_golden.images(2)[:1].to(check.device), moved)
+        with torch.no_grad():
+            actions = network.actions(inputs)[0].float().cpu()
+        found[name] = float((actions - expected).abs().max())
+    return {"largest_difference_of_actions": found, "tolerance_in_tests": openvla_golden.TOLERANCE}
+
+
+def rehearsals(check: Check) -> dict[str, Any]:
+    """Rehearse recipes at their published size, as far as memory allows."""
+    return {name: _or_reason(lambda name=name: _rehearse(check, name)) for name in REHEARSED}
+
+
+def training_steps(check: Check) -> dict[str, Any]:
+    """Measure seconds of a training step, in full and with LoRA."""
+    names = (*REHEARSED[:2], *LORA)
+    return {name: _or_reason(lambda name=name: _training(check, name)) for name in names}
+
+
+def short_training(check: Check) -> dict[str, Any]:
+    """Record, train `memory` shortly, and evaluate it."""
+    data, run = check.out / "demos", check.out / "memory"
+    few = check.tiny
+    simulator = ["--set", "simulator=fake"] if few else []
+    _command("record", "--task", TASK, "--episodes", "3" if few else "50", "--out", str(data), *simulator)
+    dataset = data / TASK
+    steps = ["--steps", "2" if few else "1000", "--set", "num_workers=0"]
+    tiny = ["--set", "save_every_steps=2", "--set", "log_every_steps=1"] if few else []
+    arguments = ["--policy", "memory", "--dataset", str(dataset), "--out", str(run), "--allow-unreplayed"]
+    started = time.perf_counter()
+    _command("finetune", *arguments, *steps, *tiny, "--device", check.device)
+    seconds = time.perf_counter() - started
+    episodes = ["--episodes", "1" if few else "50", "--n-action-steps", "4"]
+    table = _command(
+        "eval",
+        "--task",
+        TASK,
+        "--policy",
+        str(run),
+        *episodes,
+        *simulator,
+        "--out",
+        str(check.out / "evaluation"),
+    )
+    return {"training_seconds": seconds, "lines": table.stdout.splitlines()}
+
+
+def gpu_simulator(check: Check) -> dict[str, Any]:
+    """Run the tests of the GPU simulator."""
+    if check.device != "cuda":
+        raise CannotRunError("no GPU was asked for (--device cpu)")
+    arguments = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-m", "gpu", "tests/gpu"]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
+    return {"exit_code": done.returncode, "lines": done.stdout.splitlines()[-5:]}
+
+
+PARTS: dict[str, Callable[[Check], dict[str, Any]]] = {
+    part.__name__: part
+    for part in (
+        doctor,
+        rendering,
+        rendering_speed,
+        golden,
+        rehearsals,
+        training_steps,
+        short_training,
+        gpu_simulator,
+    )
+}
+
+
+def main() -> int:
+    """Run the parts that have no result yet; return 1 if one failed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--tiny", action="store_true", help="tiny networks, to try the script")
+    parser.add_argument("--out", type=Path, default=Path("runs/gpu_check"), metavar="DIR")
+    parser.add_argument("--part", nargs="+", choices=tuple(PARTS), default=tuple(PARTS), metavar="NAME")
+    args = parser.parse_args()
+    check = Check(device=args.device, tiny=args.tiny, out=args.out)
+    check.out.mkdir(parents=True, exist_ok=True)
+    file = check.out / "gpu_check.json"
+    results: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {"machine": _machine(check)}
+    for name in args.part:
+        if results.get(name, {}).get("state") in ("done", "cannot run"):
+            continue
+        print(f"{name} …", file=sys.stderr, flush=True)
+        for rest in LEFT_OVER:  # of a call that was killed
+            shutil.rmtree(check.out / rest, ignore_errors=True)
+        results[name] = _run(PARTS[name], check)
+        temporary = file.with_suffix(".tmp")
+        temporary.write_text(f"{json.dumps(results, indent=2)}\n")
+        os.replace(temporary, file)
+        (check.out / "gpu_check.md").write_text(page(results))
+    print(check.out / "gpu_check.md")
+    return int(any(part.get("state") == "failed" for part in results.values()))
+
+
+def page(results: dict[str, Any]) -> str:
+    """Return the results as Markdown, ready for docs/hardware.md."""
+    machine = results["machine"]
+    lines = [f"## {machine['device']}, measured {machine['date']}", ""]
+    if machine["tiny"]:
+        lines += ["Tiny networks: these figures only show that the script runs.", ""]
+    for name in PARTS:
+        part = results.get(name)
+        if part is not None:
+            lines += [f"### {name.replace('_', ' ')}", "", f"{part['state']} in {part['seconds']:.0f} s", ""]
+            lines += ["```json", json.dumps(part.get("result", part.get("why")), indent=1), "```", ""]
+    return "\n".join(lines)
+
+
+def _run(part: Callable[[Check], dict[str, Any]], check: Check) -> dict[str, Any]:
+    started = time.perf_counter()
+    try:
+        found: dict[str, Any] = {"state": "done", "result": part(check)}
+    except CannotRunError as exc:
+        found = {"state": "cannot run", "why": str(exc)}
+    except Exception as exc:  # the next part may still be measured
+        found = {"state": "failed", "why": f"{type(exc).__name__}: {exc!s:.2000}"}
+    return {**found, "seconds": time.perf_counter() - started}
+
+
+def _or_reason(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what was measured, or why a model cannot be measured here."""
+    import torch
+
+    from vla_eval.errors import VlaEvalError
+
+    try:
+        return measure()
+    except (CannotRunError, VlaEvalError, torch.OutOfMemoryError) as exc:
+        return {"cannot run": f"{exc!s:.500}"}
+
+
+def _rehearse(check: Check, name: str) -> dict[str, Any]:
+    from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+
+    with _small(check, name) as (recipe, tiny):
+        options = RehearsalOptions(folder=check.out / "rehearsal", device=check.device, tiny=tiny)
+        found = rehearse(recipe, options, batches=BATCHES)
+    return found.data()
+
+
+def _training(check: Check, name: str) -> dict[str, Any]:
+    from vla_eval.testing.training_speed import measure_steps
+
+    with _small(check, name) as (recipe, tiny):
+        folder = check.out / "training"
+        return measure_steps(recipe, folder, device=check.device, n_steps=TRAINING_STEPS, tiny=tiny)
+
+
+@contextlib.contextmanager
+def _small(check: Check, name: str) -> Iterator[tuple[str, bool]]:
+    """Yield the recipe to measure, and whether it is built in its tiny form."""
+    has_own = name.startswith("openvla")
+    yield ("openvla_oft_tiny" if check.tiny and has_own else name, check.tiny and not has_own)
+
+
+def _frames(renderer: Any) -> Any:
+    """Return the frames of both cameras, (N, H, W, 3) uint8, of the same seeds and actions."""
+    import numpy as np
+
+    from vla_eval.config.environment import EnvSettings, RenderSettings
+    from vla_eval.envs.factory import make_env
+
+    settings = EnvSettings(
+        task=TASK, render=RenderSettings(backend=renderer), cameras=("base_camera", "hand_camera")
+    )
+    env = make_env(settings)
+    frames = []
+    for seed in SEEDS:
+        results = env.reset({0: seed}, render=True)
+        for _ in range(RENDERED_STEPS):
+            frames += list(results[0].observation.images.values())
+            results = env.step({0: env.hold_action(0)}, render=frozenset({0}))
+    env.close()
+    return np.stack(frames)
+
+
+def _command(*arguments: str, may_fail: bool = False) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "vla_eval.cli", *arguments]
+    done = subprocess.run(command, cwd=Path.cwd(), capture_output=True, text=True, check=False)
+    if done.returncode != 0 and not may_fail:
+        raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-1500:]}")
+    return done
+
+
+def _find_tests() -> None:
+    """Let `tests` be this project's folder: an installed package has a folder of that name, too."""
+    tests = types.ModuleType("tests")
+    tests.__path__ = [str(ROOT / "tests")]
+    sys.modules["tests"] = tests
+
+
+def _machine(check: Check) -> dict[str, Any]:
+    import torch
+
+    from vla_eval.storage.provenance import collect_environment
+
+    name = torch.cuda.get_device_name() if check.device == "cuda" else "CPU"
+    return {
+        "device": name,
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "tiny": check.tiny,
+        "environment": collect_environment(),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,77 @@
+"""A rehearsal writes random weights of a recipe's shapes, loads them strictly, acts, and leaves nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from vla_eval.cli.main import main
+from vla_eval.errors import CheckpointError
+from vla_eval.policies.weight_file import write_weights
+from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+
+pytestmark = pytest.mark.usefixtures("no_network")
+BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
+
+
+@pytest.mark.parametrize(
+    ("recipe", "tiny"),
+    [
+        ("openvla_oft_tiny", False),
+        ("spatialvla_tiny", False),
+        pytest.param("octo_tiny", False, marks=pytest.mark.slow),
+        ("pi0_expert", True),
+        ("pi05_lora", True),
+        ("smolvla", True),
+    ],
+)
+def test_a_tiny_recipe_is_written_loaded_and_acts(recipe: str, tiny: bool, tmp_path: Path) -> None:
+    folder = tmp_path / "rehearsal"
+    found = rehearse(recipe, RehearsalOptions(folder=folder, tiny=tiny))
+    assert not folder.exists()
+    assert 0 < found.trained <= found.parameters
+    header = 1_000_000
+    assert found.parameters * BYTES_PER_NUMBER <= found.bytes + header
+    assert found.bytes <= found.parameters * BYTES_PER_NUMBER + header
+    assert set(found.peak_rss_bytes) == {"write", "load", "act"} and min(found.peak_rss_bytes.values()) > 0
+    assert set(found.seconds) == {"write", "load", "first_inference", "second_inference"}
+    assert found.is_within_limit
+
+
+def test_the_command_prints_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["openvla_oft_tiny", "--out", str(tmp_path / "r"), "--device", "cpu", "--format", "json"]
+    assert main(["checkpoint", "rehearse", *arguments]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert {"parameters", "trained", "bytes", "peak_rss_bytes", "seconds"} <= printed.keys()
+    assert printed["limit_bytes"] == int(1.15 * printed["bytes"] + 2e9)
+
+
+def test_a_folder_that_is_there_is_left_alone(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="exists already"):
+        rehearse("octo_tiny", RehearsalOptions(folder=tmp_path))
+
+
+def test_a_policy_whose_tokenizer_has_no_stand_in_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no stand-in"):
+        rehearse("pi0_fast", RehearsalOptions(folder=tmp_path / "r", tiny=True))
+
+
+def test_what_is_written_in_parts_is_what_safetensors_reads(tmp_path: Path) -> None:
+    whole = {
+        "a": torch.arange(12.0).reshape(3, 4),
+        "b": torch.arange(5).to(torch.bfloat16),
+        "empty": torch.zeros(0, 3),
+        "scalar": torch.tensor(7),
+    }
+    described = {name: x.to("meta") for name, x in whole.items()}
+    write_weights(tmp_path / "w.safetensors", described, lambda name: whole[name].reshape(-1).split(5))
+    found = load_file(tmp_path / "w.safetensors")
+    assert found.keys() == whole.keys()
+    assert all(torch.equal(found[name], x) and found[name].dtype == x.dtype for name, x in whole.items())
+    for parts in ([torch.zeros(11)], [torch.zeros(13)], [torch.zeros(12).half()]):
+        with pytest.raises(CheckpointError, match="expected 12 numbers"):
+            write_weights(
+                tmp_path / "x.safetensors", {"a": described["a"]}, lambda _, wrong=parts: iter(wrong)
+            )

@@ -1,0 +1,172 @@
+"""A checkpoint of random weights at a recipe's true size, as a fine-tuning would write it.
+
+Weights are made and written part by part. Tokenizers are stand-ins, since the published ones are not here.
+"""
+
+import contextlib
+import functools
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import torch
+from lerobot.policies import make_pre_post_processors
+from torch import Tensor
+
+from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.errors import CheckpointError
+from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
+from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, write_facts
+from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
+from vla_eval.policies.weight_file import write_weights
+from vla_eval.testing import tiny_models
+from vla_eval.training.dry_run import assumed_config
+from vla_eval.training.model import tokenizer_from
+
+TASK = "RememberColor3-v0"
+SPREAD = 0.02  # standard deviation of random weights, as transformers initialises them
+PART = 1 << 24  # numbers that are made at once
+PI0_FAMILY = ("pi0", "pi05", "pi0_fast")
+BYTE_TOKENIZER_SIZES: Mapping[str, dict[str, int]] = {
+    "mikasa_openvla": {},
+    "mikasa_spatialvla": {"pad_token": 0, "bos_token": 1, "stop_token": 2, "newline_token": 201},
+}
+"""Numbers of tokens of the tokenizer of bytes, which stands in for the published one. They set no shape."""
+PUBLISHED_SMOLVLM: Mapping[str, Mapping[str, Any]] = {
+    "vision": {
+        "hidden_size": 768,
+        "intermediate_size": 3072,
+        "num_hidden_layers": 12,
+        "num_attention_heads": 12,
+        "image_size": 512,
+        "patch_size": 16,
+    },
+    "text": {
+        "hidden_size": 960,
+        "intermediate_size": 2560,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 15,
+        "num_key_value_heads": 5,
+        "head_dim": 64,
+        "vocab_size": 49280,
+    },
+    "whole": {"scale_factor": 4},
+}
+"""Sizes of SmolVLM2-500M-Video-Instruct; SmolVLA then has the published 450,046,176 parameters."""
+
+
+def stand_in_config(
+    recipe: FinetuneRecipe, folder: Path, *, dtype: str | None, tiny: bool
+) -> tuple[Any, Path | None]:
+    """Return the policy's configuration, and the folder of a tokenizer where its processors need one.
+
+    Tokenizers are stand-ins: a token per byte, or a few hundred. Nothing is downloaded.
+
+    Args:
+        recipe: see there.
+        folder: where their files are written.
+        dtype: precision, for policies with such a setting; None: the recipe's.
+        tiny: build the π0 family and SmolVLA in their tiny form.
+    """
+    changes: dict[str, Any] = {} if dtype is None else {"dtype": dtype}
+    tokenizer: Path | None = None
+    kind = recipe.type
+    if kind in BYTE_TOKENIZER_SIZES:
+        own = recipe.policy.get("sizes", {})
+        changes |= {"tokenizer_name": "bytes", "sizes": {**BYTE_TOKENIZER_SIZES[kind], **own}}
+    elif kind == "mikasa_octo":
+        changes |= {"tokenizer_name": "bytes"}
+    elif kind == "smolvla":
+        sizes = None if tiny else PUBLISHED_SMOLVLM
+        vlm = tiny_models.write_tiny_smolvlm(folder / "vlm", sizes=sizes)
+        changes |= {"vlm_model_name": str(vlm)}
+    elif kind in PI0_FAMILY:
+        tokenizer = tiny_models.write_tiny_tokenizer(folder / "tokenizer")
+        changes |= tiny_models.TINY_POLICY if tiny else {}
+    if kind == "pi0_fast":
+        actions = tiny_models.write_tiny_fast_tokenizer(folder / "action_tokenizer")
+        changes |= {"text_tokenizer_name": str(tokenizer), "action_tokenizer_name": str(actions)}
+        changes |= {"validate_action_token_prefix": False}  # random weights do not write `Action:`
+        changes.pop("num_inference_steps", None)
+    base = recipe.base_checkpoint
+    changed = FinetuneRecipe(type=kind, policy={**recipe.policy, **changes}, base_checkpoint=base)
+    return assumed_config(changed), tokenizer
+
+
+def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | None) -> None:
+    """Write a checkpoint of random weights, as a fine-tuning would."""
+    state = policy.state_dict(keep_vars=True)
+    # A shared one is written under its first name.
+    once = {id(tensor): name for name, tensor in reversed(state.items())}
+    described = {name: state[name] for name in state if once[id(state[name])] == name}
+    write_weights(folder / WEIGHTS_FILE, described, functools.partial(_random_parts, described))
+    config._save_pretrained(folder)
+    own = contextlib.nullcontext() if tokenizer is None else tokenizer_from(str(tokenizer), config.type)
+    with own, no_foreign_code(config.type):
+        processors = make_pre_post_processors(config, dataset_stats=_statistics(config))
+    for processor in processors:
+        processor.save_pretrained(folder)
+    save_tokenizers(processors[0], folder)
+    save_vlm_files(config, folder)
+    height, width, _ = IMAGE_SHAPE
+    write_facts(
+        folder,
+        TrainingFacts(
+            run="rehearsal",
+            dataset="none",
+            dataset_sha256="0" * 64,
+            task=TASK,
+            state="eef",
+            images=dict.fromkeys(CAMERA_KEYS.values(), (height, width)),
+            fps=20.0,
+            action_names=ACTION_NAMES,
+            control_mode="pd_ee_delta_pose",
+            run_seed=0,
+        ),
+    )
+
+
+def _random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
+    tensor = described[name]
+    if not tensor.is_meta:  # a buffer, whose values the constructor has computed
+        yield tensor.detach()
+        return
+    draws = torch.Generator().manual_seed(zlib.crc32(name.encode()))
+    for begin in range(0, max(1, tensor.numel()), PART):
+        n = min(PART, tensor.numel() - begin)
+        yield torch.empty(n).normal_(0.0, SPREAD, generator=draws).to(tensor.dtype)
+
+
+def _statistics(config: Any) -> dict[str, dict[str, Any]]:
+    """Return statistics that leave numbers about as they are."""
+    values = {"mean": 0.0, "std": 1.0, "min": -1.0, "max": 1.0, "q01": -1.0, "q99": 1.0}
+    shapes = {key: tuple(x.shape) for key, x in {**config.input_features, **config.output_features}.items()}
+    shapes = {
+        key: (shape[0], 1, 1) if len(shape) == len(IMAGE_SHAPE) else shape for key, shape in shapes.items()
+    }
+    assert shapes[ACTION_KEY] == (len(ACTION_NAMES),)
+    return {
+        key: {name: torch.full(shape, value).numpy() for name, value in values.items()}
+        for key, shape in shapes.items()
+    }
+
+
+@contextlib.contextmanager
+def built_tiny(kind: str, *, tiny: bool) -> Iterator[None]:
+    """Let lerobot build the π0 family in its tiny form within the context, if that is asked for.
+
+    Raises:
+        CheckpointError: a tiny form is asked for, and the type has none but by recipes of its own.
+    """
+    if tiny and kind in PI0_FAMILY:
+        family: Any = kind
+        with tiny_models.tiny_paligemma(family):
+            yield
+    elif tiny and kind != "smolvla":
+        raise CheckpointError(
+            f"--tiny is for the π0 family and SmolVLA; '{kind}' has recipes of its own that are tiny."
+        )
+    else:
+        yield
