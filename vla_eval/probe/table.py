@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_eval.policies.recipe import policy_name
 from vla_eval.probe.interventions import Intervention, Level, World, delay_of
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
@@ -22,6 +21,7 @@ from vla_eval.probe.retention import Followed, HalfLife, Range, half_life, share
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.comparison import CHANCE_POLICY
 from vla_eval.results.estimates import holm
+from vla_eval.results.grouping import config_names
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 
@@ -94,22 +94,27 @@ Records = Mapping[tuple[str, int], Sequence[EpisodeRecord]]
 
 def read_probe(worlds: Sequence[World], out: Path) -> ProbeTable:
     """Read the run folders of all worlds and return their table."""
-    return probe_table(worlds, [read_run(out / world.config.name).records for world in worlds])
+    runs = [read_run(out / world.config.name) for world in worlds]
+    order = dict.fromkeys(name for run in runs for name in config_names(run, "policies"))
+    return probe_table(worlds, [run.records for run in runs], order=tuple(order))
 
 
-def probe_table(worlds: Sequence[World], records: Sequence[Sequence[EpisodeRecord]]) -> ProbeTable:
+def probe_table(
+    worlds: Sequence[World], records: Sequence[Sequence[EpisodeRecord]], *, order: Sequence[str] = ()
+) -> ProbeTable:
     """Return the table.
 
     Args:
         worlds: what was run; each task's `none` comes before its other worlds.
         records: of each world, in any order.
+        order: the policies' names in the order of the rows; others come last, by name.
     """
     by_world = [(world, _by_policy(found)) for world, found in zip(worlds, records, strict=True)]
     drawn = {world.task: found for world, found in by_world if world.intervention == "none"}
     rows, retention = [], []
     for task in dict.fromkeys(world.task for world in worlds):
         of_task = [(world, found) for world, found in by_world if world.task == task]
-        for policy, k in _policies(of_task[0][0], drawn[task]):
+        for policy, k in _policies(drawn[task], order):
             own = [_row(world, found, drawn[task], policy, k) for world, found in of_task]
             rows += own
             curve = _retention(of_task, own, policy, k)
@@ -128,10 +133,10 @@ def _by_policy(records: Sequence[EpisodeRecord]) -> Records:
     return found
 
 
-def _policies(world: World, records: Records) -> list[tuple[str, int]]:
-    """Return the policies in the order of the configuration, each by growing n_action_steps."""
-    ranks = {policy_name(policy): rank for rank, policy in enumerate(world.config.policies)}
-    return sorted(records, key=lambda key: (ranks.get(key[0], len(ranks)), key[1]))
+def _policies(records: Records, order: Sequence[str]) -> list[tuple[str, int]]:
+    """Return the policies in their order, each by growing n_action_steps."""
+    ranks = {name: rank for rank, name in enumerate(order)}
+    return sorted(records, key=lambda key: (ranks.get(key[0], len(ranks)), *key))
 
 
 def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> ProbeRow:
