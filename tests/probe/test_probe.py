@@ -158,6 +158,8 @@ def test_a_drop_that_the_oracle_shares_is_one_of_chunk_and_phase(
         *((1, 0), (1, 0)),
         *((60, 50), (60, 50)),  # the response begins at step 10
     ]
+    assert [row["n_without_choice"] for row in found["rows"]] == [0, 0, N, N]
+    assert "follows the cue in 0 of 9 (chance 3), touching nothing in 9" in found["sentences"][1]
     (note,) = [note for note in found["notes"] if "swap 1: at K = 60" in note]
     assert "(50 steps late)" in note
     assert "in 0 of 9 instead of 9 of 9 at K = 1: chunk and phase explain" in note

@@ -78,6 +78,7 @@ def json_row(row: ProbeRow) -> JsonRow:
         **_ends("matched_world_value", swap.matched_interval if swap else None),
         **_json_share("reliability", swap.reliability if swap else None),
         **_json_share("follows", row.followed),
+        "n_without_choice": row.n_without_choice,
         "n_success_once": row.success.n if row.success else None,
         "success_once": row.success.rate if row.success else None,
         "ci_low": row.success.interval.low if row.success else None,

@@ -44,7 +44,8 @@ def _clause(row: ProbeRow) -> str | None:
         "reset": f"after a reset of its memory at step {row.level} in",
     }[row.intervention]
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
-    return f"{where} {_of(row.followed)}{chance}"
+    idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
+    return f"{where} {_of(row.followed)}{chance}{idle}"
 
 
 def _of(share: Share) -> str:

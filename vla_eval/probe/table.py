@@ -38,6 +38,7 @@ class ProbeRow:
         n_pairs: episodes with a result in this world and in `none`.
         swap: of a swapped cue or order.
         followed: episodes of this world that follow the cue.
+        n_without_choice: episodes of this world in which no candidate was touched; None without candidates.
         success: episodes of this world that succeed; None without a result.
         chance: rate of following the cue without memory; None where it is not known.
         left, left_interval: share of following that this world leaves; None for swaps and `none`.
@@ -55,6 +56,7 @@ class ProbeRow:
     n_pairs: int
     swap: SwapQuantities | None
     followed: Share | None
+    n_without_choice: int | None
     success: Share | None
     chance: float | None
     left: float | None
@@ -160,6 +162,7 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         n_pairs=len(pairs),
         swap=swap,
         followed=Share(sum(map(follows, results)), len(results)) if results else None,
+        n_without_choice=_n_without_choice(results),
         success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
         chance=_chance(results, found, k),
         left=left[0] if left else None,
@@ -168,6 +171,11 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         corrected_p=None,
         n_errors=len(own) - len(results),
     )
+
+
+def _n_without_choice(results: Sequence[EpisodeRecord]) -> int | None:
+    choosing = [record for record in results if record.n_candidates]
+    return sum(record.first_choice is None for record in choosing) if choosing else None
 
 
 def _followed(pairs: Sequence[Pair]) -> tuple[Followed, Followed]:
