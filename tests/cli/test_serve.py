@@ -46,3 +46,13 @@ def test_an_open_address_without_a_key_is_warned_of(capsys: pytest.CaptureFixtur
 def test_a_number_out_of_its_range_is_a_mistake(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", "--policy", "random", *flags]) == 1
     assert "expected a number" in capsys.readouterr().err
+
+
+def test_it_computes_with_one_thread_as_workers_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    for wanted, expected in ((None, "1"), ("3", "3")):
+        monkeypatch.setenv("OMP_NUM_THREADS", "restored by monkeypatch")
+        monkeypatch.delenv("OMP_NUM_THREADS")
+        if wanted is not None:
+            monkeypatch.setenv("OMP_NUM_THREADS", wanted)
+        assert main(["serve", "--policy", "oracle"]) == 1
+        assert os.environ["OMP_NUM_THREADS"] == expected

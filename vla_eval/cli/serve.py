@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from vla_eval.errors import RecipeError
+from vla_eval.workers.start import WORKER_ENVIRONMENT
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
 evaluates it, and openpi's own client gets chunks from it. Requests of several clients share a pass of the
@@ -51,7 +52,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve; print the address when clients can connect."""
-    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    # One thread, as in workers: the sums of a pass of several rows depend on the number of threads.
+    for name, value in WORKER_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    # Here and not above: `mikasa-vla --help` need not wait for torch, which reads the number of threads.
     from vla_eval.serving.host import HostOptions, host_policy
     from vla_eval.serving.server import ServerOptions, run_server
 

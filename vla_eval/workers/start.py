@@ -23,7 +23,8 @@ from vla_eval.workers.server import IMPORTS_VARIABLE
 
 SERVER_MODULE = "vla_eval.workers.server"
 
-# One thread per worker: several workers share the cores, and sums do not depend on the number of threads.
+# One thread per worker: several workers share the cores. A server has one, too: the sums of a pass of several
+# rows depend on the number of threads.
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 
 _preloaded: dict[str, None] = {}
