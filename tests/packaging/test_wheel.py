@@ -43,7 +43,7 @@ def test_every_module_of_the_package_is_in_the_wheel(wheel: zipfile.ZipFile) -> 
 
 def test_the_templates_of_the_report_page_are_in_the_wheel(wheel: zipfile.ZipFile) -> None:
     templates = [path for path in (ROOT / "vla_eval/page/templates").iterdir() if path.is_file()]
-    assert {path.suffix for path in templates} == {".j2", ".css"}
+    assert {path.suffix for path in templates} == {".j2", ".css", ".js"}
     for path in templates:
         assert wheel.read(path.relative_to(ROOT).as_posix()) == path.read_bytes()
 
