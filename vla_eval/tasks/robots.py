@@ -6,6 +6,7 @@ grid of `GRID_M`. Physics, collision shapes and the wrist camera's view are the 
 slightly different pixels on the camera's body. The file is created on first use in the user's cache.
 """
 
+import functools
 import hashlib
 import os
 import struct
@@ -71,6 +72,7 @@ def write_binary_stl(path: Path, triangles: FloatArray) -> None:
     path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + out.tobytes())
 
 
+@functools.cache  # asked for at each reset, and the sources have 21 MB
 def light_urdf() -> Path:
     """Return the URDF of the Panda with the light camera mesh; create it if it is not in the cache.
 
