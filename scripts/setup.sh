@@ -43,6 +43,11 @@ is_usable_venv() {
 
 make_venv() {
   local free_gb
+  # `venv --clear` would empty the folder that the link points to, which another checkout may be using.
+  if [ -L "$VENV" ]; then
+    die "$VENV is a link to $(readlink -f "$VENV"), expected a folder of this checkout." \
+      "Remove the link (rm $VENV), then run 'make setup' again."
+  fi
   free_gb=$(df -Pk . | awk 'NR == 2 { print int($4 / 1048576) }')
   if [ "$free_gb" -lt "$NEEDED_GB" ]; then
     die "$free_gb GB are free on this disk, $NEEDED_GB GB are needed." "Make room, then run 'make setup' again."

@@ -348,3 +348,17 @@ def test_cv2_is_the_headless_one() -> None:
     assert done.stdout.startswith("4.")
     gui = [line.split()[-1] for line in done.stdout.splitlines() if line.strip().startswith("GUI:")]
     assert gui == ["NONE"]
+
+
+def test_an_environment_behind_a_link_is_not_cleared(tmp_path: Path) -> None:
+    """Another checkout may be using it; `venv --clear` would follow the link."""
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "kept").touch()
+    (tmp_path / ".venv").symlink_to(other)
+    done = shell(
+        f"cd {tmp_path}\nPYTHON={sys.executable}\ndf() {{ echo 'a b c 99999999'; echo 'a b c 99999999'; }}\nmake_venv"
+    )
+    assert done.returncode == 1
+    assert f".venv is a link to {other.resolve()}" in done.stderr
+    assert (other / "kept").exists()
