@@ -52,7 +52,17 @@ USED = {
         "tasks",
         "policies",
     },
-    "finetune": {"out", "device", "allow_unreplayed", "help", "tasks", "policy"},
+    "finetune": {
+        "out",
+        "device",
+        "allow_unreplayed",
+        "help",
+        "tasks",
+        "policy",
+        "dry_run",
+        "device_memory",
+        "tflops",
+    },
 }
 
 

@@ -356,9 +356,8 @@ def test_an_environment_behind_a_link_is_not_cleared(tmp_path: Path) -> None:
     other.mkdir()
     (other / "kept").touch()
     (tmp_path / ".venv").symlink_to(other)
-    done = shell(
-        f"cd {tmp_path}\nPYTHON={sys.executable}\ndf() {{ echo 'a b c 99999999'; echo 'a b c 99999999'; }}\nmake_venv"
-    )
+    enough_room = "df() { printf 'a b c 99999999\\n%.0s' 1 2; }"
+    done = shell(f"cd {tmp_path}\nPYTHON={sys.executable}\n{enough_room}\nmake_venv")
     assert done.returncode == 1
     assert f".venv is a link to {other.resolve()}" in done.stderr
     assert (other / "kept").exists()

@@ -33,6 +33,8 @@ FINETUNE_FLAGS = {
 }
 EVAL_FLAGS = {
     "dry_run": "--dry-run",
+    "steps_per_second": "--steps-per-second",
+    "inference_seconds": "--inference-seconds",
     "n_action_steps": "--n-action-steps",
     "episodes": "--episodes",
     "seed_start": "--seed-start",
