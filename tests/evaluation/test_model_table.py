@@ -36,6 +36,7 @@ from vla_eval.tasks.catalog import task_spec
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
 ROW = {"name": "one", "policy": "act", "n_action_steps": [4]}
+DRY_RUN = ("dry_run", "device_memory", "tflops")
 USED = {
     "eval": {
         "out",
@@ -52,17 +53,7 @@ USED = {
         "tasks",
         "policies",
     },
-    "finetune": {
-        "out",
-        "device",
-        "allow_unreplayed",
-        "help",
-        "tasks",
-        "policy",
-        "dry_run",
-        "device_memory",
-        "tflops",
-    },
+    "finetune": {"out", "device", "allow_unreplayed", "help", "tasks", "policy", *DRY_RUN},
 }
 
 
