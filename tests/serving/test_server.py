@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from tests.serving.served_policies import CHUNK_SIZE, CountingPolicy, Running, frame, host, serving
 from vla_eval.serving.server import PolicyServer, ServeError, ServerOptions
@@ -190,6 +191,15 @@ class TestHttp:
             with pytest.raises((InvalidStatus, UnicodeEncodeError), match=r"401|encode"):
                 Client(server, key=key)
             assert values(Client(server, key="secret").ask(**frame())) == (0, 0, 1)
+
+    def test_a_page_in_a_browser_is_refused(self) -> None:
+        with serving(CountingPolicy()) as server:
+            with (
+                pytest.raises(InvalidStatus, match="403"),
+                connect(server.url, origin=Origin("http://page.example"), proxy=None),
+            ):
+                pass
+            assert values(Client(server).ask(**frame())) == (0, 0, 1)
 
 
 class TestTheEnd:

@@ -141,9 +141,14 @@ class PolicyServer:
             self._connections.discard(connection)
 
     def _answer_http(self, socket: ServerConnection, request: Request) -> Response | None:
-        """Answer what is no WebSocket, and refuse clients without the key; None: it is a WebSocket."""
+        """Answer what is no WebSocket, refuse browsers and clients without the key; None: a WebSocket."""
         if request.path == "/healthz":
             return socket.respond(http.HTTPStatus.OK, "OK\n")
+        # Browsers send it: any page that is open could talk to a server on the loopback address.
+        if "Origin" in request.headers:
+            return socket.respond(
+                http.HTTPStatus.FORBIDDEN, "expected a policy client, found a page in a browser (Origin)\n"
+            )
         key = self._options.api_key
         given = request.headers.get("Authorization", "")
         if key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {key}".encode()):
