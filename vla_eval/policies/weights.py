@@ -35,7 +35,8 @@ def put_weights(
         where: the file, for messages.
         cast: whether floating point types may differ, because the user chose another precision.
         may_be_new: beginnings of names; all tensors of one of them may be missing together and then stay
-            as the constructor made them: a head that is new in fine-tuning.
+            as the constructor made them: a head that is new in fine-tuning. Those without memory become
+            NaN: an adapter that brings them is loaded next.
         device: where parameters without memory get it.
 
     Raises:
@@ -59,9 +60,11 @@ def put_weights(
         if not same:
             bad["not taken over"].append(key)
     _refuse(bad, where)
-    empty = [name for name, parameter in policy.named_parameters() if parameter.is_meta]
-    assert not empty or may_be_new, empty  # what is missing was refused above
-    _refuse({"missing": empty}, where)
+    for name, parameter in policy.named_parameters():
+        if parameter.is_meta:
+            assert name.startswith(tuple(may_be_new)), name  # what else is missing was refused above
+            unknown = torch.full(parameter.shape, torch.nan, dtype=parameter.dtype)
+            _take(owners, parameter, unknown, device)
 
 
 def check_fit(

@@ -97,7 +97,7 @@ def test_an_episode_executes_what_the_original_samples(
     n_action_steps = n_frames - 1 or CHUNK
     checkpoint = converted(tmp_path, window=len(is_real))
     policy = lerobot.make_lerobot(context(env, n_action_steps), checkpoint=str(checkpoint), device="cpu")
-    monkeypatch.setattr(lerobot, "_noise", lambda _seed, _shape: sampling_noise(io, case)[row])
+    monkeypatch.setattr(lerobot, "given_noise", lambda _seeds, _shape: sampling_noise(io, case)[row][None])
     n_before = n_frames - 1
     found = executed(
         env,
