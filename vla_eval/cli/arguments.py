@@ -65,15 +65,9 @@ def add_overrides(parser: argparse.ArgumentParser, *, help: str) -> None:
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare `--dry-run` and the rate that it assumes."""
+    """Declare `--dry-run`; what it assumes are flags of each verb."""
     parser.add_argument(
         "--dry-run", action="store_true", help="show what would run and what it takes; run nothing"
-    )
-    parser.add_argument(
-        "--tflops",
-        type=positive_argument,
-        metavar="N",
-        help="with --dry-run: rate to assume, 10^12 operations per second (100 for a GPU)",
     )
 
 

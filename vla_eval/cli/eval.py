@@ -8,6 +8,7 @@ from typing import Any
 from vla_eval.cli.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
+    add_dry_run,
     add_old_flag,
     add_overrides,
     add_verb,
@@ -84,9 +85,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_dry_run_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--dry-run", action="store_true", help="show what would run and what it takes; run nothing"
-    )
+    add_dry_run(parser)
     parser.add_argument(
         "--steps-per-second",
         type=positive_argument,

@@ -11,6 +11,7 @@ from vla_eval.cli.arguments import (
     add_overrides,
     add_verb,
     memory_argument,
+    positive_argument,
     set_flags,
     typed_command,
 )
@@ -70,6 +71,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     add_overrides(parser, help="change any field of the recipe's `finetune` section")
     add_dry_run(parser)
+    parser.add_argument(
+        "--tflops",
+        type=positive_argument,
+        metavar="N",
+        help="with --dry-run: rate to assume, 10^12 operations per second (100 for a GPU)",
+    )
     parser.add_argument(
         "--device-memory",
         type=memory_argument,

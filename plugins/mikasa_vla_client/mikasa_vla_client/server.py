@@ -99,9 +99,8 @@ class PolicyServer:
                 )
         self._spec, self._api_key, self._debug = spec, api_key, debug
         self._metadata = spec.metadata()
-        self._one_at_a_time = (
-            threading.Lock()
-        )  # nothing is known of whether the policy may run in two threads
+        # Nothing is known of whether the policy may run in two threads.
+        self._one_at_a_time = threading.Lock()
         self._sessions: dict[ServerConnection, dict[str, Session]] = {}
         options: dict[str, Any] = {
             "compression": None,
