@@ -127,7 +127,28 @@ class TestResume:
         bench.run("out")
 
         with pytest.raises(RunChangedError, match="episodes"):
-            bench.run("out", episodes=7)
+            bench.run("out", episodes=5)
+
+    def test_a_run_that_grew_has_the_records_of_one_made_at_once(self, bench: Bench) -> None:
+        first: dict[str, Any] = {"episodes": 5, "slots_per_worker": 2}
+        bench.run("grown", **first)
+        begun = (bench.folder / "grown/episodes.jsonl").read_bytes()
+        whole: dict[str, Any] = {
+            **first,
+            "episodes": 6,
+            "runs": 2,
+            "policies": ["random", str(bench.folder / "night.yaml")],
+        }
+
+        summary = bench.run("grown", **whole)
+        bench.run("at once", **whole)
+
+        # 2 policies x 2 runs x 6 seeds
+        assert (summary.n_episodes, summary.n_open) == (24, 0)
+        assert bench.lines("grown") == bench.lines("at once")
+        assert (bench.folder / "grown/episodes.jsonl").read_bytes().startswith(begun)
+        grown, at_once = (read_run(bench.folder / name).description for name in ("grown", "at once"))
+        assert (grown.config, grown.recipes) == (at_once.config, at_once.recipes)
 
     def test_a_changed_recipe_is_refused(self, bench: Bench) -> None:
         bench.run("out")

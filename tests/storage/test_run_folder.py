@@ -45,17 +45,101 @@ def test_a_changed_configuration_is_refused_value_by_value(tmp_path: Path) -> No
     with RunFolder.open(tmp_path / "r", describe()):
         pass
     changed = describe(
-        config={"episodes": 100, "tasks": ["A", "B"], "env": {"delay_steps": 5}},
+        config={"episodes": 40, "tasks": ["B"], "env": {"delay_steps": 5}},
         recipes={"policies/oracle": "bb"},
     )
     with pytest.raises(RunChangedError) as caught:
         RunFolder.open(tmp_path / "r", changed, allow_environment_change=True)
     message = str(caught.value)
-    assert "config.episodes: 50 -> 100" in message
-    assert 'config.tasks: ["A"] -> ["A", "B"]' in message
+    assert "config.episodes: 50 -> 40" in message
+    assert 'config.tasks: ["A"] -> ["B"]' in message
     assert "config.env.delay_steps: (not set) -> 5" in message
     assert 'recipes.policies/oracle: "aa" -> "bb"' in message
-    assert "Use another --out" in message and "restore the old one" in message
+
+
+def test_a_refused_change_names_the_command_that_puts_it_beside(tmp_path: Path) -> None:
+    with RunFolder.open(tmp_path / "r", describe()):
+        pass
+    (tmp_path / "r-2").mkdir()
+    command = f"mikasa-vla eval demo --episodes 40 --out {tmp_path / 'r'} --workers 1"
+    fewer = describe(config={"episodes": 40, "tasks": ["A"], "env": {}}, command=command)
+
+    with pytest.raises(RunChangedError) as caught:
+        RunFolder.open(tmp_path / "r", fewer)
+
+    beside = f"mikasa-vla eval demo --episodes 40 --workers 1 --out {tmp_path / 'r-3'}"
+    assert str(caught.value).splitlines()[-1].strip() == beside
+
+
+MORE: dict[str, object] = {
+    "episodes": 60,
+    "runs": 2,
+    "tasks": ["B", "A"],
+    "policies": ["oracle", "random"],
+    "policy_names": ["oracle", "random"],
+    "n_action_steps": [1, 4],
+    "task_versions": {"A": 1, "B": 3},
+}
+
+
+@pytest.mark.parametrize("field", MORE)
+def test_a_run_may_grow_in_each_list_and_number_of_its_plan_but_not_shrink(
+    tmp_path: Path, field: str
+) -> None:
+    small: dict[str, object] = {
+        "episodes": 50,
+        "runs": 1,
+        "tasks": ["A"],
+        "policies": ["oracle"],
+        "policy_names": ["oracle"],
+        "n_action_steps": [4],
+        "task_versions": {"A": 1},
+    }
+    large = small | {field: MORE[field]}
+    with RunFolder.open(tmp_path / "r", describe(config=small)):
+        pass
+
+    with RunFolder.open(tmp_path / "r", describe(config=large, command="more")):
+        pass
+
+    stored = read_run(tmp_path / "r")
+    assert stored.description.config == large
+    assert stored.description.command == "more"
+    assert [change.path for change in stored.sessions[-1].plan_changes] == [
+        f"config.{field}.B" if field == "task_versions" else f"config.{field}"
+    ]
+    with pytest.raises(RunChangedError, match=field):
+        RunFolder.open(tmp_path / "r", describe(config=small))
+
+
+def test_a_checkpoint_may_be_added_to_a_policy_of_several_but_none_replaced(tmp_path: Path) -> None:
+    with RunFolder.open(tmp_path / "r", describe(config={"policies": ["m=runs/a,runs/b"]})):
+        pass
+    with pytest.raises(RunChangedError, match=r"config\.policies"):
+        RunFolder.open(tmp_path / "r", describe(config={"policies": ["m=runs/a,runs/c,runs/b"]}))
+    with RunFolder.open(tmp_path / "r", describe(config={"policies": ["m=runs/a,runs/b,runs/c"]})):
+        pass
+
+
+def test_a_run_grows_by_a_policy_with_its_recipe_while_those_it_has_stay(tmp_path: Path) -> None:
+    with RunFolder.open(tmp_path / "r", describe(servers={"remote": {"model": "a"}})):
+        pass
+    recipes = {"policies/oracle": "aa", "policies/random": "cc"}
+    servers = {"remote": {"model": "a"}, "other": {"model": "b"}}
+    with RunFolder.open(tmp_path / "r", describe(recipes=recipes, servers=servers)):
+        pass
+    assert read_run(tmp_path / "r").description.recipes == {"policies/oracle": "aa"}
+    more = {"episodes": 50, "tasks": ["A", "B"], "env": {}}
+    with RunFolder.open(tmp_path / "r", describe(config=more, recipes=recipes, servers=servers)):
+        pass
+    stored = read_run(tmp_path / "r").description
+    assert (stored.recipes, stored.servers) == (recipes, servers)
+    for changed in (
+        describe(config=more, recipes={**recipes, "policies/oracle": "bb"}, servers=servers),
+        describe(config=more, recipes=recipes, servers={**servers, "remote": {"model": "a", "step": 2}}),
+    ):
+        with pytest.raises(RunChangedError):
+            RunFolder.open(tmp_path / "r", changed)
 
 
 def test_options_and_command_may_change(tmp_path: Path) -> None:

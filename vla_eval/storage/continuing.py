@@ -9,6 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from vla_eval.storage.growth import command_beside, without_growth
 from vla_eval.storage.run_file import (
     DEVICE,
     Change,
@@ -18,13 +19,20 @@ from vla_eval.storage.run_file import (
     Session,
     environment_changed,
     find_changes,
+    run_changed,
+    server_changed,
 )
 
 logger = logging.getLogger(__name__)
 
 
 def continued(
-    folder: Path, description: RunDescription, *, shown: Path, allow_environment_change: bool
+    folder: Path,
+    description: RunDescription,
+    *,
+    shown: Path,
+    allow_environment_change: bool,
+    may_grow: bool = False,
 ) -> RunFile:
     """Return what `run.json` must hold from now on; nothing is written.
 
@@ -33,6 +41,7 @@ def continued(
         description: what the run is started with; the device is not compared.
         shown: the folder that messages name.
         allow_environment_change: continue although commit or versions have changed.
+        may_grow: more of what is planned, the rest being the same, is no change.
 
     Raises:
         RunChangedError: configuration, recipes or environment are not what they were.
@@ -47,14 +56,40 @@ def continued(
         known = RunFile.load(folder)
     except FileNotFoundError:
         return RunFile(description=description, sessions=(session,))
-    known.check_unchanged(description, shown)
+    old = known.description
+    if may_grow:
+        known.planned(folder)  # what is no configuration cannot be compared with a larger one
+    _check_unchanged(old, description, shown, may_grow=may_grow)
     changes = find_changes(
-        without_device(known.description.environment),
-        without_device(description.environment),
-        prefix="environment",
+        without_device(old.environment), without_device(description.environment), prefix="environment"
     )
     check_allowed(changes, shown=shown, allowed=allow_environment_change)
-    return known.with_session(replace(session, environment_changes=changes))
+    growth = find_changes(old.config, description.config, prefix="config")
+    for change in growth:
+        logger.info("%s: the run grows: %s", shown, change)
+    if growth:  # the command that makes the whole run is the newest
+        known = replace(known, description=replace(description, environment=old.environment))
+    return known.with_session(replace(session, environment_changes=changes, plan_changes=growth))
+
+
+def _check_unchanged(old: RunDescription, new: RunDescription, shown: Path, *, may_grow: bool) -> None:
+    """Raise `RunChangedError` if the configuration, a recipe or a policy server is not what it was."""
+    compared = without_growth(new, old) if may_grow else new
+    changes = (
+        *find_changes(old.config, compared.config, prefix="config"),
+        *find_changes(old.recipes, compared.recipes, prefix="recipes"),
+    )
+    if changes:
+        remedy = "Use another --out for the new configuration, or restore the old one to continue this run."
+        if may_grow and new.command:
+            remedy = (
+                "To add episodes, runs, policies, tasks or n_action_steps, name all that the run has and the "
+                "new ones. Anything else goes into a folder beside it, and `report` takes both:\n"
+                f"  {command_beside(new.command, shown)}"
+            )
+        raise run_changed(changes, shown, remedy=remedy)
+    if changes := find_changes(old.servers, compared.servers, prefix="servers"):
+        raise server_changed(changes, shown)
 
 
 def check_allowed(changes: Sequence[Change], *, shown: Path, allowed: bool) -> None:

@@ -72,12 +72,14 @@ class Session:
         command: what the user typed.
         options: see `RunDescription`.
         environment_changes: how the environment differed from the one the run was started in.
+        plan_changes: by what the run grew: more episodes, runs, policies, tasks or n_action_steps.
     """
 
     started_at: str
     command: str
     options: Mapping[str, JsonValue]
     environment_changes: tuple[Change, ...] = ()
+    plan_changes: tuple[Change, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,13 +98,7 @@ class RunFile:
         data = {
             "format_version": FORMAT_VERSION,
             **_fields(self.description),
-            "sessions": [
-                {
-                    **_fields(session),
-                    "environment_changes": [c._asdict() for c in session.environment_changes],
-                }
-                for session in self.sessions
-            ],
+            "sessions": [_session_fields(session) for session in self.sessions],
         }
         text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False, default=_plain)
         replace_file(folder / RUN_FILE, f"{text}\n")
@@ -137,24 +133,6 @@ class RunFile:
         """
         return PlannedEpisodes(config=planned_config(self.description.config, _source(folder)), groups=groups)
 
-    def check_unchanged(self, new: RunDescription, where: Path) -> None:
-        """Raise `RunChangedError` if the configuration, a recipe or a policy server is not what it was."""
-        old = self.description
-        changes = (
-            *find_changes(old.config, new.config, prefix="config"),
-            *find_changes(old.recipes, new.recipes, prefix="recipes"),
-        )
-        if changes:
-            raise RunChangedError(
-                f"{where}: this run was started with another configuration:\n{_listed(changes)}\n"
-                f"Use another --out for the new configuration, or restore the old one to continue this run."
-            )
-        if changes := find_changes(old.servers, new.servers, prefix="servers"):
-            raise RunChangedError(
-                f"{where}: this run was started with another policy at the server:\n{_listed(changes)}\n"
-                f"Start the former policy there again to continue this run, or use another --out."
-            )
-
     def with_session(self, session: Session) -> "RunFile":
         """Return this with one more session."""
         return replace(self, sessions=(*self.sessions, session))
@@ -168,6 +146,21 @@ class RunFile:
             description=replace(self.description, environment=environment),
             sessions=(*earlier, replace(current, environment_changes=noted)),
         )
+
+
+def run_changed(changes: Sequence[Change], where: Path, *, remedy: str) -> RunChangedError:
+    """Build the error for a run that is started again as another one."""
+    return RunChangedError(
+        f"{where}: this run was started with another configuration:\n{_listed(changes)}\n{remedy}"
+    )
+
+
+def server_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
+    """Build the error for a run whose policy server holds another policy than before."""
+    return RunChangedError(
+        f"{where}: this run was started with another policy at the server:\n{_listed(changes)}\n"
+        f"Start the former policy there again to continue this run, or use another --out."
+    )
 
 
 def environment_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
@@ -228,6 +221,15 @@ def _source(folder: Path) -> Source:
 
 def _fields(value: RunDescription | Session) -> dict[str, Any]:  # Any: JSON
     return {one.name: getattr(value, one.name) for one in fields(value)}
+
+
+def _session_fields(session: Session) -> dict[str, Any]:  # Any: JSON
+    data = _fields(session)
+    for name in ("environment_changes", "plan_changes"):
+        data[name] = [change._asdict() for change in data[name]]
+    if not session.plan_changes:
+        del data["plan_changes"]  # so that earlier versions read a run that never grew
+    return data
 
 
 def _plain(value: object) -> dict[str, JsonValue]:

@@ -1,6 +1,6 @@
 """The run folder: episodes are durable when they are reported as finished, and none is counted twice.
 
-    run.json        what the run was started with, and each time it was continued (see `run_file`)
+    run.json        what the run consists of, and each time it was continued or grew (see `run_file`)
     episodes.jsonl  one `EpisodeRecord` per line, appended, never rewritten
     timings.jsonl   wall-clock seconds, one `EpisodeTiming` per line; no result depends on it
     run.lock        held by the process that writes
@@ -106,7 +106,7 @@ class RunFolder:
 
         Args:
             path: the folder; it is made if it is not there.
-            description: what the run is started with; it must be what it was before.
+            description: what the run is started with; it must be what it was before, or plan more episodes.
             allow_environment_change: continue although commit, versions or device have changed.
             groups: task, policy and n_action_steps of each episode that is planned; None: as far as the
                 description says it.
@@ -207,6 +207,7 @@ class RunFolder:
             description,
             shown=self.path,
             allow_environment_change=self._allow_environment_change,
+            may_grow=True,
         )
         device = description.environment.get(DEVICE)
         return self._with_device(run_file, device) if isinstance(device, Mapping) else run_file
