@@ -123,8 +123,26 @@ def test_executed_actions_are_no_views_of_the_policy_s_array() -> None:
     assert again[0] == 0
 
 
+def test_the_first_inference_may_be_late_and_all_others_follow_it_by_n_action_steps() -> None:
+    spec = ChunkingSpec(n_action_steps=3, first_inference_step=2)
+
+    # Nothing to execute at steps 0 and 1; chunks at steps 2 and 5.
+    assert executed(spec, size=3, n_steps=7) == [None, None, 200, 201, 202, 500, 501]
+    executor = ChunkExecutor(spec)
+    executor.submit(2, chunk(2, 3))
+    executor.reset()
+    assert executor.next_inference_step == 2
+
+
+def test_a_first_inference_that_repeats_an_earlier_rhythm_is_refused() -> None:
+    ChunkingSpec(n_action_steps=3, first_inference_step=2)
+    with pytest.raises(RecipeError, match=r"first_inference_step is 3, expected less than .* which is 3"):
+        ChunkingSpec(n_action_steps=3, first_inference_step=3)
+
+
 @pytest.mark.parametrize(
-    ("field", "value"), [("n_action_steps", 0), ("delay_steps", -1), ("ensemble_decay", -0.1)]
+    ("field", "value"),
+    [("n_action_steps", 0), ("delay_steps", -1), ("ensemble_decay", -0.1), ("first_inference_step", -1)],
 )
 def test_values_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(RecipeError, match=rf"chunking\.{field} is {value}, expected ≥"):

@@ -9,6 +9,8 @@ actions for steps `s, s + 1, …`; with a delay of `d` steps it is available fro
   mean of what all chunks say about that step, weight `exp(-decay * i)` for the i-th oldest chunk.
   Source: Zhao et al. 2023 (ACT, arXiv:2304.13705), section IV-B, where decay is called m.
 
+The first inference is at step `first_inference_step`, and the arm holds still until its chunk arrives.
+
 With a delay, what a chunk says about steps that are past when it arrives is dropped (`delay_alignment:
 skip`), as a robot that keeps moving during inference must do; or the whole chunk is executed late
 (`stale`), which is what a loop that does not know of its own latency does.
@@ -37,10 +39,11 @@ class ChunkingSettings:
     delay_steps: int = 0
     delay_alignment: Literal["skip", "stale"] = "skip"
     ensemble_decay: float = 0.01  # the value of ACT's public code
+    first_inference_step: int = 0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("delay_steps", "ensemble_decay"):
+        for name in ("delay_steps", "ensemble_decay", "first_inference_step"):
             if getattr(self, name) < 0:
                 raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ 0.")
         check_bounds(self, {"delay_steps": (0, MAX_STEPS)}, prefix="chunking.")
@@ -67,6 +70,11 @@ class ChunkingSpec(ChunkingSettings):
             raise RecipeError(f"chunking.n_action_steps is {self.n_action_steps}, expected ≥ 1.")
         check_bounds(self, {"n_action_steps": (1, MAX_STEPS)}, prefix="chunking.")
         ChunkingSettings.__post_init__(self)  # super() does not know the class that `slots` makes
+        if self.first_inference_step >= self.n_action_steps:
+            raise RecipeError(
+                f"chunking.first_inference_step is {self.first_inference_step}, expected less than "
+                f"n_action_steps, which is {self.n_action_steps}."
+            )
 
     @property
     def n_skipped(self) -> int:
@@ -101,12 +109,12 @@ class ChunkExecutor:
         """Start with no chunks."""
         self.spec = spec
         self._chunks: list[_Arrived] = []
-        self._next_inference_step = 0
+        self._next_inference_step = spec.first_inference_step
 
     def reset(self) -> None:
         """Forget all chunks: a new episode begins at step 0."""
         self._chunks = []
-        self._next_inference_step = 0
+        self._next_inference_step = self.spec.first_inference_step
 
     @property
     def next_inference_step(self) -> int:

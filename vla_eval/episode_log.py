@@ -10,8 +10,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
-from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError
+from vla_eval.errors import (
+    InvalidActionError,
+    MissingInstructionError,
+    SimulationError,
+    SpecMismatchError,
+)
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.task_state import TaskStatus
@@ -143,6 +149,15 @@ def check_instruction(episode: EpisodeStart) -> None:
     if not episode.instruction.strip():
         raise MissingInstructionError(
             f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
+        )
+
+
+def check_first_inference(episode: EpisodeStart, chunking: ChunkingSpec) -> None:
+    """Raise `SpecMismatchError` if the policy would never be asked."""
+    if chunking.first_inference_step >= episode.horizon_steps:
+        raise SpecMismatchError(
+            f"{episode.task}: the episode ends after {episode.horizon_steps} steps, before the first "
+            f"inference at step {chunking.first_inference_step}. Lower chunking.first_inference_step."
         )
 
 

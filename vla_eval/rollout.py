@@ -22,7 +22,7 @@ from vla_eval.core import (
     StepObserver,
     StepResult,
 )
-from vla_eval.episode_log import EpisodeLog, check_chunk, check_instruction
+from vla_eval.episode_log import EpisodeLog, check_chunk, check_first_inference, check_instruction
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import PolicySpec, check_compatible
 
@@ -91,7 +91,8 @@ def rollout(
         heartbeat: called with what is about to be done, for a watchdog.
 
     Raises:
-        SpecMismatchError: policy, environment and chunking do not fit together.
+        SpecMismatchError: policy, environment and chunking do not fit together, or the first inference is
+            after the end of the episode.
         MissingInstructionError: an episode has no instruction.
         InvalidActionError: the policy returned something that is no finite chunk.
         SimulationError: the simulator returned a reward or a state that is not finite.
@@ -100,6 +101,7 @@ def rollout(
     settings.chunking.check_chunk_size(policy.spec.chunk_size, policy=policy.spec.name)
     for episode in episodes:
         check_instruction(episode)
+        check_first_inference(episode, settings.chunking)
     loop = _Loop(env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat)
     running = loop.begin(episodes)
     while active := [episode for episode in running if not episode.done]:

@@ -154,6 +154,12 @@ class TestQueue:
         assert "slots_per_worker" not in results_config(config())
         assert results_config(config(slots_per_worker=2))["slots_per_worker"] == 2
 
+    def test_a_first_inference_at_the_beginning_is_as_in_runs_that_had_no_choice(self) -> None:
+        at_once = results_config(config())
+        late = results_config(config(n_action_steps=[4], chunking={"first_inference_step": 3}))
+        assert "first_inference_step" not in at_once["chunking"]
+        assert late["chunking"]["first_inference_step"] == 3
+
 
 def test_every_task_has_its_instruction_in_the_paper_s_prompts() -> None:
     plan = make_plan(config(tasks=list(TASKS), episodes=1))

@@ -226,6 +226,8 @@ def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
     data["policies"] = [bare_policy(name) for name in data["policies"]]
     if config.reset_policy_at_step is None:
         del data["reset_policy_at_step"]
+    if config.chunking.first_inference_step == 0:
+        del data["chunking"]["first_inference_step"]
     return data
 
 
