@@ -59,6 +59,7 @@ class PrivilegedState:
             be), world frame, in candidate order; (0, 3) for a task without candidates.
         target: index of the right candidate; None for a task without candidates or with several right ones.
         right_candidates: indices of all right candidates, in the order shown; empty without candidates.
+        shown_candidates: those of them whose cue is in view at this step.
         in_order: whether several right candidates must be touched in that order.
         touched_candidates: indices of those touched so far, in the order of first touch.
         bodies: bodies and places by name, as the task names them: `ball`, `goal` …
@@ -73,6 +74,7 @@ class PrivilegedState:
     candidate_positions_m: NDArray[np.float64]
     target: int | None
     right_candidates: tuple[int, ...] = ()
+    shown_candidates: tuple[int, ...] = ()
     in_order: bool = False
     touched_candidates: tuple[int, ...] = ()
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)

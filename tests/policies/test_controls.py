@@ -36,6 +36,7 @@ FACTORIES = {
     "oracle": scripted.make_oracle,
     "cue_blind": scripted.make_cue_blind,
     "tour": scripted.make_tour,
+    "cue_reader": scripted.make_cue_reader,
     "body_memory": shortcuts.make_body_memory,
     "cue_touch": shortcuts.make_cue_touch,
     "one_frame": shortcuts.make_one_frame,
@@ -94,12 +95,14 @@ def run(
     seeds: Iterable[int],
     *,
     n_action_steps: int = 1,
+    first_inference_step: int = 0,
     log: ActionLog | None = None,
     env: SimEnv | None = None,
 ) -> list[EpisodeRecord]:
     env = privileged_env(task) if env is None else env
     policy = make_policy(policy_name, env, n_action_steps)
-    settings = RolloutSettings(chunking=ChunkingSpec(n_action_steps=n_action_steps))
+    chunking = ChunkingSpec(n_action_steps=n_action_steps, first_inference_step=first_inference_step)
+    settings = RolloutSettings(chunking=chunking)
     records = []
     for seed in seeds:
         start = EpisodeStart(
@@ -366,3 +369,52 @@ def test_a_privileged_policy_needs_an_environment_that_tells() -> None:
     settings = RolloutSettings(chunking=ChunkingSpec(n_action_steps=1))
     with pytest.raises(SpecMismatchError, match="privileged=True"):
         rollout(env, policy, [start], settings)
+
+
+def digests(task: str, policy: str, *, k: int, first: int) -> list[str | None]:
+    records = run(task, policy, (1, 2), n_action_steps=k, first_inference_step=first)
+    return [record.trajectory_sha256 for record in records]
+
+
+@pytest.mark.parametrize("task", ["RememberColor3-v0", "BunchOfColors3-v0"])
+def test_a_cue_reader_knows_the_cue_only_if_an_inference_falls_into_it(task: str) -> None:
+    """The cue is there at steps 0 to 4: K = 8 falls into it from step 4, not from step 5."""
+    for first, known in ((4, "oracle"), (5, "cue_blind")):
+        expected = digests(task, known, k=8, first=first)
+        assert digests(task, "cue_reader", k=8, first=first) == expected
+    assert digests(task, "oracle", k=8, first=5) != digests(task, "cue_blind", k=8, first=5)
+
+
+def test_of_a_chain_a_cue_reader_knows_the_cubes_that_were_there_at_its_inferences() -> None:
+    """Three cubes for five steps each. K = 5 falls into each; K = 10 into the first and the third."""
+
+    class Shown(ActionLog):
+        def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
+            state = result.observation.privileged
+            assert state is not None
+            shown[result.observation.step] = state.shown_candidates
+            right.append(state.right_candidates)
+
+    shown: dict[int, tuple[int, ...]] = {}
+    right: list[tuple[int, ...]] = []
+    task = "ChainOfColors3-v0"
+    (reader,) = run(task, "cue_reader", [1], n_action_steps=5, log=Shown())
+    (oracle,) = run(task, "oracle", [1], n_action_steps=5)
+    assert reader.trajectory_sha256 == oracle.trajectory_sha256
+    one, two, three = right[0]
+    expected = [(one,)] * 4 + [(two,)] * 5 + [(three,)] * 5 + [()] * 5
+    assert [shown[step] for step in range(1, 20)] == expected
+
+    env = privileged_env(task)
+    policy = make_policy("cue_reader", env, 10)
+    state = env.reset({0: 1}, render=False)[0].observation.privileged
+    policy.reset([EpisodeStart(slot=0, task=task, seed=1, run=0, instruction="go", horizon_steps=120)])
+    policy._in_view[0] |= {one, three}  # type: ignore[attr-defined]
+    wanted, in_order = policy._itinerary(0, state)  # type: ignore[attr-defined]
+    assert (wanted[0], wanted[2], in_order) == (one, three, True)
+    assert wanted[1] not in (one, three)
+
+
+def test_a_cue_reader_of_a_task_without_candidates_is_refused() -> None:
+    with pytest.raises(SpecMismatchError, match="which candidate the cue shows"):
+        make_policy("cue_reader", privileged_env("InterceptMedium-v0"), 1)

@@ -216,6 +216,9 @@ class FakeEnv:
             return "response"
         return "cue" if episode.step < self._cue_steps else "delay"
 
+    def _is_in_view(self, episode: _Episode) -> bool:
+        return self._shows_cue and self._phase(episode) == "cue"
+
     def _result(self, slot: int, *, render: bool) -> StepResult:
         episode = self._episodes[slot]
         if not episode.targets:
@@ -269,8 +272,8 @@ class FakeEnv:
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
         picture = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
-        in_cue = self._shows_cue and self._phase(episode) == "cue" and episode.targets
-        picture[:8] = 20 * (episode.targets[0] + 1) if in_cue else 0
+        in_view = self._is_in_view(episode) and episode.targets
+        picture[:8] = 20 * (episode.targets[0] + 1) if in_view else 0
         first = self._cue_steps + (self._response_step - self._cue_steps - self._distract_steps) // 2
         if first <= episode.step < first + self._distract_steps:
             picture[:8] = DISTRACTOR_LEVEL
@@ -292,6 +295,7 @@ class FakeEnv:
             candidate_positions_m=episode.candidates_m.copy(),
             target=_only(episode.targets),
             right_candidates=episode.targets,
+            shown_candidates=episode.targets if self._is_in_view(episode) else (),
             in_order=self._in_order,
             touched_candidates=tuple(episode.touched),
             bodies=bodies,

@@ -329,6 +329,7 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
         candidate_positions_m=positions,
         target=_only(env.right_candidates(row)) if is_choice else None,
         right_candidates=env.right_candidates(row) if is_choice else (),
+        shown_candidates=env.shown_candidates(row) if is_choice else (),
         in_order=env.in_order if is_choice else False,
         touched_candidates=env.touched_candidates(row) if is_choice else (),
         bodies={

@@ -1,6 +1,7 @@
 """Controls for tasks with candidates: go to the right one or ones, to any, or to one after another.
 
-All see the true state of the world, but not the answer before the choice can be made.
+All see the true state of the world, but not the answer before the choice can be made. `cue_reader` knows of
+the answer what was in view at its own inferences, and guesses the rest as `cue_blind` does.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from vla_eval.task_state import PrivilegedState
 
 STATIC_RAD_S = 0.2
 
-Mode = Literal["oracle", "cue_blind", "tour"]
+Mode = Literal["oracle", "cue_blind", "tour", "cue_reader"]
 
 
 class CandidateExpert(Protocol):
@@ -48,6 +49,7 @@ class _CandidateArm[Expert](ScriptedPolicy):
         self._expert = expert
         self._mode = mode
         self._drawn: dict[int, list[int]] = {}
+        self._in_view: dict[int, set[int]] = {}
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Decide, without looking, where a blind arm goes (first)."""
@@ -55,10 +57,12 @@ class _CandidateArm[Expert](ScriptedPolicy):
         for episode in episodes:
             order = self._rng[episode.slot].permutation(self._context.n_candidates)
             self._drawn[episode.slot] = [int(i) for i in order]
+            self._in_view[episode.slot] = set()
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Hold until the choice can be made, then go."""
         state = self.privileged_state(window)
+        self._in_view[window.slot].update(state.shown_candidates)
         if state.phase != "response":
             return ActionChunk(actions=hold_rows(state.gripper_width_m, self._n_actions, self._n_dims))
         return ActionChunk(actions=self._go(window, state))
@@ -66,6 +70,9 @@ class _CandidateArm[Expert](ScriptedPolicy):
     def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
         """Return (n_actions, 7): the way to the candidate or candidates."""
         raise NotImplementedError
+
+    def _knows(self, slot: int, candidate: int) -> bool:
+        return self._mode == "oracle" or (self._mode == "cue_reader" and candidate in self._in_view[slot])
 
 
 class ChoicePolicy(_CandidateArm[CandidateExpert]):
@@ -77,8 +84,8 @@ class ChoicePolicy(_CandidateArm[CandidateExpert]):
         return self._expert.plan(state, self._candidate(window, state), self._n_actions)
 
     def _candidate(self, window: ObservationWindow, state: PrivilegedState) -> int:
-        if self._mode == "oracle":
-            assert state.target is not None  # the policy is only made for tasks with candidates
+        assert state.target is not None  # one candidate is right in the tasks of this policy
+        if self._knows(window.slot, state.target):
             return state.target
         order = self._drawn[window.slot]
         if self._mode == "tour" and len(order) > 1 and self._touches(window, state, order[0]):
@@ -94,7 +101,8 @@ class ChoicePolicy(_CandidateArm[CandidateExpert]):
 class VisitPolicy(_CandidateArm[VisitExpert]):
     """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
 
-    A blind arm knows how many were shown, and draws which ones, and their order.
+    An arm that knows none or only some of them knows how many were shown, and draws the others, and their
+    order.
     """
 
     def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
@@ -105,9 +113,10 @@ class VisitPolicy(_CandidateArm[VisitExpert]):
     def _itinerary(self, slot: int, state: PrivilegedState) -> tuple[list[int], bool]:
         """Return the candidates to touch, and whether in this order."""
         drawn = self._drawn[slot]
-        if self._mode == "oracle":
-            return list(state.right_candidates), state.in_order
-        if self._mode == "cue_blind":
-            return drawn[: len(state.right_candidates)], state.in_order
-        begun = bool(state.touched_candidates)
-        return (drawn, False) if begun else (drawn[:1], True)
+        if self._mode == "tour":
+            begun = bool(state.touched_candidates)
+            return (drawn, False) if begun else (drawn[:1], True)
+        right = state.right_candidates
+        known = [candidate for candidate in right if self._knows(slot, candidate)]
+        guesses = iter([candidate for candidate in drawn if candidate not in known])
+        return [one if one in known else next(guesses) for one in right], state.in_order

@@ -41,6 +41,7 @@ POLICIES = {
     "oracle": "vla_eval.policies.scripted:make_oracle",
     "cue_blind": "vla_eval.policies.scripted:make_cue_blind",
     "tour": "vla_eval.policies.scripted:make_tour",
+    "cue_reader": "vla_eval.policies.scripted:make_cue_reader",
     "body_memory": "vla_eval.policies.shortcuts:make_body_memory",
     "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
     "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
@@ -48,7 +49,7 @@ POLICIES = {
     "openvla": "vla_eval.policies.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
 }
-PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "body_memory", "cue_touch", "one_frame"})
+PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "cue_reader", "body_memory", "cue_touch", "one_frame"})
 """Those of ours that read the true state of the world."""
 
 

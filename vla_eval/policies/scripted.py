@@ -6,8 +6,10 @@
 - `cue_blind`: the same arm, not knowing the cue: what a perfect arm without memory gets (chance).
 - `tour`: the same arm begins with a random candidate and continues with the nearest that is left, without
   ever knowing which one is right: what can be had by searching.
+- `cue_reader`: the same arm goes to what was in view at its own inferences, and guesses what was not: the
+  ceiling of a policy that reads only the last frame, at this chunk length and first inference.
 
-The last three see the true state of the world, but not the answer before the choice can be made, and
+The last four see the true state of the world, but not the answer before the choice can be made, and
 plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
 """
 
@@ -121,6 +123,20 @@ def make_tour(context: PolicyContext) -> ExpertPolicy:
             "Leave this task out for this policy."
         )
     return _make_expert_policy(context, "tour")
+
+
+def make_cue_reader(context: PolicyContext) -> ExpertPolicy:
+    """Make the `cue_reader` control.
+
+    Raises:
+        SpecMismatchError: the task has no candidates, so that no cue names one.
+    """
+    if context.n_candidates == 0:
+        raise SpecMismatchError(
+            f"policy '{context.name}' reads which candidate the cue shows; {context.env.task} has none. "
+            "Leave this task out for this policy."
+        )
+    return _make_expert_policy(context, "cue_reader")
 
 
 def _make_expert_policy(context: PolicyContext, mode: Mode) -> ExpertPolicy:

@@ -16,6 +16,7 @@ CONTROLS = {
     "random": "random actions",
     "hold": "no motion",
     "tour": "one candidate after another",
+    "cue_reader": "the cue as far as inferences fall into it",
     "body_memory": "the cue stored in the gripper",
     "cue_touch": "stays where the cue was",
     "one_frame": "single frames",

@@ -96,6 +96,11 @@ class ChoiceEnv(MemoryTableEnv):
         """Return the right candidates of one environment's episode, in the order shown."""
         return (int(self._target[env]),)
 
+    def shown_candidates(self, env: int) -> tuple[int, ...]:
+        """Return the right candidates of one environment's episode whose cue is in view now."""
+        in_cue = bool(self._elapsed_steps[env] < self._cue_end_step[env])
+        return self.right_candidates(env) if in_cue and self.show_cue else ()
+
     def right_first_choices(self, env: int) -> tuple[int, ...]:
         """Return the candidates that are right as a first touch."""
         right = self.right_candidates(env)

@@ -186,8 +186,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Show or hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
-        # `total_cue_steps` solved for the steps of one cube, which may be drawn per episode.
-        turn_steps = (self._cue_end_step + self.gap_steps) // self.n_shown
+        turn_steps = self._turn_steps()
         turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(max=self.n_shown - 1)
         since = step - turn * turn_steps
         begins = mask & (since == 0)
@@ -196,6 +195,20 @@ class SeveralColorsEnv(ItemChoiceEnv):
         drawn = self._drawn_sequence.gather(1, turn.long()[:, None])[:, 0]
         self._show_in_middle(begins, drawn, self._of_sequence(turn.long()))
         return begins | ends
+
+    def _turn_steps(self) -> torch.Tensor:
+        """Return (B,) the steps from one cube to the next: `total_cue_steps` solved for them."""
+        steps: torch.Tensor = (self._cue_end_step + self.gap_steps) // self.n_shown
+        return steps
+
+    def shown_candidates(self, env: int) -> tuple[int, ...]:
+        """Return the right candidates whose cue is in view now: one at most if they are shown in turn."""
+        shown = super().shown_candidates(env)
+        if not shown or not self.ONE_BY_ONE:
+            return shown
+        turn_steps = int(self._turn_steps()[env])
+        turn, since = divmod(int(self._elapsed_steps[env]), turn_steps)
+        return (shown[turn],) if since < turn_steps - self.gap_steps else ()
 
     def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:
         return self._sequence.gather(1, position[:, None])[:, 0]
