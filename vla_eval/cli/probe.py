@@ -6,13 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, typed_command, workers_argument
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, workers_argument
+from vla_eval.cli.output import FORMATS
+from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
+from vla_eval.cli.probe_runs import run_all
 from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
 
 if TYPE_CHECKING:
+    from vla_eval.probe.grid import GridSettings
     from vla_eval.probe.interventions import ProbeSettings
 
 DESCRIPTION = """Run each task as it is and with one thing changed, on the same seeds, and compare.
@@ -21,6 +25,8 @@ swap: another cue in the same scene. Who follows the cue chooses what was shown 
 order: the same items in another order (Seq, Chain). blank: the cue phase passes without a cue.
 cue, delay: other lengths of the phase. distractor: another item is seen in the delay. interference: the
 arm is moved in the delay. reset: the policy is reset in mid-episode. instruction: other sentences.
+
+With --grid, chunk lengths against the lengths of the phases: what of the cue falls into an inference?
 
 CONFIG is a file, or the name of one in configs/; without it, name at least one --task and one --policy.
 The controls oracle, cue_blind and body_memory are run beside the policies. The same command resumes."""
@@ -48,7 +54,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     _add_interventions(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/probe"), metavar="DIR", help="(runs/probe)")
     add_overrides(parser, help="change any field of the evaluations")
-    parser.add_argument("--format", choices=("markdown", "csv", "json", "latex"), default="markdown")
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
 
 
 def _add_interventions(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +88,7 @@ def _add_interventions(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="control steps (the end of the cue, the beginning of the response)",
     )
+    add_grid_arguments(parser)
     parser.add_argument("--no-controls", action="store_true", help="run only the policies that are named")
 
 
@@ -96,22 +103,20 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a mistyped name, a run folder of other settings, or a fault of every episode.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.probe.interventions import plan_probe
     from vla_eval.probe.probe_text import render_probe
     from vla_eval.probe.table import read_probe
 
+    if args.grid:
+        return run_grid(args, _config(args), _grid_settings(args))
+    if args.first_inferences is not None:
+        raise RecipeError("--first-inference is of a grid. Add --grid.")
     probe = plan_probe(_config(args), _settings(args))
     for pair in probe.left_out:
         print(f"left out: {pair}", file=sys.stderr)
-    command = typed_command()
-    with stop_on_signals() as stop:
-        for world in probe.worlds:
-            out = args.out / world.config.name
-            summary = evaluate_with_progress(world.config, out=out, command=command, stop=stop)
-            if summary.was_stopped:
-                print(f"Stopped. To resume: {command}", file=sys.stderr)
-                return stop.exit_code
+    stopped = run_all([world.config for world in probe.worlds], args.out)
+    if stopped is not None:
+        return stopped
     table = read_probe(probe.worlds, args.out)
     print(render_probe(table, args.format))
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
@@ -135,6 +140,31 @@ def _settings(args: argparse.Namespace) -> "ProbeSettings":
     return ProbeSettings(**given, controls=not args.no_controls)
 
 
+def _grid_settings(args: argparse.Namespace) -> "GridSettings":
+    from vla_eval.probe.grid import AXES, GridSettings
+
+    words = [word for words in args.probes or () for word in words]
+    for word in words:
+        if word not in AXES:
+            raise RecipeError(f"--grid: --probe {word}: expected {' or '.join(AXES)}. Run it without --grid.")
+    others = [flag for name, flag in OF_NO_GRID.items() if getattr(args, name) is not None]
+    if others:
+        raise RecipeError(f"--grid has no {', '.join(others)}. Run it without --grid.")
+    given = {name: _numbers(getattr(args, name), name) for name in ("delays", "cues", "first_inferences")}
+    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if words:
+        chosen["axes"] = tuple(dict.fromkeys(words))
+    return GridSettings(**chosen, controls=not args.no_controls)
+
+
+OF_NO_GRID = {
+    "swaps": "--swap",
+    "distractors": "--distract",
+    "instructions": "--instruction",
+    "reset_steps": "--reset-at",
+}
+"""Attribute -> flag of what only other interventions have."""
+
 FLAGS = {
     "swaps": ("--swap", 1),
     "delays": ("--delay", 0),
@@ -143,12 +173,13 @@ FLAGS = {
     "reset_steps": ("--reset-at", 1),
 }
 """Attribute -> flag and least value."""
+GRID_FLAGS = {"first_inferences": ("--first-inference", 0)}
 
 
 def _numbers(values: list[int] | None, name: str) -> tuple[int, ...] | None:
     if values is None:
         return None
-    flag, least = FLAGS[name]
+    flag, least = {**FLAGS, **GRID_FLAGS}[name]
     for value in values:
         if value < least:
             raise RecipeError(f"{flag} {value}: expected a whole number ≥ {least}.")

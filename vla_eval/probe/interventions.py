@@ -11,7 +11,7 @@ from typing import Literal
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
-from vla_eval.probe.phases import Phases, default_delay_steps, phases_of
+from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
@@ -113,7 +113,7 @@ def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
         UnknownNameError: a task that is not in the catalogue.
         RecipeError: the configuration sets what the probe sets itself, or nothing can be probed.
     """
-    _refuse_own_arguments(config)
+    refuse_own_arguments(config)
     worlds: list[World] = []
     left_out: list[str] = []
     for task in config.tasks:
@@ -164,9 +164,9 @@ class _Task:
         if probe == "blank":
             return [self.world(probe, None, {"show_cue": False})] if has_phases else []
         if probe == "cue":
-            return self._of_lengths(probe, "cue_steps", settings.cues) if has_phases else []
+            return self._of_lengths(probe, settings.cues) if has_phases else []
         if probe == "delay":
-            return self._of_lengths(probe, "delay_steps", settings.delays) if has_phases else []
+            return self._of_lengths(probe, settings.delays) if has_phases else []
         if probe == "distractor":
             return self._distracting() if has_phases else []
         if probe == "interference":
@@ -177,17 +177,12 @@ class _Task:
         names = [name for name in settings.instructions if name != self.config.prompt_set]
         return [self._instructed(name) for name in names]
 
-    def _of_lengths(self, probe: Intervention, argument: str, lengths: tuple[int, ...]) -> list[World]:
+    def _of_lengths(self, probe: Literal["cue", "delay"], lengths: tuple[int, ...]) -> list[World]:
         """Return the worlds in which a phase has another length, with as many steps for the response."""
         phases = self._phases()
         usual = phases.cue_steps if probe == "cue" else phases.delay_steps
-        n_times = phases.n_in_turn if probe == "cue" else 1
         return [
-            self.world(
-                probe,
-                length,
-                {argument: length, "horizon_steps": phases.horizon_steps + n_times * (length - usual)},
-            )
+            self.world(probe, length, phases.with_length(probe, length))
             for length in sorted(set(lengths) - {usual})
         ]
 
@@ -239,15 +234,7 @@ class _Task:
 
     def _phases(self) -> Phases:
         """Return the phases of the world as drawn; only asked of tasks with phases."""
-        phases = phases_of(self.spec, self.config.env)
-        if isinstance(phases, str):
-            raise RecipeError(
-                f"env.{phases}={self.config.env[phases]!r}: a probe that changes a phase, or resets the "
-                "policy at the end of one, needs phases of a fixed length. Give one number, or leave these "
-                "probes out."
-            )
-        assert phases is not None  # a task with candidates has phases
-        return phases
+        return fixed_phases(self.spec, self.config.env)
 
 
 def shows_several(spec: TaskSpec) -> bool:
@@ -261,7 +248,8 @@ def delay_of(config: EvalConfig) -> int | None:
     return delay if isinstance(delay, int) else None
 
 
-def _refuse_own_arguments(config: EvalConfig) -> None:
+def refuse_own_arguments(config: EvalConfig) -> None:
+    """Raise `RecipeError` if a configuration sets what a probe sets itself."""
     for name in OWN_ARGUMENTS:
         if name in config.env:
             raise RecipeError(

@@ -5,8 +5,9 @@ Knows nothing of simulators: their defaults are written down here, and a test co
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+from vla_eval.errors import RecipeError
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
 
 CUE_STEPS = 5
@@ -47,6 +48,17 @@ class Phases:
         """The first step of the response."""
         return self.cue_end_step + self.delay_steps
 
+    def shows_at(self, step: int) -> bool:
+        """Whether a cue is in view at this step."""
+        turn_steps = self.cue_steps + self.gap_steps
+        return step < self.cue_end_step and step % turn_steps < self.cue_steps
+
+    def with_length(self, phase: Literal["cue", "delay"], steps: int) -> dict[str, int]:
+        """Return the arguments that give a phase this length, and the response as many steps as before."""
+        usual, n_times = (self.cue_steps, self.n_in_turn) if phase == "cue" else (self.delay_steps, 1)
+        horizon_steps = self.horizon_steps + n_times * (steps - usual)
+        return {f"{phase}_steps": steps, "horizon_steps": horizon_steps}
+
 
 def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  # Any: a task's arguments
     """Return the phases of a task with these arguments.
@@ -77,6 +89,29 @@ def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  #
     )
 
 
+def fixed_phases(spec: TaskSpec, env: Mapping[str, Any]) -> Phases:  # Any: a task's arguments
+    """Return the phases of a task that has some.
+
+    Raises:
+        RecipeError: the length of one is drawn per episode.
+    """
+    phases = phases_of(spec, env)
+    if isinstance(phases, str):
+        raise RecipeError(
+            f"env.{phases}={env[phases]!r}: a probe that changes a phase, or resets the policy at the end of "
+            "one, needs phases of a fixed length. Give one number, or leave these probes out."
+        )
+    assert phases is not None  # only asked of tasks with candidates, which have phases
+    return phases
+
+
+def divides(phases: Phases, n_action_steps: int) -> bool:
+    """Whether each phase, and each item of the cue, begins with an inference if the first one is at 0."""
+    turn_steps = phases.cue_steps + phases.gap_steps
+    begins = (phases.cue_end_step, phases.response_step, turn_steps if phases.n_in_turn > 1 else 0)
+    return all(step % n_action_steps == 0 for step in begins)
+
+
 class Inferences(NamedTuple):
     """Which inferences of a policy fall into the cue, and how late the first one of the response is.
 
@@ -90,9 +125,10 @@ class Inferences(NamedTuple):
     n_late: int
 
 
-def inferences(phases: Phases, n_action_steps: int) -> Inferences:
-    """Return the inferences at steps 0, K, 2K, … that matter to the cue and to the response."""
+def inferences(phases: Phases, n_action_steps: int, *, first_inference_step: int = 0) -> Inferences:
+    """Return the inferences, every n_action_steps, that matter to the cue and to the response."""
+    steps = range(first_inference_step, phases.cue_end_step, n_action_steps)
     return Inferences(
-        cue_steps=tuple(range(0, phases.cue_end_step, n_action_steps)),
-        n_late=-phases.response_step % n_action_steps,
+        cue_steps=tuple(step for step in steps if phases.shows_at(step)),
+        n_late=(first_inference_step - phases.response_step) % n_action_steps,
     )

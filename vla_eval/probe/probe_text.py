@@ -1,27 +1,27 @@
-"""The table of a probe as Markdown, CSV, JSON or LaTeX."""
+"""The table of a probe as Markdown, CSV, JSON, LaTeX or an HTML table."""
 
-import csv
-import io
 import json
-from collections.abc import Sequence
-from typing import Any, Literal
 
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife, Range
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable, Retention
-from vla_eval.results.cells import csv_cell, markdown_cell, markdown_text
+from vla_eval.probe.text_table import (
+    UNDEFINED,
+    JsonRow,
+    ProbeFormat,
+    rows_as_csv,
+    shown_rate,
+    shown_table,
+)
 from vla_eval.results.estimates import Interval
-from vla_eval.results.latex import latex_table, latex_text
 
-ProbeFormat = Literal["markdown", "csv", "json", "latex"]
 PROBE_VERSION = 1
-UNDEFINED = "—"
 TITLES = (
     *("task", "policy", "K", "world", "pairs", "sensitivity", "warranted", "value", "reliable", "follows"),
     *("success once", "chance", "left", "p", "p (Holm)"),
 )
-JsonRow = dict[str, Any]  # Any: JSON
+TEXT_TITLES = ("task", "policy", "world")
 
 
 def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
@@ -29,21 +29,14 @@ def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
     if fmt == "json":
         return json.dumps(probe_json(table), indent=2, ensure_ascii=False, allow_nan=False)
     if fmt == "csv":
-        return _csv([json_row(row) for row in table.rows])
-    cells = [_cells(row) for row in table.rows]
+        return rows_as_csv([json_row(row) for row in table.rows])
     said = [*sentences(table), *notes(table)]
-    if fmt == "latex":
-        is_number = [title not in ("task", "policy", "world") for title in TITLES]
-        footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
-        return "\n".join(
-            [
-                "% needs \\usepackage{booktabs}",
-                *latex_table(TITLES, cells, is_number, ruled_by_first=True),
-                *footnotes,
-            ]
-        )
-    lines = [_line(TITLES), _line([":--"] * len(TITLES)), *(_line(row) for row in cells)]
-    return "\n".join([*lines, "", *(f"- {markdown_text(line)}" for line in said)])
+    return shown_table(TITLES, probe_cells(table), said, fmt, text_titles=TEXT_TITLES)
+
+
+def probe_cells(table: ProbeTable) -> list[list[str]]:
+    """Return the cells of the table for reading, in the order of `TITLES`."""
+    return [_cells(row) for row in table.rows]
 
 
 def probe_json(table: ProbeTable) -> JsonRow:
@@ -138,45 +131,22 @@ def _cells(row: ProbeRow) -> list[str]:
         str(row.n_pairs),
         _shown(swap.sensitivity if swap else None),
         _shown(swap.warranted_choice if swap else None),
-        _shown_rate(swap.matched_value, swap.matched_interval) if swap else UNDEFINED,
+        shown_rate(swap.matched_value, swap.matched_interval) if swap else UNDEFINED,
         _shown(swap.reliability if swap else None),
         _shown(row.followed),
         _shown(row.success),
         UNDEFINED if row.chance is None else f"{row.chance:.2f}",
         UNDEFINED
         if row.left is None or row.left_interval is None
-        else _shown_rate(row.left, row.left_interval),
+        else shown_rate(row.left, row.left_interval),
         _shown_p(row.p_value),
         _shown_p(row.corrected_p),
     ]
 
 
 def _shown(share: Share | None) -> str:
-    return UNDEFINED if share is None else _shown_rate(share.rate, share.interval)
-
-
-def _shown_rate(rate: float, interval: Interval | Range) -> str:
-    low, high = (UNDEFINED if end is None else f"{end:.2f}" for end in interval)
-    return f"{rate:.2f} [{low}, {high}]"
+    return UNDEFINED if share is None else shown_rate(share.rate, share.interval)
 
 
 def _shown_p(p_value: float | None) -> str:
     return UNDEFINED if p_value is None else f"{p_value:.3g}"
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(markdown_cell(cell) for cell in cells)} |"
-
-
-def _csv(rows: Sequence[JsonRow]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows[0])
-    writer.writerows([[csv_cell(_csv_value(value)) for value in row.values()] for row in rows])
-    return text.getvalue().rstrip("\n")
-
-
-def _csv_value(value: object) -> object:
-    if isinstance(value, list):
-        return " ".join(map(str, value))
-    return "" if value is None else value

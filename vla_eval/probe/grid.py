@@ -1,0 +1,167 @@
+"""The evaluations of a grid: chunk lengths against the length of a phase, at each first inference.
+
+Where K does not divide the phases, how much of the cue falls between two inferences depends on where the
+first one is. So every first inference below K is run there. Knows nothing of records or statistics.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import RecipeError
+from vla_eval.probe.interventions import refuse_own_arguments
+from vla_eval.probe.phases import Phases, divides, fixed_phases
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
+
+Axis = Literal["delay", "cue"]
+AXES: tuple[Axis, ...] = ("delay", "cue")
+
+DEFAULT_N_ACTION_STEPS = (1, 2, 4, 8)
+DEFAULT_GRID_DELAYS = (0, 5, 20, 80)
+DEFAULT_GRID_CUES = (1, 2, 3, 5)
+
+ORACLE = "oracle"
+CUE_READER = "cue_reader"
+CONTROLS = (ORACLE, CUE_READER)
+"""Arms that forget nothing: one knows the cue in any case, one only from the frames of its inferences."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridSettings:
+    """What a grid goes over, beside the chunk lengths of the evaluation.
+
+    Attributes:
+        axes: which phases get other lengths.
+        delays, cues: these lengths, in control steps.
+        first_inferences: which first inferences are run; none: all below K where K does not divide the
+            phases.
+        controls: whether `CONTROLS` are run with the policies.
+    """
+
+    axes: tuple[Axis, ...] = ("delay",)
+    delays: tuple[int, ...] = DEFAULT_GRID_DELAYS
+    cues: tuple[int, ...] = DEFAULT_GRID_CUES
+    first_inferences: tuple[int, ...] = ()
+    controls: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridWorld:
+    """One evaluation of a grid: a task, the length of a phase, and a first inference, at one or more K.
+
+    Attributes:
+        task: task id.
+        axis: the phase that has another length.
+        level: its length in control steps.
+        first_inference_step: the control step of the first inference.
+        phases: the phases with this length.
+        config: the evaluation; its name is the run folder's.
+    """
+
+    task: str
+    axis: Axis
+    level: int
+    first_inference_step: int
+    phases: Phases
+    config: EvalConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """The evaluations of a grid, and the tasks that have none, for a message."""
+
+    worlds: tuple[GridWorld, ...]
+    left_out: tuple[str, ...]
+
+    @property
+    def n_episodes(self) -> int:
+        """How many episodes the evaluations have."""
+        configs = [world.config for world in self.worlds]
+        return sum(len(c.n_action_steps or ()) * len(c.policies) * c.runs * c.episodes for c in configs)
+
+
+def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
+    """Return the evaluations that a grid consists of.
+
+    Args:
+        config: tasks, policies, seeds and all that is the same everywhere; without n_action_steps, those of
+            `DEFAULT_N_ACTION_STEPS`.
+        settings: what is changed.
+
+    Raises:
+        UnknownNameError: a task that is not in the catalogue.
+        RecipeError: the configuration sets what the grid sets itself, a phase has no fixed length, or nothing
+            can be run.
+    """
+    refuse_own_arguments(config)
+    if config.chunking.first_inference_step:
+        raise RecipeError("chunking.first_inference_step: a grid sets it itself. Use --first-inference.")
+    worlds: list[GridWorld] = []
+    left_out: list[str] = []
+    for task in config.tasks:
+        spec = task_spec(task)
+        if spec.candidates is None:
+            left_out.append(f"{spec.id}: it has no phases")
+            continue
+        found = [world for axis in settings.axes for world in _worlds(spec, axis, config, settings)]
+        worlds += found
+        if not found:
+            left_out.append(f"{spec.id}: no K has one of these first inferences")
+    if not worlds:
+        raise RecipeError(f"--grid: there is nothing to run ({'; '.join(left_out)}).")
+    return Grid(worlds=tuple(worlds), left_out=tuple(left_out))
+
+
+def first_inferences(phases: Phases, n_action_steps: int) -> tuple[int, ...]:
+    """Return the first inferences that are to be run: 0 alone where every phase begins with an inference."""
+    return (0,) if divides(phases, n_action_steps) else tuple(range(n_action_steps))
+
+
+def _worlds(spec: TaskSpec, axis: Axis, config: EvalConfig, settings: GridSettings) -> list[GridWorld]:
+    usual = fixed_phases(spec, config.env)
+    sizes = config.n_action_steps or DEFAULT_N_ACTION_STEPS
+    worlds = []
+    for level in settings.delays if axis == "delay" else settings.cues:
+        env = usual.with_length(axis, level)
+        phases = fixed_phases(spec, {**config.env, **env})
+        firsts = {k: first_inferences(phases, k) for k in sizes}
+        for first in range(max(sizes)):
+            own = tuple(k for k in sizes if first in firsts[k])
+            if own and (not settings.first_inferences or first in settings.first_inferences):
+                changed = _config(spec, axis, level, first, config, own, env, controls=settings.controls)
+                worlds.append(
+                    GridWorld(
+                        task=spec.id,
+                        axis=axis,
+                        level=level,
+                        first_inference_step=first,
+                        phases=phases,
+                        config=changed,
+                    )
+                )
+    return worlds
+
+
+def _config(
+    spec: TaskSpec,
+    axis: Axis,
+    level: int,
+    first: int,
+    config: EvalConfig,
+    sizes: tuple[int, ...],
+    env: Mapping[str, int],
+    *,
+    controls: bool,
+) -> EvalConfig:
+    more = [control for control in CONTROLS if controls and control not in config.policies]
+    return replace(
+        config,
+        name=f"{spec.id}_grid_{axis}_{level}_from_{first}",
+        tasks=(spec.id,),
+        policies=(*config.policies, *more),
+        n_action_steps=sizes,
+        chunking=replace(config.chunking, first_inference_step=first),
+        env={**config.env, **env},
+    )

@@ -1,0 +1,54 @@
+"""The heat maps of a grid: success by K and by the length of a phase."""
+
+from pathlib import Path
+
+from vla_eval.errors import ReportError
+from vla_eval.page.heat import HeatMap, heat_png
+from vla_eval.probe.grid_table import GridCell, GridTable
+
+Group = tuple[str, str]
+"""Task and phase."""
+
+
+def heat_maps(table: GridTable) -> dict[Group, list[HeatMap]]:
+    """Return the heat maps of each task and phase: of the policies, then of the controls."""
+    found: dict[Group, dict[str, list[GridCell]]] = {}
+    for cell in table.cells:
+        found.setdefault((cell.task, cell.axis), {}).setdefault(cell.policy, []).append(cell)
+    return {
+        group: [_heat_map(policy, cells) for policy, cells in policies.items()]
+        for group, policies in found.items()
+    }
+
+
+def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
+    """Write a PNG file per task and phase, `TASK_grid_delay.png`, and return their paths.
+
+    Raises:
+        ReportError: a file cannot be written.
+    """
+    written = []
+    for (task, axis), maps in heat_maps(table).items():
+        path = folder / f"{task}_grid_{axis}.png"
+        try:
+            path.write_bytes(heat_png(maps))
+        except OSError as exc:
+            raise ReportError(
+                f"{path}: cannot be written ({exc.strerror or exc}). Name another --out."
+            ) from exc
+        written.append(path)
+    return written
+
+
+def _heat_map(policy: str, cells: list[GridCell]) -> HeatMap:
+    sizes = sorted({cell.n_action_steps for cell in cells})
+    levels = sorted({cell.level for cell in cells})
+    rates = {(cell.n_action_steps, cell.level): cell.rate for cell in cells}
+    return HeatMap(
+        title=policy,
+        row_title="K",
+        column_title=f"{cells[0].axis}, steps",
+        rows=tuple(sizes),
+        columns=tuple(levels),
+        rates=tuple(tuple(rates.get((k, level)) for level in levels) for k in sizes),
+    )

@@ -1,0 +1,90 @@
+"""What a grid says, in words: which drops chunk and phase explain, and which they do not."""
+
+from collections.abc import Sequence
+
+from vla_eval.probe.grid_table import GridCell, GridTable
+
+
+def grid_sentences(table: GridTable) -> list[str]:
+    """Return a sentence for each cell in which a policy succeeds less than in its best cell."""
+    found = []
+    for cells in _by_policy(table).values():
+        best = max(cells, key=lambda cell: cell.rate or 0.0)
+        found += [sentence for cell in cells if (sentence := _sentence(table, cell, best)) is not None]
+    return found
+
+
+def _by_policy(table: GridTable) -> dict[tuple[str, str, str], list[GridCell]]:
+    """Return the cells of each policy that has a reference, those without a result left out."""
+    found: dict[tuple[str, str, str], list[GridCell]] = {}
+    for cell in table.cells:
+        if cell.reference is not None and cell.rate is not None:
+            found.setdefault((cell.task, cell.axis, cell.policy), []).append(cell)
+    return found
+
+
+def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
+    now, at_best = table.reference_of(cell), table.reference_of(best)
+    if not _is_below(cell, best) or now is None or at_best is None:
+        return None
+    drop = (
+        f"{cell.policy} on {cell.task} succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at "
+        f"{_where(best)}"
+    )
+    same = f"{now.policy}, which has the same inferences and forgets nothing, "
+    if not _is_below(now, at_best):
+        return (
+            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase do not explain "
+            "the drop."
+        )
+    if _is_below(cell, now):
+        return (
+            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase explain a part of "
+            "the drop, not all of it."
+        )
+    return (
+        f"{drop}; {same}falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the "
+        "drop, not memory."
+    )
+
+
+def _is_below(one: GridCell, other: GridCell) -> bool:
+    """Whether the intervals of two rates do not overlap, and the first rate is the lower one."""
+    if one.interval is None or other.interval is None:
+        return False
+    return one.interval.high < other.interval.low
+
+
+def _where(cell: GridCell) -> str:
+    return f"K = {cell.n_action_steps}, {cell.axis} {cell.level}"
+
+
+def _rate(cell: GridCell) -> str:
+    return "no episode" if cell.rate is None else f"{cell.rate:.2f}"
+
+
+def grid_notes(table: GridTable) -> list[str]:
+    """Return what a reader of the table has to know, errors included."""
+    found = [
+        "Success once, over all first inferences; 95 % intervals (Wilson) count a seed as one episode. cue "
+        "frames: how many the policy is given (oracle reads the true state). late: steps of the response "
+        "before its first inference, whose actions were chosen before it. Each from the least to the most "
+        "over the first inferences.",
+    ]
+    controls = dict.fromkeys(cell.reference for cell in table.cells if cell.reference is not None)
+    if controls:
+        found.append(
+            "Same inferences: cue_reader for a policy that reads only the last frame (it knows what was in "
+            "view at its own inferences, and guesses the rest); oracle for one that reads every frame."
+        )
+    found += _unknown(table.cells)
+    if table.n_errors:
+        found.append(
+            f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
+        )
+    return found
+
+
+def _unknown(cells: Sequence[GridCell]) -> list[str]:
+    names = dict.fromkeys(cell.policy for cell in cells if any(part.n_seen is None for part in cell.parts))
+    return [f"{name}: no episode has a result, so that what it reads is not known." for name in names]

@@ -1,0 +1,195 @@
+"""The table of a grid, from its run folders: a cell per policy, K and length, over all first inferences."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.probe.grid import CUE_READER, ORACLE, Axis, GridWorld
+from vla_eval.probe.phases import Inferences, inferences
+from vla_eval.probe.quantities import Share, follows, wilson_of_rate
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import Interval
+from vla_eval.storage.run_folder import read_run
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridPart:
+    """The episodes of a cell with one first inference.
+
+    Attributes:
+        first_inference_step: its control step.
+        inferences: which inferences fall into the cue, and how many steps of the response are executed
+            before the first inference of the response.
+        n_seen: frames of the cue that the policy is given; None while no record says what it reads.
+        success, followed: episodes that succeed, and that follow the cue; None without a result.
+        n_errors: episodes without a result.
+    """
+
+    first_inference_step: int
+    inferences: Inferences
+    n_seen: int | None
+    success: Share | None
+    followed: Share | None
+    n_errors: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridCell:
+    """One policy at one K with one length of a phase.
+
+    Attributes:
+        task, axis, level, policy, n_action_steps: which cell it is.
+        n_cue_frames: control steps at which a cue is in view.
+        parts: one for each first inference.
+        n_seeds: different episodes; each is run at every first inference.
+        chance: rate of following the cue without memory; None where it is not known.
+        reference: the control that has the same inferences and forgets nothing; None for controls, or if it
+            was not run.
+    """
+
+    task: str
+    axis: Axis
+    level: int
+    policy: str
+    n_action_steps: int
+    n_cue_frames: int
+    parts: tuple[GridPart, ...]
+    n_seeds: int
+    chance: float | None
+    reference: str | None
+
+    @property
+    def rate(self) -> float | None:
+        """The share of all its episodes that succeed."""
+        known = [part.success for part in self.parts if part.success is not None]
+        return sum(one.n for one in known) / sum(one.of for one in known) if known else None
+
+    @property
+    def interval(self) -> Interval | None:
+        """The interval of the rate, with a seed as one episode at however many first inferences it is run."""
+        return None if self.rate is None else wilson_of_rate(self.rate, self.n_seeds)
+
+    @property
+    def n_errors(self) -> int:
+        """The number of episodes without a result."""
+        return sum(part.n_errors for part in self.parts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridTable:
+    """All cells: by task, phase and policy, then by K and length."""
+
+    cells: tuple[GridCell, ...]
+
+    @property
+    def n_errors(self) -> int:
+        """The number of episodes without a result."""
+        return sum(cell.n_errors for cell in self.cells)
+
+    def reference_of(self, cell: GridCell) -> GridCell | None:
+        """Return the cell of the reference at the same K and length; None without one."""
+        key = (cell.task, cell.axis, cell.level, cell.reference, cell.n_action_steps)
+        same = (
+            one
+            for one in self.cells
+            if (one.task, one.axis, one.level, one.policy, one.n_action_steps) == key
+        )
+        return next(same, None)
+
+
+def read_grid(worlds: Sequence[GridWorld], out: Path) -> GridTable:
+    """Read the run folders of all worlds and return their table."""
+    return grid_table(worlds, [read_run(out / world.config.name).records for world in worlds])
+
+
+def grid_table(worlds: Sequence[GridWorld], records: Sequence[Sequence[EpisodeRecord]]) -> GridTable:
+    """Return the table.
+
+    Args:
+        worlds: what was run.
+        records: of each world, in any order.
+    """
+    found: dict[tuple[str, Axis], list[_Run]] = {}
+    for world, own in zip(worlds, records, strict=True):
+        found.setdefault((world.task, world.axis), []).append(_Run(world=world, records=own))
+    return GridTable(cells=tuple(cell for runs in found.values() for cell in _cells(runs)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    world: GridWorld
+    records: Sequence[EpisodeRecord]
+
+    def of(self, policy: str, k: int) -> list[EpisodeRecord]:
+        return [r for r in self.records if (r.policy, r.n_action_steps) == (policy, k)]
+
+
+def _cells(runs: Sequence[_Run]) -> list[GridCell]:
+    """Return the cells of one task and phase."""
+    policies = list(dict.fromkeys(record.policy for run in runs for record in run.records))
+    sizes = sorted({record.n_action_steps for run in runs for record in run.records})
+    levels = dict.fromkeys(run.world.level for run in runs)
+    reads_every = {policy: _reads_every(runs, policy) for policy in policies}
+    cells = []
+    for policy in sorted(policies, key=lambda name: (name in (ORACLE, CUE_READER), policies.index(name))):
+        for k in sizes:
+            for level in levels:
+                own = [run for run in runs if run.world.level == level and run.of(policy, k)]
+                if own:
+                    cells.append(_cell(own, policy, k, reads_every, policies))
+    return cells
+
+
+def _reads_every(runs: Sequence[_Run], policy: str) -> bool | None:
+    """Return whether a policy is given every frame; None while no record tells.
+
+    With one inference per frame both are the same.
+    """
+    known = [
+        (record.n_frames, record.n_inferences)
+        for run in runs
+        for record in run.records
+        if record.policy == policy and record.n_frames is not None and record.n_inferences is not None
+    ]
+    return any(n_frames > n_inferences for n_frames, n_inferences in known) if known else None
+
+
+def _cell(
+    runs: Sequence[_Run],
+    policy: str,
+    k: int,
+    reads_every: Mapping[str, bool | None],
+    policies: Sequence[str],
+) -> GridCell:
+    world, every = runs[0].world, reads_every[policy]
+    results = [record for run in runs for record in run.of(policy, k) if record.outcome != "error"]
+    chances = {record.chance_success for record in results}
+    reference = ORACLE if every else CUE_READER
+    is_control = policy in (ORACLE, CUE_READER)
+    return GridCell(
+        task=world.task,
+        axis=world.axis,
+        level=world.level,
+        policy=policy,
+        n_action_steps=k,
+        n_cue_frames=world.phases.n_in_turn * world.phases.cue_steps,
+        parts=tuple(_part(run, run.of(policy, k), k, every) for run in runs),
+        n_seeds=len({(record.run, record.seed) for record in results}),
+        chance=chances.pop() if len(chances) == 1 else None,
+        reference=None if is_control or every is None or reference not in policies else reference,
+    )
+
+
+def _part(run: _Run, records: Sequence[EpisodeRecord], k: int, reads_every: bool | None) -> GridPart:
+    results = [record for record in records if record.outcome != "error"]
+    phases, first = run.world.phases, run.world.first_inference_step
+    found = inferences(phases, k, first_inference_step=first)
+    n_frames = phases.n_in_turn * phases.cue_steps
+    return GridPart(
+        first_inference_step=first,
+        inferences=found,
+        n_seen=None if reads_every is None else n_frames if reads_every else len(found.cue_steps),
+        success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
+        followed=Share(sum(map(follows, results)), len(results)) if results else None,
+        n_errors=len(records) - len(results),
+    )
