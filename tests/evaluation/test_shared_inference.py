@@ -15,12 +15,11 @@ import pytest
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
-from vla_eval.evaluation import inference_choice
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.inference_choice import chosen_inference
 from vla_eval.evaluation.plan import Plan, make_plan, results_config
 from vla_eval.records import EpisodeRecord
-from vla_eval.serving import shared as shared_module
+from vla_eval.workers import local
 
 # A recurrent network that infers for all rows of a pass at once: its bits depend on the size of a pass and on
 # the row, as those of any network do.
@@ -155,7 +154,7 @@ def test_with_several_gpus_each_has_a_server_and_records_are_the_same(
     shared(network, "one", workers=2)
     for path in network.folder.glob("pid-*"):
         path.unlink()
-    monkeypatch.setattr(shared_module, "visible_gpus", lambda: ("0", "1"))
+    monkeypatch.setattr(local, "visible_gpus", lambda: ("0", "1"))
     shared(network, "two", workers=2)
 
     assert len(network.worker_pids()) == 2
@@ -192,7 +191,7 @@ class TestTheChoice:
     def test_it_is_in_the_workers_without_a_gpu(
         self, network: Bench, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(inference_choice, "visible_gpus", lambda: ())
+        monkeypatch.setattr(local, "visible_gpus", lambda: ())
         assert chosen_inference(network.config(workers=4)) == "in_process"
 
     @pytest.mark.parametrize(
@@ -202,7 +201,7 @@ class TestTheChoice:
     def test_with_a_gpu_it_is_shared_by_several_workers_of_a_policy_with_weights(
         self, network: Bench, monkeypatch: pytest.MonkeyPatch, workers: int, policy: str, expected: str
     ) -> None:
-        monkeypatch.setattr(inference_choice, "visible_gpus", lambda: ("0",))
+        monkeypatch.setattr(local, "visible_gpus", lambda: ("0",))
         name = str(network.folder / policy) if policy.endswith(".yaml") else policy
         assert chosen_inference(network.config(workers=workers, policies=[name])) == expected
 

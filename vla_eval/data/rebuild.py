@@ -17,6 +17,8 @@ from vla_eval.data.replay import check_task_versions, recipe_of
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.seed_queue import Selection
 from vla_eval.errors import DatasetError
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +35,7 @@ def rebuild(
     out: Path,
     observer: RecordingObserver,
     workers: int | Literal["auto"] = "auto",
+    backend: Backend = LOCAL,
 ) -> Rebuilt | None:
     """Rebuild a dataset in OUT/TASK; after an interruption the same call resumes.
 
@@ -41,6 +44,7 @@ def rebuild(
         out: another folder.
         observer: gets the progress.
         workers: processes.
+        backend: where they run.
 
     Returns:
         What has come of it; None if the observer asked to stop.
@@ -67,6 +71,7 @@ def rebuild(
         observer=observer,
         selections={task: selection},
         source=manifest_sha256(dataset),
+        backend=backend,
     )
     if summary.was_stopped:
         return None

@@ -18,7 +18,6 @@ from typing import Literal, Protocol
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
 from vla_eval.config.files import content_of, options_of
 from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
 from vla_eval.data.recording_folder import RecordingFolder
 from vla_eval.data.recording_jobs import (
@@ -36,17 +35,19 @@ from vla_eval.data.seed_queue import SeedQueue, Selection
 from vla_eval.errors import RecordingError
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
+from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.job_list import JobList
+from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.pool import WorkerPool
-from vla_eval.workers.start import available_cores, simulator_modules
+from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording_worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
 
 Phase = Literal["trying seeds", "rendering", "joining"]
-RecordingPool = WorkerPool[RecordingJob, RecordingAnswer]
+RecordingPool = Pool[RecordingJob, RecordingAnswer]
 
 
 class RecordingObserver(Protocol):
@@ -119,6 +120,7 @@ def record(
     command: str = "",
     allow_environment_change: bool = False,
     observer: RecordingObserver | None = None,
+    backend: Backend = LOCAL,
 ) -> RecordingSummary:
     """Record all datasets of a recipe that are not there yet.
 
@@ -128,6 +130,7 @@ def record(
         command: what the user typed, for the record.
         allow_environment_change: resume although package versions or the machine have changed.
         observer: gets the progress.
+        backend: where the workers run; they write shards and datasets into the folder.
 
     Raises:
         VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk. What was
@@ -140,6 +143,7 @@ def record(
         command=command,
         allow_environment_change=allow_environment_change,
         observer=observer or _Silence(),
+        backend=backend,
     )
 
 
@@ -153,6 +157,7 @@ def run_plan(
     allow_environment_change: bool = False,
     selections: Mapping[str, Selection] | None = None,
     source: str | None = None,
+    backend: Backend = LOCAL,
 ) -> RecordingSummary:
     """Record what is planned; see `record`.
 
@@ -165,6 +170,7 @@ def run_plan(
         allow_environment_change: resume although package versions or the machine have changed.
         selections: task -> the attempts to render, where they are known already.
         source: digest of what the selections were read from.
+        backend: see `record`.
     """
     versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
@@ -176,30 +182,29 @@ def run_plan(
         command=command,
     )
     datasets: list[RecordedDataset] = []
-    n_workers = available_cores() if recipe.workers == "auto" else recipe.workers
-    with (
-        RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder,
-        RecordingPool(
+    n_workers = backend.n_cores if recipe.workers == "auto" else recipe.workers
+    with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
+        pool: RecordingPool = backend.pool(
             recording_main,
             answers=(Attempt, ShardWritten, DatasetWritten),
             size=n_workers,
             timeouts=recipe.timeouts,
             logs=folder.logs(),
             preload=(WORKER_MODULE, *simulator_modules(recipe.simulator)),
-        ) as pool,
-    ):
-        recorder = _Recorder(
-            plan=plan,
-            folder=folder,
-            pool=pool,
-            observer=observer,
-            allow_environment_change=allow_environment_change,
         )
-        try:
-            for task in plan.tasks:
-                datasets.append(recorder.record(task, (selections or {}).get(task.task)))
-        except _Stopped:
-            return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
+        with pool as running:
+            recorder = _Recorder(
+                plan=plan,
+                folder=folder,
+                pool=running,
+                observer=observer,
+                allow_environment_change=allow_environment_change,
+            )
+            try:
+                for task in plan.tasks:
+                    datasets.append(recorder.record(task, (selections or {}).get(task.task)))
+            except _Stopped:
+                return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
     return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=False)
 
 

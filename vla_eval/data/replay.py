@@ -18,7 +18,6 @@ from vla_eval.config.decoding import decode
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.episode_check import STATE_TOLERANCE
-from vla_eval.data.job_list import JobList
 from vla_eval.data.manifest import (
     RECORDING_FILE,
     DatasetFacts,
@@ -32,11 +31,14 @@ from vla_eval.errors import DatasetError, RecipeError, RecordingError
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.job_list import JobList
+from vla_eval.workers.jobs import Answered
+from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.pool import Answered, WorkerPool
-from vla_eval.workers.start import available_cores, simulator_modules
+from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.replay_worker"
 MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver")
@@ -133,6 +135,7 @@ def replay(
     episodes: Sequence[int] | None = None,
     pixels: bool = False,
     workers: int | Literal["auto"] = "auto",
+    backend: Backend = LOCAL,
 ) -> ReplayReport | None:
     """Replay episodes of a dataset; the report of a whole dataset is written into it.
 
@@ -144,6 +147,7 @@ def replay(
             the whole unless it has found a mismatch.
         pixels: compare images, too.
         workers: processes.
+        backend: where they run.
 
     Returns:
         The report; None if the observer asked to stop.
@@ -157,18 +161,17 @@ def replay(
     same_machine = all(facts.environment.get(name) == environment.get(name) for name in MACHINE_FACTS)
     jobs = _jobs(dataset, facts, _chosen(manifest, episodes, dataset), pixels, same_machine)
     observer.on_phase(facts.task, "replaying", n_done=0, n_total=len(jobs))
-    size = max(1, min(len(jobs), available_cores() if workers == "auto" else workers))
+    size = max(1, min(len(jobs), backend.n_cores if workers == "auto" else workers))
     replayed: list[EpisodeReplayed] = []
-    pool = WorkerPool[ReplayJob, EpisodeReplayed]
-    preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
-    with pool(
+    pool: Pool[ReplayJob, EpisodeReplayed] = backend.pool(
         replay_main,
         answers=(EpisodeReplayed,),
         size=size,
         timeouts=TimeoutConfig(),
         logs=logs,
-        preload=preload,
-    ) as running:
+        preload=(WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ())),
+    )
+    with pool as running:
         for event in running.run(JobList(jobs)):
             if isinstance(event, Answered):
                 done = _episode_of(event)

@@ -6,7 +6,7 @@ means, the same call resumes where it stopped.
 """
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -14,6 +14,7 @@ from typing import Protocol
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
 from vla_eval.errors import TooManyErrorsError
+from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.phases import phases, with_servers
 from vla_eval.evaluation.plan import (
@@ -31,13 +32,17 @@ from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder
 from vla_eval.viz.capture import EpisodeCapture
+from vla_eval.workers.backend import Backend, Pool
+from vla_eval.workers.jobs import Answered
+from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.pool import Answered, WorkerMain, WorkerPool
-from vla_eval.workers.start import available_cores, simulator_modules
+from vla_eval.workers.process import WorkerMain
+from vla_eval.workers.start import simulator_modules
 
 RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
 WORKER_MODULE = "vla_eval.evaluation.worker"
+EpisodePool = Pool[EpisodeBatch, Finished]
 
 
 class EvaluationObserver(Protocol):
@@ -98,6 +103,7 @@ def evaluate(
     command: str = "",
     allow_environment_change: bool = False,
     observer: EvaluationObserver | None = None,
+    backend: Backend = LOCAL,
 ) -> EvaluationSummary:
     """Run all episodes of a configuration that have no result yet.
 
@@ -107,11 +113,13 @@ def evaluate(
         command: what the user typed, for the record.
         allow_environment_change: continue although package versions or the machine have changed.
         observer: gets the progress.
+        backend: where the workers run.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
+    config = with_inference(config, backend)
     observer, path = observer or _Silence(), out or default_run_folder(config)
     plan = make_plan(config)
     with RunFolder.open(
@@ -123,10 +131,10 @@ def evaluate(
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)
         n_open = queue.n_episodes
-        n_workers = worker_count(config, plan, n_jobs=queue.n_batches)
+        n_workers = worker_count(config, plan, n_jobs=queue.n_batches, backend=backend)
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
         bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
-        was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished)
+        was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished, backend)
     return EvaluationSummary(
         out=path,
         n_episodes=len(plan.jobs),
@@ -136,11 +144,11 @@ def evaluate(
     )
 
 
-def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int) -> int:
+def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int, backend: Backend = LOCAL) -> int:
     """Return how many workers to start."""
     if config.workers != "auto":
         return max(1, min(config.workers, n_jobs))
-    n_cores = available_cores()
+    n_cores = backend.n_cores
     return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
 
 
@@ -169,42 +177,47 @@ def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
     return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
 
 
-def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
+def _run_phases(
+    plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey], backend: Backend
+) -> bool:
     """Run the episodes that have no result; return whether the observer stopped it."""
     logs, config = bookkeeper.path / "logs", bookkeeper.config
     logs.mkdir(exist_ok=True)
     for phase in phases(plan):
         if not JobQueue(phase.jobs, finished=finished).n_episodes:
             continue
-        with with_servers(phase, config, plan, logs=logs, stops=bookkeeper.observer.on_tick) as jobs:
+        stops = bookkeeper.observer.on_tick
+        with with_servers(phase, config, plan, backend=backend, logs=logs, stops=stops) as jobs:
             if jobs is None:
                 return True
             queue = bookkeeper.queue = JobQueue(jobs, finished=finished)
-            n_workers = worker_count(config, plan, n_jobs=queue.n_batches)
-            if _run(queue, bookkeeper, n_workers, _modules(config, plan)):
+            pool: EpisodePool = backend.pool(
+                _worker_main(bookkeeper),
+                answers=(Finished,),
+                size=worker_count(config, plan, n_jobs=queue.n_batches, backend=backend),
+                timeouts=config.timeouts,
+                logs=logs,
+                preload=_modules(config, plan),
+            )
+            if _run(queue, bookkeeper, pool):
                 return True
     return False
 
 
-def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", n_workers: int, preload: Sequence[str]) -> bool:
+def _worker_main(bookkeeper: "_Bookkeeper") -> WorkerMain:
+    """Return what workers run."""
+    config = bookkeeper.config
+    if not config.capture.is_on:
+        return worker_main
+    folder = bookkeeper.path.resolve()
+    capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
+    return functools.partial(worker_main, capture=capture)
+
+
+def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", pool: EpisodePool) -> bool:
     """Run the queue's episodes; return whether the observer stopped it."""
-    logs, config = bookkeeper.path / "logs", bookkeeper.config
-    new_pool = WorkerPool[EpisodeBatch, Finished]
-    main: WorkerMain = worker_main
-    if config.capture.is_on:
-        capture = EpisodeCapture(
-            config=config.capture, folder=bookkeeper.path.resolve(), seed_start=config.seed_start
-        )
-        main = functools.partial(worker_main, capture=capture)
-    with new_pool(
-        main,
-        answers=(Finished,),
-        size=n_workers,
-        timeouts=config.timeouts,
-        logs=logs,
-        preload=preload,
-    ) as pool:
-        for event in pool.run(queue):
+    with pool as running:
+        for event in running.run(queue):
             if isinstance(event, Answered):
                 bookkeeper.take(event)
             elif isinstance(event, DeviceFound):

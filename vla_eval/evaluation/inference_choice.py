@@ -1,19 +1,29 @@
 """Decide where policies infer: in each worker, or in servers that all workers share."""
 
+from dataclasses import replace
 from typing import Any, Literal  # Any: plain data
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.recipe import bare_policy, is_folder
-from vla_eval.serving.shared import visible_gpus
 from vla_eval.wire.addresses import named_server
-from vla_eval.workers.start import available_cores
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
 
 INFERENCE_FIELDS = ("inference", "inference_max_batch")
 
 
-def chosen_inference(config: EvalConfig) -> Literal["in_process", "shared"]:
+def with_inference(config: EvalConfig, backend: Backend) -> EvalConfig:
+    """Return the configuration with the choice that is right for a backend, if it leaves the choice.
+
+    Raises:
+        UnknownNameError, RecipeError: see `chosen_inference`.
+    """
+    return replace(config, inference=chosen_inference(config, backend))
+
+
+def chosen_inference(config: EvalConfig, backend: Backend = LOCAL) -> Literal["in_process", "shared"]:
     """Return where policies with weights infer.
 
     Left to the program, it is shared where there is a GPU, more than one worker and such a policy.
@@ -23,8 +33,8 @@ def chosen_inference(config: EvalConfig) -> Literal["in_process", "shared"]:
     """
     if config.inference != "auto":
         return config.inference
-    n_workers = available_cores() if config.workers == "auto" else config.workers
-    pays = n_workers > 1 and bool(visible_gpus()) and any(_has_weights(name) for name in config.policies)
+    n_workers = backend.n_cores if config.workers == "auto" else config.workers
+    pays = n_workers > 1 and bool(backend.n_gpus) and any(_has_weights(name) for name in config.policies)
     return "shared" if pays else "in_process"
 
 

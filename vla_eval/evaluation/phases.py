@@ -17,6 +17,7 @@ from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.serving.host import HostOptions
 from vla_eval.serving.shared import KEY_VARIABLE, SharedServers
+from vla_eval.workers.backend import Backend
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,7 @@ def with_servers(
     config: EvalConfig,
     plan: Plan,
     *,
+    backend: Backend,
     logs: Path,
     stops: Callable[[], bool],
 ) -> Iterator[Sequence[EpisodeJob] | None]:
@@ -58,6 +60,7 @@ def with_servers(
         phase: the episodes.
         config: what is evaluated.
         plan: what the servers' policies are called in the configuration.
+        backend: where the servers run.
         logs: folder for what the servers write.
         stops: asked while servers start; true: give up, and give None.
 
@@ -75,6 +78,7 @@ def with_servers(
         logs=logs,
         start_seconds=config.timeouts.setup_seconds,
         preload=own_modules(adapters),
+        backend=backend,
         stops=stops,
     ) as servers:
         if servers.was_stopped:

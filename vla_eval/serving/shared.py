@@ -1,11 +1,10 @@
-"""Server processes of an evaluation, on the loopback address: one per GPU, ended with their parent.
+"""Server processes of an evaluation: one per GPU of the backend, ended with their parent.
 
 Each is guarded like a worker: however the parent ends, its servers end with it.
 """
 
 import logging
 import os
-import re
 import secrets
 import time
 from collections.abc import Callable, Sequence
@@ -18,20 +17,18 @@ from typing import Self
 from vla_eval.errors import VlaEvalError
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.serving.server import ServerOptions, run_server
-from vla_eval.storage.provenance import nvidia_driver_version
 from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.workers.backend import Backend, Service
 from vla_eval.workers.framing import BrokenMessageError, send_message
 from vla_eval.workers.inside import SharedStage, detach
+from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import Failed, as_exception, describe_error
-from vla_eval.workers.process import CLOSE_SECONDS, WorkerProcess
-from vla_eval.workers.start import worker_context
+from vla_eval.workers.process import CLOSE_SECONDS
+from vla_eval.workers.start import VISIBLE_GPUS
 
 KEY_VARIABLE = "MIKASA_VLA_SHARED_KEY"
 """Environment variable with the key of an evaluation's servers, for its workers."""
-VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
-LOOPBACK = "127.0.0.1"
 POLL_SECONDS = 0.05
-_GPU_DEVICE = re.compile(r"nvidia\d+")
 
 logger = logging.getLogger(__name__)
 
@@ -42,10 +39,11 @@ class SharedServerError(VlaEvalError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServeJob:
-    """What a server process is given: policy, key, and the GPU that it may use."""
+    """What a server process is given: policy, key, address to bind, and the GPU that it may use."""
 
     host: HostOptions
     api_key: str
+    address: str
     gpu: str | None
 
 
@@ -57,17 +55,6 @@ class ServerReady:
     metadata: ServerMetadata
 
 
-def visible_gpus() -> tuple[str, ...]:
-    """Return the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` names them; no torch is needed."""
-    if nvidia_driver_version() is None:
-        return ()
-    named = os.environ.get(VISIBLE_GPUS)
-    if named is not None:
-        return tuple(name.strip() for name in named.split(",") if name.strip() not in ("", "-1"))
-    n_devices = sum(_GPU_DEVICE.fullmatch(name) is not None for name in os.listdir("/dev"))
-    return tuple(str(index) for index in range(n_devices))
-
-
 class SharedServers:
     """The servers of one policy; a context manager that leaves none behind.
 
@@ -76,6 +63,7 @@ class SharedServers:
         logs: folder for what the servers write.
         start_seconds: how long a server may take until clients can connect.
         preload: modules that servers need and that take long to import.
+        backend: where they run.
         stops: asked while the servers start; true: give up.
     """
 
@@ -86,22 +74,21 @@ class SharedServers:
         logs: Path,
         start_seconds: float,
         preload: Sequence[str] = (),
+        backend: Backend = LOCAL,
         stops: Callable[[], bool] = lambda: False,
     ) -> None:
         self._options, self._start_seconds, self._stops = options, start_seconds, stops
         self._key = secrets.token_urlsafe(32)
-        context = worker_context(preload=preload)
-        self._gpus: tuple[str | None, ...] = visible_gpus() or (None,)
-        self._processes = [
-            WorkerProcess(serve_main, context, index=index, log=logs / f"server-{index}.log")
-            for index in range(len(self._gpus))
-        ]
+        self._services = backend.services(serve_main, logs=logs, preload=preload)
         self._ready: list[ServerReady] = []
 
     @property
     def urls(self) -> str:
         """The addresses, with commas."""
-        return ",".join(f"ws://{LOOPBACK}:{ready.port}" for ready in self._ready)
+        return ",".join(
+            f"ws://{service.address}:{ready.port}"
+            for service, ready in zip(self._services, self._ready, strict=True)
+        )
 
     @property
     def metadata(self) -> ServerMetadata:
@@ -111,7 +98,7 @@ class SharedServers:
     @property
     def was_stopped(self) -> bool:
         """Whether it was given up before all servers were ready."""
-        return len(self._ready) < len(self._processes)
+        return len(self._ready) < len(self._services)
 
     def __enter__(self) -> Self:
         """Start all servers and wait for them; workers that start now know the key.
@@ -121,10 +108,12 @@ class SharedServers:
         """
         os.environ[KEY_VARIABLE] = self._key
         try:
-            for process, gpu in zip(self._processes, self._gpus, strict=True):
-                process.give(ServeJob(host=self._options, api_key=self._key, gpu=gpu))
-            for process in self._processes:
-                ready = self._wait_for(process)
+            for service in self._services:
+                service.give(
+                    ServeJob(host=self._options, api_key=self._key, address=service.address, gpu=service.gpu)
+                )
+            for service in self._services:
+                ready = self._wait_for(service)
                 if ready is None:
                     break
                 self._ready.append(ready)
@@ -138,47 +127,47 @@ class SharedServers:
     ) -> None:
         """End all servers: gently after success, at once after an exception."""
         if kind is None:
-            for process in self._processes:
-                process.ask_to_close()
+            for service in self._services:
+                service.ask_to_close()
             deadline = time.monotonic() + CLOSE_SECONDS
-            for process in self._processes:
-                process.wait(max(0.0, deadline - time.monotonic()))
+            for service in self._services:
+                service.wait(max(0.0, deadline - time.monotonic()))
         self._end()
 
     def _end(self) -> None:
         os.environ.pop(KEY_VARIABLE, None)
-        for process in self._processes:
-            process.ask_to_end()
-        for process in self._processes:
-            process.end()
+        for service in self._services:
+            service.ask_to_end()
+        for service in self._services:
+            service.end()
 
-    def _wait_for(self, process: WorkerProcess) -> ServerReady | None:
+    def _wait_for(self, service: Service) -> ServerReady | None:
         """Return what a server says when it is ready; None if the caller stops."""
         deadline = time.monotonic() + self._start_seconds
         while not self._stops():
             try:
-                messages = process.read()
+                messages = service.read()
             except (EOFError, OSError, BrokenMessageError) as exc:
-                raise self._not_started(process, f"ended ({exc!r})") from exc
+                raise self._not_started(service, f"ended ({exc!r})") from exc
             for message in messages:
                 if isinstance(message, ServerReady):
                     return message
                 if isinstance(message, Failed):
                     raise as_exception(message.error)
-            if process.start_error is not None:
-                raise self._not_started(process, f"could not be started: {process.start_error!r}")
+            if service.start_error is not None:
+                raise self._not_started(service, f"could not be started: {service.start_error!r}")
             if time.monotonic() > deadline:
                 raise self._not_started(
-                    process,
+                    service,
                     f"was not ready after {self._start_seconds:g} s (timeouts.setup_seconds)",
                 )
             time.sleep(POLL_SECONDS)
         return None
 
-    def _not_started(self, process: WorkerProcess, what: str) -> SharedServerError:
+    def _not_started(self, service: Service, what: str) -> SharedServerError:
         return SharedServerError(
-            f"the server of policy '{self._options.policy}' {what}. Its output is in {process.log}. To infer "
-            f"in the workers instead: --set inference=in_process\n{process.tail() or ''}"
+            f"the server of policy '{self._options.policy}' {what}. Its output is in {service.log}. To infer "
+            f"in the workers instead: --set inference=in_process\n{service.tail() or ''}"
         )
 
 
@@ -193,7 +182,7 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
         hosted = host_policy(job.host)
         run_server(
             hosted,
-            ServerOptions(host=LOOPBACK, port=0, api_key=job.api_key),
+            ServerOptions(host=job.address, port=0, api_key=job.api_key),
             ready=lambda port: send_message(connection, ServerReady(port=port, metadata=hosted.metadata)),
             ends=lambda: _wait_for_parent(connection),
         )

@@ -12,51 +12,24 @@ inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording_
 
 import signal
 import time
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self, cast
+from typing import Self, cast
 
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.core import Stage
 from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
+from vla_eval.workers.jobs import Answered, Event, Job, JobSource
 from vla_eval.workers.messages import DeviceFound, Failed
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
 from vla_eval.workers.start import end_server, server_is_stopped, worker_context
 
-__all__ = ["Answered", "Job", "JobSource", "WorkerMain", "WorkerPool"]
-
 TICK_SECONDS = 0.2
 DUMP_SECONDS = 0.5  # for a stuck worker to write its stack
-
-
-class Job(Protocol):
-    """What a worker can be given to do; it is sent to it by pickle."""
-
-    @property
-    def setup_key(self) -> Hashable:
-        """Jobs with the same one need the same preparation, which a process keeps; others get their own."""
-
-
-class JobSource[J: Job](Protocol):
-    """A source of jobs; `JobQueue` is one."""
-
-    def has_next(self) -> bool:
-        """Whether a job can be handed out now."""
-
-    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
-        """Return the next job for a worker that has loaded `loaded`, while others have `taken`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answered[J: Job, A]:
-    """The result of one job."""
-
-    job: J
-    answer: A | Failed
 
 
 @dataclass(slots=True, kw_only=True)
@@ -78,6 +51,7 @@ class WorkerPool[J: Job, A]:
         timeouts: how long a worker may be busy with one thing.
         logs: folder for what the workers write to standard output and error.
         preload: modules that the workers need and that take long to import; see `worker_context`.
+        first_index: what logs and messages call the first worker.
     """
 
     def __init__(
@@ -89,6 +63,7 @@ class WorkerPool[J: Job, A]:
         timeouts: TimeoutConfig,
         logs: Path,
         preload: Sequence[str] = (),
+        first_index: int = 0,
     ) -> None:
         """Start nothing yet: processes start when there is work for them."""
         self._main = main
@@ -101,6 +76,7 @@ class WorkerPool[J: Job, A]:
             "inference": timeouts.inference_seconds,
         }
         self._logs = logs
+        self._first_index = first_index
         self._context = worker_context(preload=preload)
         self._workers: dict[int, _Worker[J]] = {}
 
@@ -123,7 +99,7 @@ class WorkerPool[J: Job, A]:
             worker.process.end()
         self._workers.clear()
 
-    def run(self, queue: JobSource[J]) -> Iterator[Answered[J, A] | DeviceFound | None]:
+    def run(self, queue: JobSource[J]) -> Iterator[Event[J, A]]:
         """Run all jobs of the queue; yields answers as they come, and None on every tick."""
         while True:
             self._hand_out(queue)
@@ -150,8 +126,8 @@ class WorkerPool[J: Job, A]:
                 process = WorkerProcess(
                     self._main,
                     self._context,
-                    index=index,
-                    log=self._logs / f"worker-{index}.log",
+                    index=self._first_index + index,
+                    log=self._logs / f"worker-{self._first_index + index}.log",
                     predecessor=worker.process if worker else None,
                 )
                 worker = self._workers[index] = _Worker(process=process, loaded=job.setup_key, job=None)

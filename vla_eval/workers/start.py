@@ -8,6 +8,7 @@ worker starts from nothing: a CUDA context does not survive a fork, and an impor
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,6 +23,9 @@ from vla_eval.workers.guard import fork_guarded
 from vla_eval.workers.server import IMPORTS_VARIABLE
 
 SERVER_MODULE = "vla_eval.workers.server"
+
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
+_GPU_DEVICE = re.compile(r"nvidia\d+")
 
 # One thread per worker: several workers share the cores. A server has one, too: the sums of a pass of several
 # rows depend on the number of threads.
@@ -129,3 +133,14 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
 def available_cores() -> int:
     """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """Return the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` names them; no torch is needed."""
+    if nvidia_driver_version() is None:
+        return ()
+    named = os.environ.get(VISIBLE_GPUS)
+    if named is not None:
+        return tuple(name.strip() for name in named.split(",") if name.strip() not in ("", "-1"))
+    n_devices = sum(_GPU_DEVICE.fullmatch(name) is not None for name in os.listdir("/dev"))
+    return tuple(str(index) for index in range(n_devices))

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Collection, Hashable, Iterable
 
-from vla_eval.workers.pool import Job
+from vla_eval.workers.jobs import Job
 
 
 class JobList[J: Job]:

@@ -1,11 +1,11 @@
-"""Which GPUs an evaluation's servers may use."""
+"""Which GPUs this process may use."""
 
 import os
 
 import pytest
 
-from vla_eval.serving import shared
-from vla_eval.serving.shared import VISIBLE_GPUS, visible_gpus
+from vla_eval.workers import start
+from vla_eval.workers.start import VISIBLE_GPUS, visible_gpus
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from vla_eval.serving.shared import VISIBLE_GPUS, visible_gpus
 def test_gpus_are_those_that_the_process_may_use(
     monkeypatch: pytest.MonkeyPatch, visible: str | None, expected: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(shared, "nvidia_driver_version", lambda: "570.1")
+    monkeypatch.setattr(start, "nvidia_driver_version", lambda: "570.1")
     monkeypatch.setattr(os, "listdir", lambda _: ["null", "nvidia0", "nvidia1", "nvidiactl", "nvidia-uvm"])
     monkeypatch.delenv(VISIBLE_GPUS, raising=False)
     if visible is not None:
@@ -30,6 +30,6 @@ def test_gpus_are_those_that_the_process_may_use(
 
 
 def test_without_a_driver_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "nvidia_driver_version", lambda: None)
+    monkeypatch.setattr(start, "nvidia_driver_version", lambda: None)
     monkeypatch.setenv(VISIBLE_GPUS, "0")
     assert visible_gpus() == ()

@@ -1,0 +1,120 @@
+"""Where jobs run: what the process pool of this machine and a cluster have in common.
+
+Evaluations, audits, probes, recordings and replays take a `Backend` and do not know which. Whoever plans
+the jobs is the only one that writes results.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.workers.jobs import Event, Job, JobSource
+from vla_eval.workers.process import WorkerMain
+
+
+class Pool[J: Job, A](Protocol):
+    """Workers that answer jobs; a context manager that leaves none behind."""
+
+    def __enter__(self) -> Self:
+        """Start nothing yet: workers start when there is work for them."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """End all workers: gently after success, at once after an exception."""
+
+    def run(self, queue: JobSource[J]) -> Iterator[Event[J, A]]:
+        """Run all jobs of the queue; yields answers as they come, and None on every tick.
+
+        Every job gets an answer, whatever a worker does.
+        """
+
+
+class Service(Protocol):
+    """A process that is given one job and runs until it is ended: a policy server.
+
+    Attributes:
+        address: IP address that the other workers reach it at.
+        gpu: which GPU it is to take, as `CUDA_VISIBLE_DEVICES` names it; None: what it sees.
+        log: where its standard output and error go, for messages.
+        start_error: why it could not be started or handed its job.
+    """
+
+    address: str
+    gpu: str | None
+    log: Path
+    start_error: BaseException | None
+
+    def give(self, job: object) -> None:
+        """Start it with its job; returns at once."""
+
+    def read(self) -> list[object]:
+        """Return the messages that have come since the last call.
+
+        Raises:
+            EOFError: it has ended, and all that it sent has been returned.
+            OSError: the connection is broken.
+            BrokenMessageError: what has come is no message.
+        """
+
+    def has_ended(self) -> bool:
+        """Whether it is there no longer."""
+
+    def wait(self, seconds: float) -> int | None:
+        """Wait for its end; return its exit code if there is one."""
+
+    def ask_to_close(self) -> None:
+        """Have it end by itself."""
+
+    def ask_to_end(self) -> None:
+        """Have it killed with whatever it has started."""
+
+    def end(self) -> None:
+        """Kill it and whatever it has started, and wait until that is done."""
+
+    def tail(self) -> str | None:
+        """Return the end of what it has written."""
+
+
+class Backend(Protocol):
+    """The processor cores and GPUs that there are, and how to use them."""
+
+    @property
+    def n_cores(self) -> int:
+        """How many workers can run at the same time."""
+
+    @property
+    def n_gpus(self) -> int:
+        """How many GPUs there are."""
+
+    def pool[J: Job, A](
+        self,
+        main: WorkerMain,
+        *,
+        answers: tuple[type, ...],
+        size: int,
+        timeouts: TimeoutConfig,
+        logs: Path,
+        preload: Sequence[str] = (),
+    ) -> Pool[J, A]:
+        """Return workers.
+
+        Args:
+            main: what a worker process runs: it answers each job `J` by an `A` or a `Failed`.
+            answers: the classes of `A`; anything else that a worker sends is an error.
+            size: how many workers at most.
+            timeouts: how long a worker may be busy with one thing.
+            logs: folder for what workers of this machine write to standard output and error.
+            preload: modules that the workers need and that take long to import.
+        """
+
+    def services(self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()) -> Sequence[Service]:
+        """Return services that are not started yet: one per GPU; one, where there is no GPU.
+
+        Args:
+            main: what each runs.
+            logs: folder for what those of this machine write.
+            preload: modules that they need and that take long to import.
+        """

@@ -1,0 +1,37 @@
+"""Jobs, where they come from and what comes of them. Knows neither processes nor machines."""
+
+from collections.abc import Collection, Hashable
+from dataclasses import dataclass
+from typing import Protocol
+
+from vla_eval.workers.messages import DeviceFound, Failed
+
+
+class Job(Protocol):
+    """What a worker can be given to do; it is sent to it by pickle."""
+
+    @property
+    def setup_key(self) -> Hashable:
+        """Jobs with the same one need the same preparation, which a process keeps; others get their own."""
+
+
+class JobSource[J: Job](Protocol):
+    """A source of jobs; `JobQueue` is one."""
+
+    def has_next(self) -> bool:
+        """Whether a job can be handed out now."""
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
+        """Return the next job for a worker that has loaded `loaded`, while others have `taken`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered[J: Job, A]:
+    """The result of one job."""
+
+    job: J
+    answer: A | Failed
+
+
+type Event[J: Job, A] = Answered[J, A] | DeviceFound | None
+"""What a pool yields: an answer, a device, or None on every tick."""

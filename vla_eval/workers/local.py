@@ -1,0 +1,68 @@
+"""The backend of one machine: a pool of processes, and services on the loopback address."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.workers.jobs import Job
+from vla_eval.workers.pool import WorkerPool
+from vla_eval.workers.process import WorkerMain, WorkerProcess
+from vla_eval.workers.start import available_cores, visible_gpus, worker_context
+
+LOOPBACK = "127.0.0.1"
+
+
+class LocalService(WorkerProcess):
+    """A service on this machine; see `Service`."""
+
+    address = LOOPBACK
+    gpu: str | None = None
+
+    def has_ended(self) -> bool:
+        """Whether the process is there no longer."""
+        return self.wait(0.0) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class LocalBackend:
+    """This machine; see `Backend`."""
+
+    @property
+    def n_cores(self) -> int:
+        """How many cores this process may use."""
+        return available_cores()
+
+    @property
+    def n_gpus(self) -> int:
+        """How many GPUs this process may use."""
+        return len(visible_gpus())
+
+    def pool[J: Job, A](
+        self,
+        main: WorkerMain,
+        *,
+        answers: tuple[type, ...],
+        size: int,
+        timeouts: TimeoutConfig,
+        logs: Path,
+        preload: Sequence[str] = (),
+    ) -> WorkerPool[J, A]:
+        """Return worker processes."""
+        return WorkerPool(main, answers=answers, size=size, timeouts=timeouts, logs=logs, preload=preload)
+
+    def services(
+        self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()
+    ) -> tuple[LocalService, ...]:
+        """Return one process per GPU, or one."""
+        context = worker_context(preload=preload)
+        gpus: tuple[str | None, ...] = visible_gpus() or (None,)
+        services = []
+        for index, gpu in enumerate(gpus):
+            service = LocalService(main, context, index=index, log=logs / f"server-{index}.log")
+            service.gpu = gpu
+            services.append(service)
+        return tuple(services)
+
+
+LOCAL = LocalBackend()
