@@ -133,9 +133,11 @@ class Bench:
         (folder / "pair_policy.py").write_text(PAIR_MODULE)
         self.write_policy()
 
-    def write_policy(self, adapter: str = "night_policy:make", **args: Any) -> None:
+    def write_policy(self, adapter: str = "night_policy:make", *, name: str = "night", **args: Any) -> Path:
         recipe = {"version": 1, "description": "d", "adapter": adapter, "args": args}
-        (self.folder / "night.yaml").write_text(json.dumps(recipe))  # JSON is YAML
+        path = self.folder / f"{name}.yaml"
+        path.write_text(json.dumps(recipe))  # JSON is YAML
+        return path
 
     def mend(self) -> None:
         (self.folder / "mended").touch()

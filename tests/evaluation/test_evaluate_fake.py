@@ -171,6 +171,38 @@ class TestResume:
         assert first.name.startswith("test-")
 
 
+# ------------------------------------------------------------------------------------------ run seeds
+
+
+class TestRunSeeds:
+    def test_each_of_several_checkpoints_is_one_run_of_the_same_policy(self, bench: Bench) -> None:
+        first = bench.write_policy(name="a", faults={"2": "raise"})
+        second = bench.write_policy(name="b", faults={"3": "raise"})
+
+        summary = bench.run("out", policies=["random", f"mine={first},{second}"], episodes=4, workers=2)
+
+        stored = read_run(bench.folder / "out")
+        assert (summary.n_episodes, summary.n_errors) == (4 + 2 * 4, 2)
+        assert {(r.policy, r.run, r.seed) for r in stored.records if r.outcome == "error"} == {
+            ("mine", 0, 2),
+            ("mine", 1, 3),
+        }
+        assert {"policies/mine/run-0", "policies/mine/run-1"} < set(stored.description.recipes)
+
+    def test_a_checkpoint_more_is_a_run_more_of_the_same_folder(self, bench: Bench) -> None:
+        paths = [str(bench.write_policy(name=name, pause=i / 1e6)) for i, name in enumerate("abc")]
+        bench.run("grown", policies=[f"mine={','.join(paths[:2])}"], episodes=2)
+        begun = (bench.folder / "grown/episodes.jsonl").read_bytes()
+
+        bench.run("grown", policies=[f"mine={','.join(paths)}"], episodes=2)
+        bench.run("at once", policies=[f"mine={','.join(paths)}"], episodes=2)
+
+        assert bench.lines("grown") == bench.lines("at once")
+        assert (bench.folder / "grown/episodes.jsonl").read_bytes().startswith(begun)
+        with pytest.raises(RunChangedError, match=r"config\.policies"):
+            bench.run("grown", policies=[f"mine={','.join(reversed(paths))}"], episodes=2)
+
+
 # ------------------------------------------------------------------------------------------ command line
 
 

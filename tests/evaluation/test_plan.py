@@ -1,5 +1,6 @@
 """What an evaluation will run, in which order, and what two runs are compared by."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -91,7 +92,59 @@ class TestPlan:
         assert decode(EvalConfig, to_data(original), where="x") == original
 
 
+class TestRunSeeds:
+    def test_checkpoints_of_different_kinds_are_not_runs_of_one_policy(self) -> None:
+        with pytest.raises(RecipeError, match="found adapter random in random and hold in hold"):
+            make_plan(config(policies=["mine=random,hold"]))
+
+    def test_a_checkpoint_named_twice_would_count_as_two_trainings(self) -> None:
+        with pytest.raises(RecipeError, match="are the same checkpoint"):
+            make_plan(config(policies=["mine=random,random"]))
+
+    def test_a_policy_server_is_no_run_seed(self) -> None:
+        with pytest.raises(RecipeError, match=r"found ws://127\.0\.0\.1:1"):
+            make_plan(config(policies=["mine=random,ws://127.0.0.1:1"]))
+
+    def test_other_policies_have_as_many_runs_or_one(self, tmp_path: Path) -> None:
+        policies = ["hold", f"mine=random,{random_again(tmp_path)}"]
+
+        counts = [
+            Counter(
+                (job.key.policy, job.key.run) for job in make_plan(config(policies=policies, **more)).jobs
+            )
+            for more in ({"runs": 1, "episodes": 5}, {"runs": 2, "episodes": 5})
+        ]
+
+        mine = {("mine", 0): 5, ("mine", 1): 5}
+        assert counts == [{("hold", 0): 5} | mine, {("hold", 0): 5, ("hold", 1): 5} | mine]
+        with pytest.raises(RecipeError, match="runs: 3, but policy 'mine' has 2 checkpoints"):
+            make_plan(config(policies=policies, runs=3))
+
+    def test_a_name_for_one_checkpoint_is_its_name_in_records(self) -> None:
+        (job,) = make_plan(config(policies=["mine=random"], episodes=1)).jobs
+        assert (job.key.policy, job.key.run, job.group.adapter) == ("mine", 0, "random")
+
+
+def random_again(folder: Path) -> Path:
+    """Write a recipe that is `random` under another name."""
+    path = folder / "again.yaml"
+    path.write_text("version: 1\ndescription: d\nadapter: random\n")
+    return path
+
+
 class TestQueue:
+    def test_the_first_episode_of_each_checkpoint_comes_first(self, tmp_path: Path) -> None:
+        policy = f"mine=random,{random_again(tmp_path)}"
+        queue = JobQueue(make_plan(config(policies=[policy], episodes=2)).jobs, finished=())
+
+        order = []
+        loaded = None
+        while batch := queue.take(loaded):
+            loaded = batch.setup_key
+            order += [(job.key.run, job.key.seed) for job in batch.jobs]
+
+        assert order == [(0, 1), (1, 1), (1, 2), (0, 2)]
+
     def test_the_first_episode_of_each_group_comes_first(self) -> None:
         plan = make_plan(config(policies=["random", "hold"], episodes=3))
         queue = JobQueue(plan.jobs, finished=())
@@ -99,7 +152,7 @@ class TestQueue:
         order = []
         loaded = None
         while batch := queue.take(loaded):
-            loaded = batch.group.key
+            loaded = batch.setup_key
             order += [(job.key.policy, job.key.seed) for job in batch.jobs]
 
         assert order == [("random", 1), ("hold", 1), ("hold", 2), ("hold", 3), ("random", 2), ("random", 3)]
@@ -109,7 +162,7 @@ class TestQueue:
         first, _, _, other, *_ = plan.jobs
         queue = JobQueue(plan.jobs, finished={first.key, other.key})
 
-        batch = queue.take(None, taken={first.group.key})
+        batch = queue.take(None, taken={first.group.setup_key})
 
         assert batch is not None
         assert batch.group.key == other.group.key

@@ -1,5 +1,6 @@
 """The success table: what is put together, what is counted, what is left undefined."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,46 @@ def test_means_are_over_the_episodes_that_they_speak_of() -> None:
     assert row.inferences_per_episode == 6
     assert row.success_at_end == pytest.approx(1 / 3)
     assert row.first_choice_success == pytest.approx(1 / 3)
+
+
+def of_checkpoints(run: StoredRun, **digests: str) -> StoredRun:
+    recipes = {f"checkpoints/p/run-{name.removeprefix('run_')}": digest for name, digest in digests.items()}
+    return replace(run, description=replace(run.description, recipes=recipes))
+
+
+def test_the_runs_of_a_row_are_rows_of_the_wide_table_and_none_of_the_other() -> None:
+    # Run means 1 and 1/2.
+    records = [*episodes("p", "++++"), *episodes("p", "+-+-", run=1), *episodes("random", "----")]
+    table = build_table([stored(records)])
+
+    assert [(row.policy, row.success_once) for row in table.rows] == [("p", 0.75), ("random", 0.0)]
+    assert [(row.run, row.n_episodes, row.success_once) for row in table.run_rows] == [(0, 4, 1), (1, 4, 0.5)]
+    assert all(row.paired_difference is None for row in table.run_rows)
+    first_column = [
+        line.split("|")[2].strip()
+        for line in render(table, "markdown", wide=True).splitlines()
+        if line.startswith("|")
+    ]
+    assert first_column[2:] == ["p", "p, run 0", "p, run 1", "random"]
+    assert "run 0" not in render(table, "markdown")
+    assert [row["run"] for row in json.loads(render(table, "json"))["run_rows"]] == [0, 1]
+
+
+def test_a_baseline_of_fewer_runs_is_compared_over_those_it_has_and_that_is_noted() -> None:
+    records = [*episodes("p", "++++"), *episodes("p", "+-+-", run=1), *episodes("cue_blind", "----")]
+    table = build_table([stored(records)])
+    assert only_row(table, "p").n_pairs == 4
+    assert has_note(table, "vs cue_blind", "p on RememberColor3-v0 K=1 (1 of 2 runs)", "--runs")
+
+
+def test_a_folder_with_a_further_checkpoint_repeats_none_of_the_earlier_ones() -> None:
+    one = of_checkpoints(stored(episodes("p", "++--")), run_0="aa")
+    records = [*episodes("p", "++--"), *episodes("p", "+++-", run=1)]
+    both = of_checkpoints(stored(records, path="runs/b"), run_0="aa", run_1="bb")
+
+    row = only_row(build_table([one, both]), "p")
+
+    assert (row.n_runs, row.n_episodes) == (2, 8)
 
 
 def test_success_at_end_is_undefined_where_episodes_stop_at_success() -> None:

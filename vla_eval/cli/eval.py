@@ -60,7 +60,8 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         **many,
         dest="policies",
         metavar="P",
-        help="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server",
+        help="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server; "
+        "NAME=DIR,DIR,DIR: one row whose runs are these checkpoints",
     )
     parser.add_argument(
         "--n-action-steps",

@@ -19,7 +19,7 @@ PRESETS = ("paper",)
 def add_table_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the table is printed."""
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
-    parser.add_argument("--wide", action="store_true", help="every column, however wide the table becomes")
+    parser.add_argument("--wide", action="store_true", help="every column, and a row per run")
     parser.add_argument(
         "--preset",
         choices=PRESETS,

@@ -19,8 +19,8 @@ from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.phases import phases, with_servers
 from vla_eval.evaluation.plan import (
     EpisodeJob,
-    GroupKey,
     Plan,
+    SetupKey,
     fingerprint,
     make_plan,
     results_config,
@@ -239,21 +239,21 @@ class _Bookkeeper:
     n_results: int = 0
     n_errors: int = 0
     n_consecutive_errors: int = 0
-    proven: set[GroupKey] = field(default_factory=set)  # groups with an episode that ran to its end
+    proven: set[SetupKey] = field(default_factory=set)  # groups with an episode that ran to its end
 
     def take(self, answered: Answered[EpisodeBatch, Finished]) -> None:
         """Store the results, or the error in their place."""
         batch, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
             # A group that has worked before is no mistake of the user: a GPU was lost, for example.
-            if answer.refused and batch.group.key not in self.proven:
+            if answer.refused and batch.setup_key not in self.proven:
                 raise as_exception(answer.error)
             if len(batch.jobs) > 1:
                 self.queue.put_back_alone(batch)
             else:
                 self._take_error(batch.jobs[0], answer.error)
             return
-        self.proven.add(batch.group.key)
+        self.proven.add(batch.setup_key)
         self.n_consecutive_errors = 0
         for record, timing in zip(answer.records, answer.timings, strict=True):
             self.folder.append(record, timing)

@@ -7,6 +7,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.recipe import bare_policy, is_folder
+from vla_eval.storage.planned import named_checkpoints
 from vla_eval.wire.addresses import named_server
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
@@ -51,6 +52,9 @@ def inference_fields(config: EvalConfig) -> dict[str, Any]:
 
 
 def _has_weights(name: str) -> bool:
+    named = named_checkpoints(name)
+    if named is not None:
+        return any(_has_weights(one) for one in named.checkpoints)
     if named_server(name) is not None:
         return False
     return is_folder(name) or has_weights(load_recipe("policies", bare_policy(name), PolicyRecipe).value)

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass
 
-from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, GroupKey
+from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, SetupKey
 from vla_eval.records import EpisodeKey
 
 
@@ -20,9 +20,9 @@ class EpisodeBatch:
         return self.jobs[0].group
 
     @property
-    def setup_key(self) -> GroupKey:
+    def setup_key(self) -> SetupKey:
         """Batches with the same one can be run with the same environment and policy."""
-        return self.group.key
+        return self.group.setup_key
 
 
 class JobQueue:
@@ -36,15 +36,16 @@ class JobQueue:
 
     def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
         """Queue the jobs that are not finished."""
-        begun = {GroupKey(*key[:3]) for key in finished}
+        jobs = tuple(jobs)
+        begun = {job.group.setup_key for job in jobs if job.key in finished}
         self._heads: deque[EpisodeBatch] = deque()
-        self._rest: dict[GroupKey, deque[EpisodeBatch]] = {}
+        self._rest: dict[SetupKey, deque[EpisodeBatch]] = {}
         for batch in _batches(job for job in jobs if job.key not in finished):
-            if batch.group.key not in begun:
-                begun.add(batch.group.key)
+            if batch.setup_key not in begun:
+                begun.add(batch.setup_key)
                 self._heads.append(batch)
             else:
-                self._rest.setdefault(batch.group.key, deque()).append(batch)
+                self._rest.setdefault(batch.setup_key, deque()).append(batch)
 
     def has_next(self) -> bool:
         """Whether there is a batch that has not been handed out."""
@@ -88,7 +89,8 @@ def _batches(jobs: Iterable[EpisodeJob]) -> Iterable[EpisodeBatch]:
     """Yield the jobs in their order; a batch ends with its group, or where a slot is needed twice."""
     batch: list[EpisodeJob] = []
     for job in jobs:
-        if batch and (job.group.key != batch[0].group.key or job.slot in {other.slot for other in batch}):
+        is_other = bool(batch) and job.group.setup_key != batch[0].group.setup_key
+        if batch and (is_other or job.slot in {other.slot for other in batch}):
             yield EpisodeBatch(jobs=tuple(batch))
             batch = []
         batch.append(job)

@@ -35,11 +35,11 @@ class Phase:
 
 def phases(plan: Plan) -> Iterator[Phase]:
     """Return the parts of a run that have episodes, in order."""
-    in_workers = tuple(job for job in plan.jobs if job.group.key.policy not in plan.shared)
+    in_workers = tuple(job for job in plan.jobs if job.group.part not in plan.shared)
     if in_workers:
         yield Phase(jobs=in_workers, policy=None)
     for policy in plan.shared:
-        jobs = tuple(job for job in plan.jobs if job.group.key.policy == policy)
+        jobs = tuple(job for job in plan.jobs if job.group.part == policy)
         if jobs:
             yield Phase(jobs=jobs, policy=policy)
 

@@ -6,13 +6,13 @@ first episode. Knows nothing of processes or files of results.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 from vla_eval.bounds import MAX_EPISODES
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, content_of, digest_of
-from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.inference_choice import (
@@ -22,10 +22,11 @@ from vla_eval.evaluation.inference_choice import (
     inference_fields,
 )
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
-from vla_eval.policies.recipe import bare_policy, load_policy_recipe
+from vla_eval.policies.recipe import bare_policy
 from vla_eval.policies.registry import check_adapter
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.policies.remote.survey import survey
+from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entry
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -35,11 +36,18 @@ from vla_eval.wire.metadata import ServerMetadata
 
 
 class GroupKey(NamedTuple):
-    """The key of episodes that one environment object and one policy object can run."""
+    """The row of a table that episodes belong to."""
 
     task: str
     policy: str
     n_action_steps: int
+
+
+class SetupKey(NamedTuple):
+    """The key of episodes that one environment object and one policy object can run."""
+
+    group: GroupKey
+    checkpoint: int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +63,8 @@ class EpisodeGroup:
         instruction: the language instruction.
         n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
             policy is in it, else what its server says.
+        checkpoint: of a policy of several checkpoints, which one; it has the run of that number alone.
+        part: the policy's name in recipes and among shared policies; with several checkpoints, that of one.
     """
 
     key: GroupKey
@@ -64,6 +74,13 @@ class EpisodeGroup:
     rollout: RolloutSettings
     instruction: str
     n_rows: int = 1
+    checkpoint: int | None = None
+    part: str = ""
+
+    @property
+    def setup_key(self) -> SetupKey:
+        """Episodes with the same one can be run with the same environment and policy."""
+        return SetupKey(self.key, self.checkpoint)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,12 +114,13 @@ class Plan:
     Attributes:
         jobs: every episode, in a fixed order.
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
-            policies, and the datasets that these were trained on.
+            policies, and the datasets that these were trained on. Several checkpoints of one policy are
+            `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         servers: policy behind a socket -> what its server says of itself.
         task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
-        shared: policy whose inference is shared by all workers -> what the configuration calls it.
+        shared: `EpisodeGroup.part` whose inference all workers share -> what the configuration calls it.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
         max_workers: the most workers that `workers: auto` may start, since each loads the policies that are
             not shared; None: no limit.
@@ -133,9 +151,10 @@ def make_plan(config: EvalConfig) -> Plan:
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
-    policies = [load_policy_recipe(name) for name in config.policies]
+    policies = [load_policy_entry(text) for text in config.policies]
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
+    _check_runs(config, policies)
     prompts = load_prompts(config.prompt_set)
     servers = {
         policy.name: survey(policy.value.args, policy=policy.name)
@@ -153,15 +172,15 @@ def make_plan(config: EvalConfig) -> Plan:
             if policy.value.needs_candidates and task.candidates is None:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
-            n_rows = config.inference_max_batch if policy.name in shared else config.slots_per_worker
+            n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
             groups.extend(_groups(config, task, policy, instruction, servers.get(policy.name), n_rows=n_rows))
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
-    _refuse_too_many(config, n_groups=len(groups))
+    _refuse_too_many(config, groups)
     limits = [
         policy.value.max_workers
         for policy in policies
-        if policy.value.max_workers is not None and policy.name not in shared
+        if policy.value.max_workers is not None and policy.part(0) not in shared
     ]
     return Plan(
         jobs=tuple(
@@ -173,14 +192,15 @@ def make_plan(config: EvalConfig) -> Plan:
                 row=index % group.n_rows,
             )
             for group in groups
-            for run in range(config.runs)
+            for run in _runs(config, group)
             for index in range(config.episodes)
         ),
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization={
-            policy.name: notes
+            policy.part(index): notes
             for policy in policies
-            if (notes := normalization_notes(policy.value.adapter, policy.value.args))
+            for index, recipe in enumerate(policy.recipes)
+            if (notes := normalization_notes(recipe.value.adapter, recipe.value.args))
         },
         servers={name: server.identity() for name, server in servers.items()},
         task_versions={task.id: task.version for task in tasks},
@@ -191,24 +211,45 @@ def make_plan(config: EvalConfig) -> Plan:
     )
 
 
-def _shared(config: EvalConfig, policies: Sequence[Recipe[PolicyRecipe]]) -> dict[str, str]:
+def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
+    """Refuse a number of runs that a policy of several checkpoints does not have."""
+    for policy in policies:
+        n_checkpoints = len(policy.recipes)
+        if policy.is_by_run and config.runs not in (1, n_checkpoints):
+            raise RecipeError(
+                f"runs: {config.runs}, but policy '{policy.name}' has {n_checkpoints} checkpoints, one per "
+                f"run. Expected {n_checkpoints}, so that the other policies have as many runs, or 1."
+            )
+
+
+def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
+    return range(config.runs) if group.checkpoint is None else (group.checkpoint,)
+
+
+def _shared(config: EvalConfig, policies: Sequence[PolicyEntry]) -> dict[str, str]:
     """Return the policies whose inference is shared, see `Plan.shared`."""
     if chosen_inference(config) == "in_process":
         return {}
-    named = zip(config.policies, policies, strict=True)
-    return {policy.name: name for name, policy in named if has_weights(policy.value)}
+    return {
+        policy.part(index): text
+        for policy in policies
+        for index, text in enumerate(policy.texts)
+        if has_weights(policy.recipes[index].value)
+    }
 
 
 def _recipe_hashes(
     prompts: Recipe[PromptRecipe],
-    policies: Sequence[Recipe[PolicyRecipe]],
+    policies: Sequence[PolicyEntry],
     servers: Mapping[str, ServerMetadata],
 ) -> dict[str, str]:
     """Return the digests of all files that results depend on, see `Plan`."""
     hashes = {f"prompts/{prompts.name}": prompts.sha256}
-    hashes |= {f"policies/{policy.name}": policy.sha256 for policy in policies}
     for policy in policies:
-        hashes |= checkpoint_hashes(policy.value.adapter, policy.value.args, policy=policy.name)
+        for index, recipe in enumerate(policy.recipes):
+            part = policy.part(index)
+            hashes[f"policies/{part}"] = recipe.sha256
+            hashes |= checkpoint_hashes(recipe.value.adapter, recipe.value.args, policy=part)
     for name, server in servers.items():
         if server.weights_sha256 is not None:
             hashes[f"checkpoints/{name}"] = server.weights_sha256
@@ -244,11 +285,12 @@ def _refuse_instruction(config: EvalConfig) -> None:
         )
 
 
-def _refuse_too_many(config: EvalConfig, *, n_groups: int) -> None:
-    n_episodes = n_groups * config.runs * config.episodes
+def _refuse_too_many(config: EvalConfig, groups: Sequence[EpisodeGroup]) -> None:
+    n_episodes = sum(len(_runs(config, group)) for group in groups) * config.episodes
     if n_episodes > MAX_EPISODES:
+        n_rows = len({group.key for group in groups})
         raise RecipeError(
-            f"{config.name}: {n_groups} groups (task, policy, n_action_steps), {config.runs} runs and "
+            f"{config.name}: {n_rows} groups (task, policy, n_action_steps), {config.runs} runs and "
             f"{config.episodes} episodes make {n_episodes} episodes, expected at most {MAX_EPISODES} in one "
             f"run folder. Use fewer, or several configurations."
         )
@@ -263,20 +305,21 @@ def _refuse_doubles(kind: str, names: list[str]) -> None:
 def _groups(
     config: EvalConfig,
     task: TaskSpec,
-    policy: Recipe[PolicyRecipe],
+    policy: PolicyEntry,
     instruction: str,
     server: ServerMetadata | None,
     *,
     n_rows: int,
 ) -> Iterable[EpisodeGroup]:
-    args = policy.value.args
-    if server is not None:
-        args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
-        n_rows = server.batch_max or n_rows
-    for n_action_steps in config.n_action_steps or (policy.value.default_n_action_steps,):
+    steps = config.n_action_steps or (policy.value.default_n_action_steps,)
+    for n_action_steps, (index, recipe) in product(steps, enumerate(policy.recipes)):
+        args = recipe.value.args
+        if server is not None:
+            args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
+            n_rows = server.batch_max or n_rows
         yield EpisodeGroup(
             key=GroupKey(task.id, policy.name, n_action_steps),
-            adapter=policy.value.adapter,
+            adapter=recipe.value.adapter,
             args=args,
             env=EnvSettings(
                 task=task.id,
@@ -294,4 +337,6 @@ def _groups(
             ),
             instruction=instruction,
             n_rows=n_rows,
+            checkpoint=index if policy.is_by_run else None,
+            part=policy.part(index),
         )

@@ -20,6 +20,7 @@ from vla_eval.policies.checkpoint import (
 from vla_eval.policies.checkpoint_json import get_count, get_text
 from vla_eval.policies.config_check import MAX_ACTIONS
 from vla_eval.policies.remote.survey import moved, remote_recipe
+from vla_eval.storage.planned import named_checkpoints
 from vla_eval.wire.addresses import named_server
 
 LEROBOT_ADAPTER = "lerobot"
@@ -34,6 +35,9 @@ def policy_name(name: str) -> str:
         CheckpointError: it is a folder without a checkpoint.
         RemotePolicyError: it is an address, and there is no policy server.
     """
+    named = named_checkpoints(name)
+    if named is not None:
+        return named.name
     server = named_server(name)
     if server is not None and server.recipe is None:
         return remote_recipe(server.urls).name

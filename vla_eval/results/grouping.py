@@ -25,6 +25,7 @@ POLICY_NAMES = "policy_names"  # the policies' names in records, in the configur
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
 PROMPTS = "prompts/"  # recipes whose names have this prefix hold the instructions
 WEIGHTS = "checkpoints/"  # recipes whose names have this prefix are the weights of a policy
+OF_RUN = "run-"  # with the run's number after the policy's name: one of its several checkpoints
 DIGITS = 8
 DEFAULT = "default"
 
@@ -95,7 +96,7 @@ class Grouping:
 class _Copy(NamedTuple):
     """Episodes of one run index with the same weights: seed -> record."""
 
-    weights: frozenset[tuple[str, str]]
+    weights: frozenset[str]
     records: dict[int, EpisodeRecord]
 
 
@@ -116,7 +117,7 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
         for (key, index), records in _by_run(stored, label_of).items():
             copies = found[key][index]
             n_copies = len(copies)
-            n_new = _place(copies, _Copy(_weights(stored, key.policy), records))
+            n_new = _place(copies, _Copy(_weights(stored, key.policy, index), records))
             if n_new < len(records):
                 n_doubles[str(stored.path)] += len(records) - n_new
             if 0 < n_copies < len(copies):
@@ -140,11 +141,17 @@ def _by_run(
     return found
 
 
-def _weights(stored: StoredRun, policy: str) -> frozenset[tuple[str, str]]:
-    """Return the digests of a policy's weights; none for a policy without weights."""
+def _weights(stored: StoredRun, policy: str, index: int) -> frozenset[str]:
+    """Return the digests of a policy's weights in a run; none for a policy without weights."""
     name = f"{WEIGHTS}{policy}"
-    recipes = stored.description.recipes.items()
-    return frozenset((key, digest) for key, digest in recipes if key == name or key.startswith(f"{name}/"))
+    of_run, of_runs = f"{name}/{OF_RUN}{index}", f"{name}/{OF_RUN}"
+    return frozenset(
+        digest
+        for key, digest in stored.description.recipes.items()
+        if key in (name, of_run)
+        or key.startswith(f"{of_run}/")
+        or (key.startswith(f"{name}/") and not key.startswith(of_runs))
+    )
 
 
 def _runs(by_index: Mapping[int, Sequence[_Copy]]) -> tuple[Run, ...]:

@@ -76,7 +76,18 @@ def comparison_notes(rows: Sequence[Row], compared: Mapping[str, Mapping[RowKey,
             "p treats pairs of several runs as independent: it describes these trained policies, not "
             "training them again; for that, use the interval over the runs."
         )
+    n_runs = {_key(row): row.n_runs for row in rows}
     for baseline, found in compared.items():
+        fewer = [
+            f"{_shown(row)} ({n_runs[one.baseline]} of {row.n_runs} runs)"
+            for row in rows
+            if (one := found.get(_key(row))) and n_runs[one.baseline] < row.n_runs
+        ]
+        if fewer:
+            notes.append(
+                f"vs {baseline}: {some_of(fewer)} over the runs that {baseline} has, too; `--runs` gives it "
+                "as many."
+            )
         other_k = [
             f"{_shown(row)} against K={one.baseline.n_action_steps}"
             for row in rows

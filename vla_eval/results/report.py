@@ -3,8 +3,9 @@
 Reads and returns; changes nothing. `docs/statistics.md` explains each column.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results import notes
@@ -21,8 +22,8 @@ from vla_eval.results.comparison import (
     measure,
 )
 from vla_eval.results.estimates import chance_corrected
-from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs
-from vla_eval.results.success_table import Row, Table
+from vla_eval.results.grouping import RowEpisodes, group_runs
+from vla_eval.results.success_table import Row, RunRow, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
 from vla_eval.storage.run_folder import StoredRun
 
@@ -57,8 +58,9 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     compared = compare_with_baselines(grouping.groups, baselines)
     measured = {key: measure(group) for key, group in grouping.groups.items()}
     chances = {key: chance_of(key, grouping.groups, measured) for key in grouping.groups}
+    around = {key: _Around(chances[key], ceiling_of(key, measured)) for key in grouping.groups}
     rows = [
-        _row(group, measured, chance=chances[key], versus=[compared[name].get(key) for name in baselines])
+        Row(**_cells(group, measured[key], around[key], [compared[name].get(key) for name in baselines]))
         for key, group in grouping.groups.items()
     ]
     table_notes = (
@@ -69,6 +71,13 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     )
     return Table(
         rows=tuple(rows),
+        run_rows=tuple(
+            RunRow(**_cells(alone, measure(alone), around[key], ()), run=run.index, copy=run.copy)
+            for key, group in grouping.groups.items()
+            if measured[key].n_runs > 1
+            for run in group.runs
+            for alone in [replace(group, runs=(run,))]
+        ),
         notes=table_notes,
         baselines=baselines,
         n_comparisons=sum(len(found) for found in compared.values()),
@@ -76,18 +85,20 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
     )
 
 
-def _row(
-    group: RowEpisodes,
-    measured: Mapping[RowKey, Measured],
-    *,
-    chance: Chance | None,
-    versus: Sequence[Comparison | None],
-) -> Row:
-    own = measured[group.key]
+class _Around(NamedTuple):
+    """What a rate is compared with."""
+
+    chance: Chance | None
+    ceiling: float | None
+
+
+def _cells(
+    group: RowEpisodes, own: Measured, around: _Around, versus: Sequence[Comparison | None]
+) -> dict[str, Any]:  # Any: the fields of `Row`
     right = own.right_if_chose_interval
-    ceiling = ceiling_of(group.key, measured)
+    chance, ceiling = around
     first, second = (*(_versus(one) for one in versus), _versus(None), _versus(None))[:2]
-    return Row(
+    return dict(
         **group.key._asdict(),
         n_episodes=len(group.results),
         n_errors=group.n_errors,

@@ -87,11 +87,25 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RunRow(Row):
+    """One run of a row that has several; compared with nothing, so that no test counts twice.
+
+    Attributes:
+        run: its number; with several checkpoints, which of them.
+        copy: above 0 where further run folders hold the same run with other trajectories or weights.
+    """
+
+    run: int
+    copy: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """Rows and their notes.
 
     Attributes:
         rows: in the order of the configuration.
+        run_rows: the runs of each row that has several.
         notes: footnotes, whole sentences.
         baselines: the policies with which the others are compared: one, two or none.
         n_comparisons: how many p values were corrected together.
@@ -99,7 +113,19 @@ class Table:
     """
 
     rows: tuple[Row, ...]
+    run_rows: tuple[RunRow, ...] = ()
     notes: tuple[str, ...]
     baselines: tuple[str, ...]
     n_comparisons: int
     runs: Mapping[str, str]
+
+    def with_runs(self) -> tuple[Row, ...]:
+        """Return the rows, each followed by its runs."""
+        runs_of: dict[tuple[str, str, int, str | None], list[Row]] = {}
+        for run in self.run_rows:
+            runs_of.setdefault((run.task, run.policy, run.n_action_steps, run.variant), []).append(run)
+        return tuple(
+            one
+            for row in self.rows
+            for one in (row, *runs_of.get((row.task, row.policy, row.n_action_steps, row.variant), ()))
+        )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from vla_eval.errors import check_names
-from vla_eval.results.success_table import Row, Table
+from vla_eval.results.success_table import Row, RunRow, Table
 
 UNDEFINED = "—"
 SMALLEST_SHOWN_P = 0.001
@@ -55,7 +55,8 @@ def lay_out(table: Table, *, names: Sequence[str] = (), wide: bool = False) -> L
     Args:
         table: what `build_table` returned.
         names: exactly these columns, in this order.
-        wide: all but the extra columns, however wide the table becomes and whatever is constant.
+        wide: all but the extra columns, however wide the table becomes and whatever is constant, and a row
+            for each of several runs.
 
     Raises:
         UnknownNameError: there is no such column.
@@ -66,7 +67,7 @@ def lay_out(table: Table, *, names: Sequence[str] = (), wide: bool = False) -> L
         return _layout(table, [by_name[name] for name in names])
     shown = [column for column in by_name.values() if not column.is_extra and not _is_empty(column, table)]
     if wide:
-        return _layout(table, shown)
+        return _layout(table, shown, rows=table.with_runs())
     same = [column for column in shown if column.folds and len(set(_cells(column, table))) == 1]
     fitting, left_out = _fit([column for column in shown if column not in same], table)
     found = tuple((column.title, column.cell(table.rows[0])) for column in same)
@@ -78,8 +79,9 @@ def sentence_of(same: Sequence[tuple[str, str]]) -> str:
     return f"All rows: {', '.join(f'{title} {cell}' for title, cell in same)}."
 
 
-def _layout(table: Table, columns: Sequence[Column]) -> Layout:
-    return Layout(tuple(columns), tuple(tuple(one.cell(row) for one in columns) for row in table.rows))
+def _layout(table: Table, columns: Sequence[Column], *, rows: Sequence[Row] | None = None) -> Layout:
+    shown = table.rows if rows is None else rows
+    return Layout(tuple(columns), tuple(tuple(one.cell(row) for one in columns) for row in shown))
 
 
 def _fit(columns: Sequence[Column], table: Table) -> tuple[list[Column], list[Column]]:
@@ -106,7 +108,7 @@ def _columns(table: Table) -> list[Column]:
     first, second = (*table.baselines, "baseline", "second baseline")[:2]
     return [
         Column("task", "task", lambda row: row.task, is_number=False, folds=True),
-        Column("policy", "policy", lambda row: row.policy, is_number=False),
+        Column("policy", "policy", _policy, is_number=False),
         Column("K", "K", lambda row: str(row.n_action_steps), folds=True),
         Column("variant", "variant", lambda row: row.variant or UNDEFINED, is_number=False),
         Column("success", "success once", _success_once),
@@ -129,6 +131,13 @@ def _columns(table: Table) -> list[Column]:
         Column("episodes", "episodes", _episodes, folds=True),
         Column("errors", "errors", lambda row: str(row.n_errors), folds=True),
     ]
+
+
+def _policy(row: Row) -> str:
+    if not isinstance(row, RunRow):
+        return row.policy
+    copy = f", folder {row.copy + 1}" if row.copy else ""
+    return f"{row.policy}, run {row.run}{copy}"
 
 
 def _rate(value: float | None) -> str:

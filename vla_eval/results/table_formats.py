@@ -44,7 +44,7 @@ def render(
             precision.
         paper: add the paper's results for the same tasks, marked and separate from the measured ones.
         columns: names of the columns in the formats for reading, in this order; none: those that fit.
-        wide: all columns in the formats for reading, however wide the table becomes.
+        wide: all columns in the formats for reading, however wide the table becomes, and a row per run.
         preset: `paper`: LaTeX with tasks as columns and policies as rows.
 
     Returns:
@@ -178,6 +178,7 @@ def _json(table: Table, figures: Sequence[PaperFigure] | None) -> str:
         "n_comparisons": table.n_comparisons,
         "runs": dict(table.runs),
         "rows": [row.to_dict() for row in table.rows],
+        "run_rows": [row.to_dict() for row in table.run_rows],
         "notes": list(table.notes),
     }
     if figures is not None:

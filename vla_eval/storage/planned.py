@@ -3,14 +3,35 @@
 Knows nothing of files.
 """
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from vla_eval.errors import some_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.strict_json import Count, Positive, Source, as_dataclass
+
+_NAMED = re.compile(r"(?P<name>\w[\w.-]*)=(?P<checkpoints>.+)", re.DOTALL)
+
+
+class NamedCheckpoints(NamedTuple):
+    """What `NAME=A,B,C` says: one policy whose runs are different checkpoints.
+
+    Attributes:
+        name: of the policy in records and tables.
+        checkpoints: of run 0, 1, 2 …
+    """
+
+    name: str
+    checkpoints: tuple[str, ...]
+
+
+def named_checkpoints(policy: str) -> NamedCheckpoints | None:
+    """Read the entry of a policy in a configuration; None if it names a single one."""
+    match = _NAMED.fullmatch(policy)
+    return NamedCheckpoints(match["name"], tuple(match["checkpoints"].split(","))) if match else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,7 +41,7 @@ class PlannedConfig:
     Attributes:
         tasks: ids, maybe with their namespace.
         task_versions: task id -> version of its rules.
-        policies: names, files or folders.
+        policies: names, files or folders, or `NAME=A,B,C`.
         policy_names: what records call the policies.
         n_action_steps: None also where each policy has its default.
         episodes, runs, seed_start: how many, and of which seeds.
@@ -34,6 +55,11 @@ class PlannedConfig:
     episodes: Positive | None = None
     runs: Positive | None = None
     seed_start: Count | None = None
+
+    def n_runs(self, policy: str) -> int | None:
+        """Return how many runs a policy has: one per checkpoint if it was given several."""
+        named = (named_checkpoints(entry) for entry in self.policies or ())
+        return next((len(one.checkpoints) for one in named if one and one.name == policy), self.runs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,8 +104,9 @@ class PlannedEpisodes:
             return f"n_action_steps are {some_of(config.n_action_steps)}"
         if self.groups is not None and key[:3] not in self.groups:
             return "no such policy is run on this task with these n_action_steps"
-        if config.runs is not None and key.run >= config.runs:
-            return f"the runs are 0 to {config.runs - 1}"
+        n_runs = config.n_runs(key.policy)
+        if n_runs is not None and key.run >= n_runs:
+            return f"the runs are 0 to {n_runs - 1}"
         if config.episodes is not None and config.seed_start is not None:
             last = config.seed_start + config.episodes - 1
             if not config.seed_start <= key.seed <= last:
