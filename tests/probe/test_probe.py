@@ -169,6 +169,9 @@ def config(**fields: Any) -> EvalConfig:
     return EvalConfig(**{"name": "x", "tasks": ("RememberColor3-v0",), "policies": ("hold",), **fields})
 
 
+TASK_CONFIG = config()
+
+
 def test_horizons_follow_the_delay() -> None:
     probe = plan_probe(config(), ProbeSettings(probes=("delay",), delays=(0, 5, 320)))
     env = {world.level: world.config.env for world in probe.worlds}

@@ -23,8 +23,9 @@ DESCRIPTION = """Run each task as it is and with one thing changed, on the same 
 
 swap: another cue in the same scene. Who follows the cue chooses what was shown in each of the two worlds.
 order: the same items in another order (Seq, Chain). blank: the cue phase passes without a cue.
-cue, delay: other lengths of the phase. distractor: another item is seen in the delay. interference: the
-arm is moved in the delay. reset: the policy is reset in mid-episode. instruction: other sentences.
+cue, delay: other lengths of the phase. delay_swap: a swap after each delay. distractor: another item is
+seen in the delay. interference: the arm is moved in the delay. reset: the policy is reset in mid-episode.
+instruction: other sentences.
 
 With --grid, chunk lengths against the lengths of the phases: what of the cue falls into an inference?
 

@@ -22,15 +22,18 @@ Intervention = Literal[
     "blank",
     "cue",
     "delay",
+    "delay_swap",
     "distractor",
     "interference",
     "reset",
     "instruction",
 ]
 PROBES: tuple[Intervention, ...] = (
-    *("swap", "order", "blank", "cue", "delay", "distractor", "interference", "reset"),
-    "instruction",
+    *("swap", "order", "blank", "cue", "delay", "delay_swap", "distractor"),
+    *("interference", "reset", "instruction"),
 )
+SWAPS: tuple[Intervention, ...] = ("swap", "order", "delay_swap")
+"""Interventions whose worlds have another right answer than the world that they are compared with."""
 DEFAULT_PROBES: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
 DEFAULT_DELAYS = (0, 5, 10, 20, 40, 80, 160, 320)
 DEFAULT_CUES = (1, 2, 3)
@@ -83,7 +86,8 @@ class World:
 
     Attributes:
         task: task id.
-        intervention: what is changed; `none` for the world that the others are compared with.
+        intervention: what is changed; `none` for the world that the others are compared with. `delay_swap`
+            is compared with the `delay` of the same level.
         level: by how much: the swap's number, a number of steps, the step of a reset, or a prompt set.
         config: the evaluation of this task; its name is the run folder's.
     """
@@ -126,7 +130,8 @@ def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
             if not found:
                 left_out.append(f"{probe} on {spec.id}: {WHY_NOT[probe]}")
         if changed:
-            worlds += [of_task.world("none", None, {}), *changed]
+            # By name: `delay_swap` has the worlds of `swap` and `delay` that it is compared with.
+            worlds += {one.config.name: one for one in (of_task.world("none", None, {}), *changed)}.values()
     if not worlds:
         raise RecipeError(f"--probe: there is nothing to run ({'; '.join(left_out)}).")
     return Probe(worlds=tuple(worlds), left_out=tuple(left_out))
@@ -138,6 +143,7 @@ WHY_NOT: Mapping[Intervention, str] = {
     "blank": "it has no cue phase",
     "cue": "it has no cue phase",
     "delay": "it has no delay",
+    "delay_swap": "it has no delay",
     "distractor": "it has no items, or its delay is shorter than the distractor",
     "interference": "it has no delay of two steps or more",
     "instruction": "the only prompt set that was named is that of the evaluation",
@@ -167,6 +173,8 @@ class _Task:
             return self._of_lengths(probe, settings.cues) if has_phases else []
         if probe == "delay":
             return self._of_lengths(probe, settings.delays) if has_phases else []
+        if probe == "delay_swap":
+            return self._swapping_after_delays() if has_phases else []
         if probe == "distractor":
             return self._distracting() if has_phases else []
         if probe == "interference":
@@ -185,6 +193,15 @@ class _Task:
             self.world(probe, length, phases.with_length(probe, length))
             for length in sorted(set(lengths) - {usual})
         ]
+
+    def _swapping_after_delays(self) -> list[World]:
+        """Return the worlds of each delay, as drawn and with the first of the other cues."""
+        delays, swap = self.worlds("delay"), self.settings.swaps[0]
+        swapped = [
+            self.world("delay_swap", world.level, {**world.config.env, "swap_cue": swap}) for world in delays
+        ]
+        usual = self.world("swap", swap, {"swap_cue": swap})
+        return [usual, *delays, *swapped]
 
     def _distracting(self) -> list[World]:
         if self.spec.candidates not in ITEMS:

@@ -4,8 +4,9 @@ import json
 
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife, Range
+from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
-from vla_eval.probe.table import ProbeRow, ProbeTable, Retention
+from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import (
     UNDEFINED,
     JsonRow,
@@ -104,14 +105,15 @@ def _json_retention(curve: Retention) -> JsonRow:
         "task": curve.task,
         "policy": curve.policy,
         "n_action_steps": curve.n_action_steps,
+        "of": curve.of,
         "points": [
-            {"delay_steps": row.delay_steps, **_json_share("follows", row.followed), "chance": row.chance}
-            for row in curve.rows
+            {"delay_steps": point.delay_steps, **_json_share(curve.of, point.share), "chance": point.chance}
+            for point in curve.points
         ],
         "half_life_steps": half.steps if half else None,
         **_ends("half_life_steps", half.interval if half else None),
         "half_life_state": _state(half),
-        "longest_delay_steps": curve.rows[-1].delay_steps,
+        "longest_delay_steps": curve.points[-1].delay_steps,
     }
 
 

@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
+from vla_eval.probe.interventions import SWAPS
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
+from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
 
 ORACLE = "oracle"
@@ -18,20 +20,20 @@ def sentences(table: ProbeTable) -> list[str]:
 def _sentence(table: ProbeTable, task: str, policy: str, k: int) -> str:
     rows = [row for row in table.rows if (row.task, row.policy, row.n_action_steps) == (task, policy, k)]
     said = [clause for row in rows if (clause := _clause(row)) is not None]
-    halves = [
-        curve.half_life
+    said += [
+        _half_life(curve)
         for curve in table.retention
         if (curve.task, curve.policy, curve.n_action_steps) == (task, policy, k)
     ]
-    said += [_half_life(half) for half in halves]
     return f"{policy} on {task}, K = {k}: {'; '.join(said) or 'no episode has a result'}."
 
 
 def _clause(row: ProbeRow) -> str | None:
     if row.swap is not None:
         what = "both orders" if row.intervention == "order" else "the cue in both worlds"
-        return f"follows {what} in {_of(row.swap.warranted_choice)} pairs{_of_pairs(row)}"
-    if row.followed is None or row.intervention in ("swap", "order"):
+        after = f" after a delay of {row.level} steps" if row.intervention == "delay_swap" else ""
+        return f"follows {what}{after} in {_of(row.swap.warranted_choice)} pairs{_of_pairs(row)}"
+    if row.followed is None or row.intervention in SWAPS:
         return None
     where = {
         "none": "follows the cue in",
@@ -59,13 +61,15 @@ def _of_pairs(row: ProbeRow) -> str:
     return f" (chance at most {row.chance**2 * row.swap.n_pairs:.0f})"
 
 
-def _half_life(half: HalfLife | None) -> str:
+def _half_life(curve: Retention) -> str:
+    half = curve.half_life
+    of = " of following it in both worlds" if curve.of == "warranted_choice" else ""
     if half is None:
-        return "no half-life, since at the shortest delay the cue is not followed more often than by chance"
+        return f"no half-life{of}, since at the shortest delay this is not more frequent than by chance"
     if half.steps is None and half.interval.low is None:
-        return f"half-life more than {half.longest_delay} steps"
+        return f"half-life{of} more than {half.longest_delay} steps"
     ends = " to ".join(_steps(end, half) for end in half.interval)
-    return f"half-life {_steps(half.steps, half)} steps [{ends}]"
+    return f"half-life{of} {_steps(half.steps, half)} steps [{ends}]"
 
 
 def _steps(steps: float | None, half: HalfLife) -> str:

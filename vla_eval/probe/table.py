@@ -1,12 +1,12 @@
 """The table of a probe, from its run folders: a row per task, policy, n_action_steps and world."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from vla_eval.probe.interventions import Intervention, Level, World, delay_of
+from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
     Pair,
@@ -17,9 +17,10 @@ from vla_eval.probe.quantities import (
     paired_p,
     swap_quantities,
 )
-from vla_eval.probe.retention import Followed, HalfLife, Range, half_life, share_left
+from vla_eval.probe.retention import Followed, Range, share_left
+from vla_eval.probe.retention_curves import Retention, retention_curves
+from vla_eval.probe.world_records import Records, by_policy, chance_of, compared_with, results_of
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.comparison import CHANCE_POLICY
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names
 from vla_eval.storage.run_folder import read_run
@@ -28,21 +29,21 @@ from vla_eval.tasks.catalog import task_spec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeRow:
-    """One policy in one world, compared with the world as it is drawn (`none`).
+    """One policy in one world, compared with the world as it is drawn, or with another one of its delay.
 
     Attributes:
         task, policy, n_action_steps: whose row it is.
         intervention, level: the world.
         delay_steps: its delay; None for a task without one.
         inferences: which inferences fall into the cue; None without phases, or if their lengths are drawn.
-        n_pairs: episodes with a result in this world and in `none`.
+        n_pairs: episodes with a result in this world and in the one that it is compared with.
         swap: of a swapped cue or order.
         followed: episodes of this world that follow the cue.
         n_without_choice: episodes of this world in which no candidate was touched; None without candidates.
         success: episodes of this world that succeed; None without a result.
         chance: rate of following the cue without memory; None where it is not known.
         left, left_interval: share of following that this world leaves; None for swaps and `none`.
-        p_value: exact paired test against `none`; corrected_p: after Holm, over the table.
+        p_value: exact paired test against that world; corrected_p: after Holm, over the table.
         n_errors: episodes of this world without a result.
     """
 
@@ -67,17 +68,6 @@ class ProbeRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Retention:
-    """How the delay affects one policy on one task."""
-
-    task: str
-    policy: str
-    n_action_steps: int
-    rows: tuple[ProbeRow, ...]
-    half_life: HalfLife | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeTable:
     """All rows, in the order of the worlds, and the retention curves."""
 
@@ -88,10 +78,6 @@ class ProbeTable:
     def n_errors(self) -> int:
         """The number of episodes without a result."""
         return sum(row.n_errors for row in self.rows)
-
-
-Records = Mapping[tuple[str, int], Sequence[EpisodeRecord]]
-"""(policy, n_action_steps) -> records of one world."""
 
 
 def read_probe(worlds: Sequence[World], out: Path) -> ProbeTable:
@@ -111,28 +97,18 @@ def probe_table(
         records: of each world, in any order.
         order: the policies' names in the order of the rows; others come last, by name.
     """
-    by_world = [(world, _by_policy(found)) for world, found in zip(worlds, records, strict=True)]
+    by_world = [(world, by_policy(found)) for world, found in zip(worlds, records, strict=True)]
     drawn = {world.task: found for world, found in by_world if world.intervention == "none"}
     rows, retention = [], []
     for task in dict.fromkeys(world.task for world in worlds):
         of_task = [(world, found) for world, found in by_world if world.task == task]
         for policy, k in _policies(drawn[task], order):
-            own = [_row(world, found, drawn[task], policy, k) for world, found in of_task]
-            rows += own
-            curve = _retention(of_task, own, policy, k)
-            if curve is not None:
-                retention.append(curve)
+            rows += [_row(world, found, compared_with(world, of_task), policy, k) for world, found in of_task]
+            retention += retention_curves(of_task, policy, k)
     tested = [row.p_value for row in rows if row.p_value is not None]
     corrected = iter(holm(tested))
     rows = [row if row.p_value is None else replace(row, corrected_p=next(corrected)) for row in rows]
     return ProbeTable(rows=tuple(rows), retention=tuple(retention))
-
-
-def _by_policy(records: Sequence[EpisodeRecord]) -> Records:
-    found: dict[tuple[str, int], list[EpisodeRecord]] = {}
-    for record in records:
-        found.setdefault((record.policy, record.n_action_steps), []).append(record)
-    return found
 
 
 def _policies(records: Records, order: Sequence[str]) -> list[tuple[str, int]]:
@@ -143,9 +119,9 @@ def _policies(records: Records, order: Sequence[str]) -> list[tuple[str, int]]:
 
 def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> ProbeRow:
     own = found.get((policy, k), ())
-    results = [record for record in own if record.outcome != "error"]
+    results = results_of(own)
     pairs = pair_up(drawn.get((policy, k), ()), own)
-    is_swap = world.intervention in ("swap", "order")
+    is_swap = world.intervention in SWAPS
     swap = swap_quantities(pairs, task_spec(world.task)) if is_swap else None
     compared = not is_swap and world.intervention != "none"
     left = share_left(*_followed(pairs)) if compared and pairs else None
@@ -164,7 +140,7 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         followed=Share(sum(map(follows, results)), len(results)) if results else None,
         n_without_choice=_n_without_choice(results),
         success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
-        chance=_chance(results, found, k),
+        chance=chance_of(results, found, k),
         left=left[0] if left else None,
         left_interval=left[1] if left else None,
         p_value=p_value,
@@ -181,40 +157,3 @@ def _n_without_choice(results: Sequence[EpisodeRecord]) -> int | None:
 def _followed(pairs: Sequence[Pair]) -> tuple[Followed, Followed]:
     drawn = np.array([follows(pair.drawn) for pair in pairs], dtype=bool)
     return drawn, np.array([follows(pair.other) for pair in pairs], dtype=bool)
-
-
-def _chance(results: Sequence[EpisodeRecord], found: Records, k: int) -> float | None:
-    """Return the records' chance level, or what the blind arm has in this world."""
-    known = {record.chance_success for record in results}
-    if len(known) == 1 and None not in known:
-        return known.pop()
-    blind = [record for record in found.get((CHANCE_POLICY, k), ()) if record.outcome != "error"]
-    return sum(map(follows, blind)) / len(blind) if blind else None
-
-
-def _retention(
-    of_task: Sequence[tuple[World, Records]], rows: Sequence[ProbeRow], policy: str, k: int
-) -> Retention | None:
-    """Return the curve over the delay; None if the delay was not changed."""
-    by_delay = {
-        row.delay_steps: (row, found.get((policy, k), ()))
-        for (world, found), row in zip(of_task, rows, strict=True)
-        if world.intervention in ("none", "delay") and row.delay_steps is not None and row.followed
-    }
-    if len(by_delay) < 2:
-        return None
-    delays = sorted(by_delay)
-    outcomes = {
-        delay: {(r.run, r.seed): follows(r) for r in by_delay[delay][1] if r.outcome != "error"}
-        for delay in delays
-    }
-    shared = sorted(set.intersection(*(set(known) for known in outcomes.values())))
-    chance = by_delay[delays[0]][0].chance
-    followed = {delay: np.array([outcomes[delay][key] for key in shared], dtype=bool) for delay in delays}
-    return Retention(
-        task=rows[0].task,
-        policy=policy,
-        n_action_steps=k,
-        rows=tuple(by_delay[delay][0] for delay in delays),
-        half_life=None if chance is None else half_life(followed, chance),
-    )

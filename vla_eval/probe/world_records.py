@@ -1,0 +1,49 @@
+"""The records of a task's worlds by policy, and which world another one is compared with. Reads no files."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from vla_eval.probe.interventions import Intervention, Level, World
+from vla_eval.probe.quantities import follows
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.comparison import CHANCE_POLICY
+
+Records = Mapping[tuple[str, int], Sequence[EpisodeRecord]]
+"""(policy, n_action_steps) -> records of one world."""
+
+Worlds = Sequence[tuple[World, Records]]
+"""The worlds of one task."""
+
+
+def by_policy(records: Iterable[EpisodeRecord]) -> Records:
+    """Sort the records of one world."""
+    found: dict[tuple[str, int], list[EpisodeRecord]] = {}
+    for record in records:
+        found.setdefault((record.policy, record.n_action_steps), []).append(record)
+    return found
+
+
+def records_in(worlds: Worlds, intervention: Intervention, level: Level) -> Records | None:
+    """Return the records of a world; None if it was not run."""
+    own = (found for world, found in worlds if (world.intervention, world.level) == (intervention, level))
+    return next(own, None)
+
+
+def compared_with(world: World, worlds: Worlds) -> Records:
+    """Return the records of the world that this one is compared with; none if it was not run."""
+    if world.intervention == "delay_swap":
+        return records_in(worlds, "delay", world.level) or {}
+    return records_in(worlds, "none", None) or {}
+
+
+def results_of(records: Iterable[EpisodeRecord]) -> list[EpisodeRecord]:
+    """Return the records that are no errors."""
+    return [record for record in records if record.outcome != "error"]
+
+
+def chance_of(records: Sequence[EpisodeRecord], found: Records, n_action_steps: int) -> float | None:
+    """Return the records' chance level, or what the blind arm has in this world; None if neither is known."""
+    known = {record.chance_success for record in records}
+    if len(known) == 1 and None not in known:
+        return known.pop()
+    blind = results_of(found.get((CHANCE_POLICY, n_action_steps), ()))
+    return sum(map(follows, blind)) / len(blind) if blind else None
