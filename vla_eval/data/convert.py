@@ -4,8 +4,6 @@ What a source does not have is left out and said so, or is an error; computed is
 what is there (`import_writer`).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any  # arrays of several types
 
@@ -15,9 +13,9 @@ from vla_eval.data.import_writer import ImportWriter
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.layouts import Source, SourceEpisode, lerobot_layout, npz_files, read_npz
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.shard_writer import draft_path, publish, remove_drafts
 from vla_eval.errors import DatasetError
 from vla_eval.features import StateKind
+from vla_eval.storage.drafts import whole_folder
 
 NPZ_NAME = "train_data_{}.npz"  # as the authors' recorder calls its files
 
@@ -53,7 +51,7 @@ def convert_to_npz(source: Source, out: Path) -> int:
         DatasetError: `out` exists, or the source lacks something that the layout has.
     """
     n_episodes = 0
-    with _whole_folder(out) as draft:
+    with whole_folder(out, error=DatasetError) as draft:
         draft.mkdir(parents=True)
         for episode in source.episodes():
             arrays = _paper_arrays(episode, where=source.path)
@@ -76,7 +74,7 @@ def convert_to_lerobot(source: Source, out: Path, *, task: str | None, state: St
     """
     if source.layout == "lerobot_mikasa":
         raise DatasetError(f"{source.path}: is a LeRobotDataset of this project already.")
-    with _whole_folder(out) as draft:
+    with whole_folder(out, error=DatasetError) as draft:
         writer = ImportWriter(draft, source, task=task, state=state)
         for episode in source.episodes():
             writer.add(episode)
@@ -98,19 +96,3 @@ def _paper_arrays(episode: SourceEpisode, *, where: Path) -> dict[str, Any]:
         )
     rgb = np.concatenate([episode.images_base_THWC, episode.images_wrist_THWC], axis=-1)
     return {"rgb": rgb, "action": episode.actions_TA, **numbers}
-
-
-@contextmanager
-def _whole_folder(out: Path) -> Iterator[Path]:
-    """Give a place to write to; it becomes `out` at the end, or is removed after an exception."""
-    if out.exists():
-        raise DatasetError(f"{out}: exists already. Name a new folder with --out, or remove this one.")
-    remove_drafts(out)
-    draft = draft_path(out)
-    draft.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield draft
-        publish(draft, out)
-    except BaseException:
-        remove_drafts(out)
-        raise

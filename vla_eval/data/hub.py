@@ -20,8 +20,8 @@ from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.imported import IMPORT_FILE
 from vla_eval.data.manifest import RECORDING_FILE, REPLAY_FILE
-from vla_eval.data.shard_writer import publish
 from vla_eval.errors import DatasetError
+from vla_eval.storage.drafts import publish
 
 REPO_TYPE = "dataset"
 BESIDES = (RECORDING_FILE, IMPORT_FILE, REPLAY_FILE, CARD_FILE, SHEET_FILE)

@@ -43,18 +43,12 @@ from vla_eval.data.recording_jobs import (
     ShardWritten,
     TaskPlan,
 )
-from vla_eval.data.shard_writer import (
-    Format,
-    ShardWriter,
-    draft_path,
-    join_shards,
-    publish,
-    remove_drafts,
-)
+from vla_eval.data.shard_writer import Format, ShardWriter, join_shards
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.features import CAMERA_KEYS, frame_values
+from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import storage_full
 from vla_eval.storage.starting import DISK_TROUBLE
 from vla_eval.workers.inside import Heartbeat

@@ -5,8 +5,6 @@ finalised, made durable and then renamed. Encoding goes through `LeRobotDataset`
 simulators: it is given frames.
 """
 
-import os
-import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,12 +24,11 @@ from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries,
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
-from vla_eval.storage.durable import sync_folder
+from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
 ROBOT_TYPE = "panda_wristcam"
 SHARD_EPISODES = MIKASA_FOLDER / "manifest.jsonl"
 SHARD_HISTOGRAMS = MIKASA_FOLDER / "histograms.npz"
-DRAFT_SUFFIX = ".draft"
 MIN_FRAMES = 2  # lerobot's statistics need two
 # One thread, so that the bytes of a video do not depend on the machine's cores.
 ENCODER_THREADS = 1
@@ -172,31 +169,3 @@ def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:
     """Return the episodes of a finished shard."""
     path = shard / SHARD_EPISODES
     return read_entries(path, RecordedEpisode)
-
-
-def draft_path(path: Path) -> Path:
-    """Return where something is written that is to appear at `path`; another one for each process.
-
-    lerobot keeps decoders open by their path: a draft must not have the path of an earlier one.
-    """
-    return path.with_name(f"{path.name}.{os.getpid()}{DRAFT_SUFFIX}")
-
-
-def remove_drafts(path: Path) -> None:
-    """Remove what earlier processes began to write."""
-    for draft in path.parent.glob(f"{path.name}.*{DRAFT_SUFFIX}"):
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def publish(draft: Path, path: Path) -> None:
-    """Make a folder durable and give it its final name, in one step that cannot be cut in half."""
-    for folder, _, names in os.walk(draft):
-        for name in names:
-            descriptor = os.open(Path(folder) / name, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        sync_folder(Path(folder))
-    os.rename(draft, path)
-    sync_folder(path.parent)

@@ -1,0 +1,82 @@
+"""Write a folder beside its place and rename it when it is whole. Knows nothing of what it holds."""
+
+import contextlib
+import errno
+import glob
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from vla_eval.errors import VlaEvalError
+from vla_eval.storage.durable import sync_folder
+
+DRAFT_SUFFIX = ".draft"
+NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS})
+
+
+@contextlib.contextmanager
+def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
+    """Give a place to write to; it becomes `out` at the end, or is removed after an exception.
+
+    Raises:
+        VlaEvalError: of class `error`: `out` exists.
+    """
+    if out.exists():
+        raise error(f"{out}: exists already. Name a new folder with --out, or remove this one.")
+    remove_drafts(out)
+    draft = draft_path(out)
+    draft.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield draft
+        publish(draft, out)
+    except BaseException:
+        remove_drafts(out)
+        raise
+
+
+def draft_path(path: Path) -> Path:
+    """Return where something is written that is to appear at `path`; another one for each process.
+
+    lerobot keeps decoders open by their path: a draft must not have the path of an earlier one.
+    """
+    return path.with_name(f"{path.name}.{os.getpid()}{DRAFT_SUFFIX}")
+
+
+def remove_drafts(path: Path) -> None:
+    """Remove what earlier processes began to write."""
+    for draft in path.parent.glob(f"{glob.escape(path.name)}.*{DRAFT_SUFFIX}"):
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def publish(draft: Path, path: Path) -> None:
+    """Make a folder durable and give it its final name, in one step that cannot be cut in half."""
+    for folder, _, names in os.walk(draft):
+        for name in names:
+            descriptor = os.open(Path(folder) / name, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        sync_folder(Path(folder))
+    os.rename(draft, path)
+    sync_folder(path.parent)
+
+
+def link_file(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where the file system cannot link."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError as exc:
+        if exc.errno not in NO_LINKS:
+            raise
+        shutil.copyfile(source, target)
+
+
+def link_tree(source: Path, target: Path) -> None:
+    """Do the same with all files below a folder."""
+    for folder, _, names in os.walk(source):
+        for name in names:
+            file = Path(folder) / name
+            link_file(file, target / file.relative_to(source))
