@@ -64,6 +64,10 @@ class RunChangedError(RunFolderError):
     """A run cannot be continued, because its configuration or its machine has changed."""
 
 
+class MergeError(RunFolderError):
+    """Shards cannot be put together: they overlap, differ, or one is missing."""
+
+
 class StorageFullError(RunFolderError):
     """A record could not be made durable."""
 

@@ -181,3 +181,7 @@ class EpisodeTiming:
     reset_seconds: Seconds
     step_seconds: Seconds
     inference_seconds: Seconds
+
+    def to_json(self) -> str:
+        """Return the timing as one line of JSON, without the line's end."""
+        return json.dumps({**asdict(self), "key": self.key._asdict()})

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from vla_eval.config.renamed import warn_renamed
+from vla_eval.errors import RecipeError
+from vla_eval.storage.shard import Shard
 
 EXIT_EPISODE_ERRORS = 3
 """All episodes were run, and some ended in an error."""
@@ -51,6 +53,24 @@ def add_allow_environment_change(parser: argparse.ArgumentParser, *, consequence
         "--allow-environment-change",
         action="store_true",
         help=f"resume although package versions or the machine have changed{consequence}",
+    )
+
+
+def shard_argument(text: str) -> Shard:
+    """Read the value of `--shard`."""
+    try:
+        return Shard.parse(text)
+    except RecipeError as exc:
+        raise argparse.ArgumentTypeError(str(exc)) from exc
+
+
+def add_shard(parser: argparse.ArgumentParser) -> None:
+    """Declare `--shard I/N`."""
+    parser.add_argument(
+        "--shard",
+        type=shard_argument,
+        metavar="I/N",
+        help="run only part I of N, to OUT-shard-I-of-N; `mikasa-vla merge` puts them together",
     )
 
 

@@ -5,10 +5,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, add_verb, add_workers, typed_command
+from vla_eval.cli.arguments import (
+    EXIT_EPISODE_ERRORS,
+    add_allow_environment_change,
+    add_overrides,
+    add_shard,
+    add_verb,
+    add_workers,
+    typed_command,
+)
 from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
+from vla_eval.storage.shard import shard_folder
 
 DESCRIPTION = """Run the oracle and the controls that need no memory on every task, and name the shortcuts by
 which a task can be won: without acting, by touching one candidate after another, by staying at the cue,
@@ -39,8 +48,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--protocol", choices=("paper", "strict", "both"), default="both", help="(both)")
     add_workers(parser, default="auto")
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
+    add_shard(parser)
     add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
+    add_allow_environment_change(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,20 +63,30 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
+    from vla_eval.cli.output import print_shard
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
     configs = _configs(args)
-    command = typed_command()
+    out, command = shard_folder(args.out, args.shard), typed_command()
     with stop_on_signals() as stop:
         n_errors = 0
         for config in configs:
-            out = args.out / config.name
-            summary = evaluate_with_progress(config, out=out, command=command, stop=stop)
+            summary = evaluate_with_progress(
+                config,
+                out=out / config.name,
+                command=command,
+                stop=stop,
+                allow_environment_change=args.allow_environment_change,
+                shard=args.shard,
+            )
             n_errors += summary.n_errors
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)
                 return stop.exit_code
-    print(render_audit(read_audit(configs, args.out), args.format))
+    if args.shard is not None:
+        print_shard(out, args.out, args.shard)
+    else:
+        print(render_audit(read_audit(configs, args.out), args.format))
     return EXIT_EPISODE_ERRORS if n_errors else 0
 
 

@@ -11,6 +11,7 @@ from vla_eval.cli.arguments import (
     add_dry_run,
     add_old_flag,
     add_overrides,
+    add_shard,
     add_verb,
     add_workers,
     positive_argument,
@@ -24,6 +25,7 @@ from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
 from vla_eval.policies.recipe import policy_name
+from vla_eval.storage.shard import shard_folder
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -80,6 +82,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         help="load each model once, in a server that all workers share (inference: shared)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
+    add_shard(parser)
     add_overrides(parser, help="change any field of the configuration")
     _add_dry_run_arguments(parser)
     add_allow_environment_change(parser, consequence="; the table will say so")
@@ -126,7 +129,7 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.cli.output import check_baseline, check_table_arguments, print_table, write_html
+    from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.evaluation.evaluate import default_run_folder
     from vla_eval.storage.run_folder import read_run
@@ -143,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
     check_table_arguments(args)
     check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
-    out = args.out or default_run_folder(config)
+    out = shard_folder(args.out or default_run_folder(config), args.shard)
     with stop_on_signals() as stop:
         summary = evaluate_with_progress(
             config,
@@ -151,6 +154,7 @@ def run(args: argparse.Namespace) -> int:
             command=command,
             stop=stop,
             allow_environment_change=args.allow_environment_change,
+            shard=args.shard,
         )
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
@@ -169,6 +173,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.html is not None:
         write_html([found], args)
+    if args.shard is not None:
+        hint_merge(args.out or default_run_folder(config), args.shard)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
 
 
@@ -177,7 +183,7 @@ def _dry_run(config: EvalConfig, args: argparse.Namespace) -> int:
 
     named = {name: getattr(args, name) for name in ("steps_per_second", "inference_seconds")}
     rates = AssumedRates(**{name: value for name, value in named.items() if value is not None})
-    print("\n".join(describe_evaluation(config, out=args.out, rates=rates)))
+    print("\n".join(describe_evaluation(config, out=args.out, rates=rates, shard=args.shard)))
     return 0
 
 

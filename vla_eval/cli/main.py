@@ -17,6 +17,7 @@ PROGRAM = "mikasa-vla"
 VERBS = (
     "eval",
     "report",
+    "merge",
     "compare",
     "check",
     "audit",

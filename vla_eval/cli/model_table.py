@@ -11,6 +11,7 @@ from typing import NamedTuple
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
 from vla_eval.errors import FolderInUseError, RecipeError
 from vla_eval.evaluation.grid import (
+    EVALUATION_FOLDER,
     Finetuning,
     ModelTable,
     describe_effort,
@@ -19,6 +20,7 @@ from vla_eval.evaluation.grid import (
     load_model_table,
     narrow,
 )
+from vla_eval.storage.shard import shard_folder
 
 RUNS_FOLDER = Path("runs")
 FINETUNE_FLAGS = {
@@ -97,7 +99,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
     Raises:
         VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
     """
-    from vla_eval.cli.output import check_baseline, check_table_arguments, print_table, write_html
+    from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.storage.run_folder import read_run
 
@@ -113,6 +115,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
     n_errors, folders = 0, []
     with stop_on_signals() as stop, _tiny_models(work):
         for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
+            folder = shard_folder(folder.parent, args.shard) / folder.name
             config = replace(config, workers=1 if args.tiny else (args.workers or config.workers))
             summary = evaluate_with_progress(
                 config,
@@ -120,6 +123,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
                 command=command,
                 stop=stop,
                 allow_environment_change=args.allow_environment_change,
+                shard=args.shard,
             )
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)
@@ -130,6 +134,8 @@ def evaluate_table(args: argparse.Namespace) -> int:
     print_table(runs, args)
     if args.html is not None:
         write_html(runs, args)
+    if args.shard is not None:
+        hint_merge(work.out / EVALUATION_FOLDER, args.shard)
     return EXIT_EPISODE_ERRORS if n_errors else 0
 
 

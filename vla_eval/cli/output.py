@@ -3,9 +3,11 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_eval.errors import unknown_name
+from vla_eval.storage.shard import Shard
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
@@ -67,6 +69,21 @@ def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
     page = write_page(runs, args.html, baseline=args.baseline)
     sys.stdout.flush()  # the table first, wherever the two go
     print(f"Report page: {page}", file=sys.stderr)
+
+
+def print_shard(folder: Path, whole: Path, shard: Shard) -> None:
+    """Print the folder of a finished shard, and how the shards become one run."""
+    print(folder, flush=True)
+    hint_merge(whole, shard)
+
+
+def hint_merge(whole: Path, shard: Shard) -> None:
+    """Say on standard error how the shards become one run."""
+    print(
+        f"Shard {shard} is done. When all are: mikasa-vla merge {whole}-shard-*-of-{shard.count} "
+        f"--out {whole}; then the same command without --shard prints the result.",
+        file=sys.stderr,
+    )
 
 
 def check_baseline(baseline: str | None, policies: Sequence[str]) -> None:

@@ -6,7 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_overrides, workers_argument
+from vla_eval.cli.arguments import (
+    EXIT_EPISODE_ERRORS,
+    add_allow_environment_change,
+    add_overrides,
+    add_shard,
+    workers_argument,
+)
 from vla_eval.cli.output import FORMATS
 from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
 from vla_eval.cli.probe_runs import run_all
@@ -54,8 +60,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--workers", type=workers_argument, metavar="W", help="processes, or 'auto'")
     _add_interventions(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/probe"), metavar="DIR", help="(runs/probe)")
+    add_shard(parser)
     add_overrides(parser, help="change any field of the evaluations")
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_allow_environment_change(parser)
 
 
 def _add_interventions(parser: argparse.ArgumentParser) -> None:
@@ -115,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     probe = plan_probe(_config(args), _settings(args))
     for pair in probe.left_out:
         print(f"left out: {pair}", file=sys.stderr)
-    stopped = run_all([world.config for world in probe.worlds], args.out)
+    stopped = run_all([world.config for world in probe.worlds], args)
     if stopped is not None:
         return stopped
     table = read_probe(probe.worlds, args.out)

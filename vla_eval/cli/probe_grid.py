@@ -46,7 +46,7 @@ def run_grid(args: argparse.Namespace, config: EvalConfig, settings: "GridSettin
     for task in grid.left_out:
         print(f"left out: {task}", file=sys.stderr)
     print(f"{len(grid.worlds)} run folders, {grid.n_episodes} episodes", file=sys.stderr)
-    stopped = run_all([world.config for world in grid.worlds], args.out)
+    stopped = run_all([world.config for world in grid.worlds], args)
     if stopped is not None:
         return stopped
     table = read_grid(grid.worlds, args.out)

@@ -1,29 +1,42 @@
 """Run the evaluations of a probe one after another, each in a folder of its own."""
 
+import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from vla_eval.cli.arguments import typed_command
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.storage.shard import shard_folder
 
 
-def run_all(configs: Sequence[EvalConfig], out: Path) -> int | None:
-    """Run or resume each evaluation in `out/NAME`.
+def run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:
+    """Run or resume each evaluation in `OUT/NAME`, or one shard of each.
 
     Returns:
-        None once all are there; the exit code if a signal has stopped them.
+        None once all are there; the exit code after a shard, or if a signal has stopped them.
 
     Raises:
         VlaEvalError: as for `evaluate`.
     """
+    from vla_eval.cli.output import print_shard
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
-    command = typed_command()
+    out, command, n_errors = shard_folder(args.out, args.shard), typed_command(), 0
     with stop_on_signals() as stop:
         for config in configs:
-            summary = evaluate_with_progress(config, out=out / config.name, command=command, stop=stop)
+            summary = evaluate_with_progress(
+                config,
+                out=out / config.name,
+                command=command,
+                stop=stop,
+                allow_environment_change=args.allow_environment_change,
+                shard=args.shard,
+            )
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)
                 return stop.exit_code
-    return None
+            n_errors += summary.n_errors
+    if args.shard is None:
+        return None
+    print_shard(out, args.out, args.shard)
+    return EXIT_EPISODE_ERRORS if n_errors else 0

@@ -13,6 +13,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord
+from vla_eval.storage.shard import Shard
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
@@ -56,7 +57,13 @@ def stop_on_signals() -> Iterator[StopRequest]:
 
 
 def evaluate_with_progress(
-    config: EvalConfig, *, out: Path, command: str, stop: StopRequest, allow_environment_change: bool = False
+    config: EvalConfig,
+    *,
+    out: Path,
+    command: str,
+    stop: StopRequest,
+    allow_environment_change: bool = False,
+    shard: Shard | None = None,
 ) -> EvaluationSummary:
     """Run an evaluation with progress on standard error, and end early if asked to stop.
 
@@ -71,6 +78,7 @@ def evaluate_with_progress(
             command=command,
             allow_environment_change=allow_environment_change,
             observer=progress,
+            shard=shard,
         )
     finally:
         progress.close()

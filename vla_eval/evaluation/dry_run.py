@@ -8,11 +8,13 @@ from pathlib import Path
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import default_run_folder, worker_count
 from vla_eval.evaluation.job_queue import JobQueue
-from vla_eval.evaluation.plan import EpisodeJob, Plan, make_plan
+from vla_eval.evaluation.plan import EpisodeJob, Plan
+from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies.checkpoint import find_checkpoint, weights_file
 from vla_eval.records import EpisodeKey
 from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import read_run
+from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.tasks.catalog import task_spec
 
 N_CAMERAS = 2
@@ -62,23 +64,25 @@ class EvaluationEffort:
         return busy / self.n_workers
 
 
-def describe_evaluation(config: EvalConfig, *, out: Path | None, rates: AssumedRates) -> list[str]:
+def describe_evaluation(
+    config: EvalConfig, *, out: Path | None, rates: AssumedRates, shard: Shard | None = None
+) -> list[str]:
     """Return lines for a person.
 
     Raises:
         VlaEvalError: a mistake in the configuration, a recipe or a checkpoint; a folder of another run.
     """
-    path = out or default_run_folder(config)
-    return list(_lines(config, path, evaluation_effort(config, out=path), rates))
+    path = shard_folder(out or default_run_folder(config), shard)
+    return list(_lines(config, path, evaluation_effort(config, out=path, shard=shard), rates))
 
 
-def evaluation_effort(config: EvalConfig, *, out: Path) -> EvaluationEffort:
+def evaluation_effort(config: EvalConfig, *, out: Path, shard: Shard | None = None) -> EvaluationEffort:
     """Return what is left to run.
 
     Raises:
         VlaEvalError: see `describe_evaluation`.
     """
-    plan = make_plan(config)
+    plan = plan_shard(config, shard)
     finished = _finished(out)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)

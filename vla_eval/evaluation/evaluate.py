@@ -22,15 +22,16 @@ from vla_eval.evaluation.plan import (
     Plan,
     SetupKey,
     fingerprint,
-    make_plan,
     results_config,
 )
+from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.evaluation.worker import Finished, worker_main
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder
+from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.jobs import Answered
@@ -104,24 +105,26 @@ def evaluate(
     allow_environment_change: bool = False,
     observer: EvaluationObserver | None = None,
     backend: Backend = LOCAL,
+    shard: Shard | None = None,
 ) -> EvaluationSummary:
     """Run all episodes of a configuration that have no result yet.
 
     Args:
         config: what to evaluate.
-        out: the run folder; by default `default_run_folder(config)`.
+        out: the run folder; by default `default_run_folder(config)`, or that of its shard.
         command: what the user typed, for the record.
         allow_environment_change: continue although package versions or the machine have changed.
         observer: gets the progress.
         backend: where the workers run.
+        shard: run only this part of the episodes.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
     config = with_inference(config, backend)
-    observer, path = observer or _Silence(), out or default_run_folder(config)
-    plan = make_plan(config)
+    observer, path = observer or _Silence(), out or shard_folder(default_run_folder(config), shard)
+    plan = plan_shard(config, shard)
     with RunFolder.open(
         path,
         _describe(config, plan, command),
@@ -166,6 +169,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
         command=command,
         normalization=dict(plan.normalization),
         servers=dict(plan.servers),
+        shard=plan.shard,
     )
 
 

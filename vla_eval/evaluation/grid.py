@@ -38,6 +38,7 @@ FLOPS_PER_WEIGHT_AND_TOKEN: dict[Trained, int] = {"all": 6, "adapters": 4, "head
 Source: Kaplan et al. 2020, "Scaling laws for neural language models", section 2.1. Adapters need the first
 two, heads on frozen features the first.
 """
+EVALUATION_FOLDER = "evaluation"  # of the run folders, in the folder of a table
 SUSTAINED_TFLOPS = 100
 """What a data-centre GPU is assumed to keep up in bfloat16; an assumption, not a measurement."""
 
@@ -253,7 +254,7 @@ def evaluations(
         adapters: row -> adapter where it is not lerobot's.
     """
     own = adapters or {}
-    folder = out / "evaluation"
+    folder = out / EVALUATION_FOLDER
     for task in table.tasks:
         rows = table.rows_of(task)
         # Chance and ceiling are those of the same number of action steps.

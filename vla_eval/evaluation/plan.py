@@ -29,6 +29,7 @@ from vla_eval.policies.remote.survey import survey
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entry
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
+from vla_eval.storage.shard import Shard
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
@@ -124,6 +125,7 @@ class Plan:
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
         max_workers: the most workers that `workers: auto` may start, since each loads the policies that are
             not shared; None: no limit.
+        shard: the part of the configuration's episodes that `jobs` are; None: all of them.
     """
 
     jobs: tuple[EpisodeJob, ...]
@@ -135,6 +137,7 @@ class Plan:
     shared: Mapping[str, str]
     left_out: tuple[str, ...]
     max_workers: int | None
+    shard: Shard | None = None
 
 
 def make_plan(config: EvalConfig) -> Plan:

@@ -176,7 +176,8 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
         for path in grouping.further
     ]
     own = [note for run in runs for note in (*_incomplete(run), *_continued_elsewhere(run))]
-    return _told_together(notes) + own + _environment_differences(runs) + _recipe_differences(runs)
+    shards = _absent_shards(runs)
+    return _told_together(notes) + own + shards + _environment_differences(runs) + _recipe_differences(runs)
 
 
 def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
@@ -225,7 +226,8 @@ def _incomplete(run: StoredRun) -> list[str]:
     if not isinstance(n_episodes, int) or not isinstance(n_runs, int):
         return []
     there: Counter[PlannedRow] = Counter(PlannedRow(r.task, r.policy, r.n_action_steps) for r in run.records)
-    expected = n_episodes * n_runs
+    shard = run.description.shard
+    expected = (n_episodes if shard is None else len(shard.indices(n_episodes))) * n_runs
     missing = {group: there[group] for group in _planned(run, there) if there[group] < expected}
     if not missing:
         return []
@@ -233,6 +235,20 @@ def _incomplete(run: StoredRun) -> list[str]:
     return [
         f"{run.path} is incomplete (episodes done, of how many): {some_of(parts)}. Run the same command "
         "again to resume."
+    ]
+
+
+def _absent_shards(runs: Sequence[StoredRun]) -> list[str]:
+    """Name the shards of a run that are not among the run folders."""
+    found: dict[tuple[str, int], set[int]] = defaultdict(set)
+    for run in runs:
+        if run.description.shard is not None:
+            found[run.description.name, run.description.shard.count].add(run.description.shard.number)
+    absent = {key: sorted(set(range(1, key[1] + 1)) - numbers) for key, numbers in found.items()}
+    return [
+        f"{name} is not complete; not in this table: shard {some_of(f'{n}/{count}' for n in numbers)}."
+        for (name, count), numbers in absent.items()
+        if numbers
     ]
 
 

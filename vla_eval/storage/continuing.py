@@ -74,6 +74,8 @@ def continued(
 
 def _check_unchanged(old: RunDescription, new: RunDescription, shown: Path, *, may_grow: bool) -> None:
     """Raise `RunChangedError` if the configuration, a recipe or a policy server is not what it was."""
+    if changes := find_changes(_shard(old), _shard(new), prefix="shard"):
+        raise run_changed(changes, shown, remedy="Each shard needs a folder of its own: use another --out.")
     compared = without_growth(new, old) if may_grow else new
     changes = (
         *find_changes(old.config, compared.config, prefix="config"),
@@ -103,3 +105,9 @@ def check_allowed(changes: Sequence[Change], *, shown: Path, allowed: bool) -> N
 def without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
     """Return what is known of the environment before a worker has started."""
     return {name: value for name, value in environment.items() if name != DEVICE}
+
+
+def _shard(description: RunDescription) -> dict[str, JsonValue]:
+    """Return which shard a run is; its groups follow from the configuration, which may grow."""
+    shard = description.shard
+    return {} if shard is None else {"number": shard.number, "count": shard.count}

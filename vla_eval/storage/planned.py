@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from vla_eval.errors import some_of
 from vla_eval.records import EpisodeRecord
+from vla_eval.storage.shard import Shard
 from vla_eval.strict_json import Count, Positive, Source, as_dataclass
 
 _NAMED = re.compile(r"(?P<name>\w[\w.-]*)=(?P<checkpoints>.+)", re.DOTALL)
@@ -86,10 +87,12 @@ class PlannedEpisodes:
     Attributes:
         config: what the configuration says of them.
         groups: (task, policy, n_action_steps) of all, where that is known.
+        shard: the part of these episodes that the run has; None: all.
     """
 
     config: PlannedConfig
     groups: Collection[tuple[str, str, int]] | None = None
+    shard: Shard | None = None
 
     def objection(self, record: EpisodeRecord) -> str | None:
         """Return why a record is none of this run; None if it may be one."""
@@ -111,6 +114,8 @@ class PlannedEpisodes:
             last = config.seed_start + config.episodes - 1
             if not config.seed_start <= key.seed <= last:
                 return f"the seeds are {config.seed_start} to {last}"
+            if self.shard is not None and not self.shard.holds(key.seed - config.seed_start):
+                return f"the run is shard {self.shard}, and the seed is in another one"
         return None
 
 

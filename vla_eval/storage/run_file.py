@@ -5,13 +5,14 @@ Knows nothing of episodes; the values it keeps are plain JSON and mean nothing t
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from vla_eval.errors import RunChangedError, RunFolderError, one_line
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.planned import PlannedEpisodes, planned_config
+from vla_eval.storage.shard import Shard
 from vla_eval.strict_json import Source, as_dataclass, read_file, read_json, read_version
 
 FORMAT_VERSION = 1
@@ -39,6 +40,7 @@ class RunDescription:
         normalization: learned policy -> by which statistics it normalises; recorded only, since the digest
             of the weights in `recipes` covers them.
         servers: policy behind a socket -> what its server says of itself; compared on resume.
+        shard: which part of the plan it is; None: all of it. Compared on resume.
     """
 
     name: str
@@ -49,6 +51,7 @@ class RunDescription:
     command: str
     normalization: Mapping[str, JsonValue] = field(default_factory=dict)
     servers: Mapping[str, JsonValue] = field(default_factory=dict)
+    shard: Shard | None = None
 
 
 class Change(NamedTuple):
@@ -97,7 +100,7 @@ class RunFile:
         """
         data = {
             "format_version": FORMAT_VERSION,
-            **_fields(self.description),
+            **_description(self.description),
             "sessions": [_session_fields(session) for session in self.sessions],
         }
         text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False, default=_plain)
@@ -131,7 +134,9 @@ class RunFile:
         Raises:
             RunFolderError: a field of the configuration has another type than a configuration's.
         """
-        return PlannedEpisodes(config=planned_config(self.description.config, _source(folder)), groups=groups)
+        config, shard = planned_config(self.description.config, _source(folder)), self.description.shard
+        known = groups if shard is None else shard.groups
+        return PlannedEpisodes(config=config, groups=known, shard=shard)
 
     def with_session(self, session: Session) -> "RunFile":
         """Return this with one more session."""
@@ -151,14 +156,14 @@ class RunFile:
 def run_changed(changes: Sequence[Change], where: Path, *, remedy: str) -> RunChangedError:
     """Build the error for a run that is started again as another one."""
     return RunChangedError(
-        f"{where}: this run was started with another configuration:\n{_listed(changes)}\n{remedy}"
+        f"{where}: this run was started with another configuration:\n{listed(changes)}\n{remedy}"
     )
 
 
 def server_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
     """Build the error for a run whose policy server holds another policy than before."""
     return RunChangedError(
-        f"{where}: this run was started with another policy at the server:\n{_listed(changes)}\n"
+        f"{where}: this run was started with another policy at the server:\n{listed(changes)}\n"
         f"Start the former policy there again to continue this run, or use another --out."
     )
 
@@ -166,7 +171,7 @@ def server_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
 def environment_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
     """Build the error for a run that is continued on another machine or with other versions."""
     return RunChangedError(
-        f"{where}: this run was started in another environment:\n{_listed(changes)}\n"
+        f"{where}: this run was started in another environment:\n{listed(changes)}\n"
         f"Use another --out, or restore the old environment. To continue all the same, add "
         f"--allow-environment-change: the change is then recorded and the report names it."
     )
@@ -232,6 +237,12 @@ def _session_fields(session: Session) -> dict[str, Any]:  # Any: JSON
     return data
 
 
+def _description(value: RunDescription) -> dict[str, Any]:  # Any: JSON
+    # Of a whole run there is no field `shard`, so that earlier versions of this program read it.
+    own = {name: item for name, item in _fields(value).items() if name != "shard"}
+    return own if value.shard is None else {**own, "shard": asdict(value.shard)}
+
+
 def _plain(value: object) -> dict[str, JsonValue]:
     """Make a dict of a mapping that json does not know as one."""
     if isinstance(value, Mapping):
@@ -239,7 +250,7 @@ def _plain(value: object) -> dict[str, JsonValue]:
     raise TypeError(f"{value!r:.80} is {type(value).__name__}, which JSON cannot hold")
 
 
-def _listed(changes: Sequence[Change]) -> str:
+def listed(changes: Sequence[Change]) -> str:
     """Return one line per change, whatever the values are."""
     lines = [one_line(str(change)) for change in changes[:MAX_LISTED]]
     shown = [line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}…" for line in lines]

@@ -8,10 +8,9 @@
 Knows nothing of tasks, policies or statistics.
 """
 
-import json
 import logging
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -171,7 +170,7 @@ class RunFolder:
             self._finished.add(record.key)
         if timing is not None:
             try:
-                self._timings.append(json.dumps({**asdict(timing), "key": timing.key._asdict()}))
+                self._timings.append(timing.to_json())
             except RunFolderError as exc:
                 logger.warning("%s: a timing was not kept (%s)", self.path, exc)
 

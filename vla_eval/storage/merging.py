@@ -1,0 +1,124 @@
+"""Put the shards of a run together as the run folder that one run would have left.
+
+Everything is checked before anything is written, and the new folder appears whole. The shards stay as they
+are. Knows nothing of tasks, policies or statistics.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.errors import MergeError
+from vla_eval.records import EpisodeKey, EpisodeRecord
+from vla_eval.storage.capture_files import rrd_file, thumbnail_file, video_file
+from vla_eval.storage.drafts import link_file, whole_folder
+from vla_eval.storage.durable import replace_file, storage_full
+from vla_eval.storage.episodes_file import shown_key
+from vla_eval.storage.folders import EPISODES_FILE, TIMINGS_FILE
+from vla_eval.storage.run_file import RunFile
+from vla_eval.storage.run_folder import StoredRun, read_run
+from vla_eval.storage.shard_parts import ShardPart, as_part, merge_descriptions, missing_shards
+from vla_eval.storage.timings import read_timings
+
+CAPTURES = (video_file, thumbnail_file, rrd_file)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergedRun:
+    """What shards come to.
+
+    Attributes:
+        run_file: the description of the whole run, and the sessions of all shards.
+        runs: the shards.
+        records: of all episodes, in the order of the plan.
+        missing: sentences about shards and episodes that are not there.
+    """
+
+    run_file: RunFile
+    runs: tuple[StoredRun, ...]
+    records: tuple[EpisodeRecord, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def n_errors(self) -> int:
+        """How many episodes ended in an error."""
+        return sum(record.outcome == "error" for record in self.records)
+
+
+def merge_runs(folders: Sequence[Path], *, allow_environment_change: bool = False) -> MergedRun:
+    """Read shards and put them together; nothing is written.
+
+    Args:
+        folders: run folders, each of another shard of one plan.
+        allow_environment_change: merge although versions or machines differ.
+
+    Raises:
+        MergeError: a folder is no shard, two are the same one, or they are of different plans or, unless
+            that is allowed, environments.
+        RunFolderError: one is no run folder, or a file in it is damaged.
+    """
+    runs = [read_run(folder) for folder in folders]
+    parts = [as_part(run.path, run.description, run.sessions) for run in runs]
+    run_file = merge_descriptions(parts, allow_environment_change=allow_environment_change)
+    rank_of = {group: rank for rank, group in enumerate(parts[0].shard.groups)}
+    records = sorted(
+        (record for run in runs for record in run.records),
+        key=lambda record: (rank_of[record.key[:3]], *record.key[3:]),
+    )
+    missing = [*missing_shards(parts)]
+    for part, run in zip(parts, runs, strict=True):
+        missing += _missing_episodes(part, {record.key for record in run.records})
+    return MergedRun(run_file=run_file, runs=tuple(runs), records=tuple(records), missing=tuple(missing))
+
+
+def write_merged(merged: MergedRun, out: Path) -> None:
+    """Write the run folder. Captures are linked, or copied where the file system cannot link.
+
+    Raises:
+        MergeError: there is something at `out`.
+        StorageFullError: it could not be written; nothing is left.
+    """
+    timings = {key: one for run in merged.runs for key, one in read_timings(run.path).items()}
+    kept = [timings[record.key].to_json() for record in merged.records if record.key in timings]
+    try:
+        with whole_folder(out, error=MergeError) as draft:
+            draft.mkdir()
+            replace_file(draft / TIMINGS_FILE, "".join(f"{line}\n" for line in kept))
+            replace_file(draft / EPISODES_FILE, "".join(f"{one.to_json()}\n" for one in merged.records))
+            merged.run_file.save(draft)
+            for run in merged.runs:
+                _link_captures(run, draft)
+    except OSError as exc:
+        raise storage_full(out, exc) from exc
+
+
+def _link_captures(run: StoredRun, target: Path) -> None:
+    for record in run.records:
+        for place in CAPTURES:
+            if place(run.path, record).is_file():
+                link_file(place(run.path, record), place(target, record))
+
+
+def _missing_episodes(part: ShardPart, there: set[EpisodeKey]) -> Iterator[str]:
+    """Say how many episodes of a shard were not run."""
+    absent = [key for key in _planned(part) if key not in there]
+    if absent:
+        yield (
+            f"{part.path} (shard {part.shard}): {len(absent)} of {len(absent) + len(there)} episodes were "
+            f"not run, such as {shown_key(absent[0])}. To resume: {part.sessions[-1].command}"
+        )
+
+
+def _planned(part: ShardPart) -> Iterator[EpisodeKey]:
+    """Return every episode of a shard, by its description."""
+    planned = RunFile(description=part.description, sessions=part.sessions).planned(part.path)
+    config, shard = planned.config, part.shard
+    if config.episodes is None or config.seed_start is None or config.runs is None:
+        raise MergeError(
+            f"{part.path}: expected episodes, seed_start and runs in the configuration of its run.json, "
+            f"found no such field. The file was changed by another program; restore it."
+        )
+    for group in shard.groups:
+        for run in range(config.runs):
+            for index in shard.indices(config.episodes):
+                yield EpisodeKey(*group, run, config.seed_start + index)

@@ -1,0 +1,140 @@
+"""Compare what shards were started with, and describe the whole that they come to.
+
+The same for the shards of runs and of recordings: it knows nothing of what their folders hold.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vla_eval.errors import MergeError, some_of
+from vla_eval.storage.continuing import without_device
+from vla_eval.storage.run_file import (
+    DEVICE,
+    Change,
+    JsonValue,
+    RunDescription,
+    RunFile,
+    Session,
+    find_changes,
+    listed,
+)
+from vla_eval.storage.shard import Shard
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardPart:
+    """A folder that holds a shard.
+
+    Attributes:
+        path: the folder.
+        description, sessions: of its `run.json`.
+        shard: which one it is.
+    """
+
+    path: Path
+    description: RunDescription
+    sessions: tuple[Session, ...]
+    shard: Shard
+
+
+def as_part(path: Path, description: RunDescription, sessions: Sequence[Session]) -> ShardPart:
+    """Return the shard that a folder holds.
+
+    Raises:
+        MergeError: it was not made with `--shard`.
+    """
+    if description.shard is None:
+        raise MergeError(
+            f"{path}: expected a shard (made with --shard I/N), found a whole run. `mikasa-vla report` puts "
+            f"whole runs into one table."
+        )
+    return ShardPart(path=path, description=description, sessions=tuple(sessions), shard=description.shard)
+
+
+def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: bool) -> RunFile:
+    """Return what one run's `run.json` would hold, with the sessions of all shards.
+
+    Raises:
+        MergeError: two are the same shard, or of different plans or, unless that is allowed, environments.
+    """
+    first, *others = parts
+    for other in others:
+        _refuse_other_plan(first, other)
+    _refuse_doubles(parts)
+    sessions: list[Session] = list(first.sessions)
+    device: dict[str, JsonValue] = {}
+    for part in parts:
+        changes = _environment_changes(first, part)
+        if changes and not allow_environment_change:
+            raise MergeError(
+                f"{part.path}: was made in another environment than {first.path}:\n{listed(changes)}\n"
+                f"Run the shard again where the others were made. To merge them all the same, add "
+                f"--allow-environment-change: the change is then recorded and the report names it."
+            )
+        if part is not first:
+            sessions += [_with_changes(session, changes) for session in part.sessions]
+        device = {**_device(part), **device}
+    environment = without_device(first.description.environment) | ({DEVICE: device} if device else {})
+    description = replace(first.description, environment=environment, shard=None)
+    return RunFile(description=description, sessions=tuple(sessions))
+
+
+def missing_shards(parts: Sequence[ShardPart]) -> Iterator[str]:
+    """Name the shards of the plan that are not among the parts."""
+    count = parts[0].shard.count
+    absent = sorted(set(range(1, count + 1)) - {part.shard.number for part in parts})
+    if absent:
+        numbers = some_of(f"{number}/{count}" for number in absent)
+        yield f"{parts[0].description.name}: no folder of shard {numbers} was named."
+
+
+def _refuse_other_plan(first: ShardPart, other: ShardPart) -> None:
+    one, two = first.description, other.description
+    changes = [
+        *find_changes(one.config, two.config, prefix="config"),
+        *find_changes(one.recipes, two.recipes, prefix="recipes"),
+        *find_changes(one.servers, two.servers, prefix="servers"),
+        *find_changes(_division(first.shard), _division(other.shard), prefix="shard"),
+    ]
+    if changes:
+        raise MergeError(
+            f"{other.path}: expected a shard of the same plan as {first.path}, found another:\n"
+            f"{listed(changes)}\nMerge the shards of one command, which differ in --shard alone."
+        )
+
+
+def _division(shard: Shard) -> dict[str, JsonValue]:
+    """Return what all shards of a plan have in common."""
+    return {"count": shard.count, "block_size": shard.block_size, "groups": shard.groups}
+
+
+def _refuse_doubles(parts: Sequence[ShardPart]) -> None:
+    path_of: dict[int, Path] = {}
+    for part in parts:
+        if part.shard.number in path_of:
+            raise MergeError(
+                f"shard {part.shard} is named twice: {path_of[part.shard.number]} and {part.path} have the "
+                f"same episodes. Name one of them."
+            )
+        path_of[part.shard.number] = part.path
+
+
+def _environment_changes(first: ShardPart, other: ShardPart) -> tuple[Change, ...]:
+    """Return how the environments differ; of the devices, what is known of both."""
+    environments = [without_device(part.description.environment) for part in (first, other)]
+    one, two = _device(first), _device(other)
+    both = [{name: device[name] for name in one if name in two} for device in (one, two)]
+    return (
+        *find_changes(*environments, prefix="environment"),
+        *find_changes(*both, prefix=f"environment.{DEVICE}"),
+    )
+
+
+def _device(part: ShardPart) -> dict[str, JsonValue]:
+    device = part.description.environment.get(DEVICE)
+    return dict(device) if isinstance(device, Mapping) else {}
+
+
+def _with_changes(session: Session, changes: Sequence[Change]) -> Session:
+    return replace(session, environment_changes=(*session.environment_changes, *changes))
