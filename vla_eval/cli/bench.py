@@ -20,7 +20,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--task", default="RememberColor3-v0", help="task id (default: %(default)s)")
     parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
-    parser.add_argument("--wrist-mesh", choices=("shipped", "simplified"), default="shipped")
+    parser.add_argument("--wrist-mesh", choices=("shipped", "whole", "simplified"), default="shipped")
     parser.add_argument(
         "--loader",
         nargs="?",

@@ -19,12 +19,13 @@ class RenderSettings:
     """How images are rendered.
 
     Attributes:
-        wrist_mesh: the mesh of the wrist camera's housing: as ManiSkill ships it, or a simpler one
-            that renders faster on a CPU and looks a little different.
+        wrist_mesh: the mesh of the wrist camera's housing: `shipped` gives the images of ManiSkill's own
+            mesh and leaves out what is hidden inside the housing; `whole` draws that, too (the same images,
+            slower); `simplified` renders a little faster on a CPU and looks a little different.
         backend: `auto`, `cpu`, `gpu`, or a device as SAPIEN names it (`cuda:1`).
     """
 
-    wrist_mesh: Literal["shipped", "simplified"] = "shipped"
+    wrist_mesh: Literal["shipped", "whole", "simplified"] = "shipped"
     backend: str = "auto"
 
 

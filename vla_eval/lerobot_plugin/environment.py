@@ -242,6 +242,7 @@ def _state_kind(name: str) -> StateKind:
 def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
     known: Mapping[str, RenderSettings] = {
         "shipped": RenderSettings(wrist_mesh="shipped", backend=backend),
+        "whole": RenderSettings(wrist_mesh="whole", backend=backend),
         "simplified": RenderSettings(wrist_mesh="simplified", backend=backend),
     }
     if wrist_mesh not in known:

@@ -59,8 +59,9 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             the CPU simulator (20 ms), never on the GPU simulator. In a reused scene PhysX keeps contact
             caches, so states differ from those of a new scene (measured: from 1e-7 to 15 rad/s after
             contact).
-        robot_uids: `panda_wristcam`, or `panda_wristcam_light` with a simplified camera mesh; or another
-            arm that the task supports (`SUPPORTED_ROBOTS`).
+        robot_uids: `panda_wristcam`; `panda_wristcam_seen`, which gives the same images faster;
+            `panda_wristcam_light` with a simplified camera mesh; or another arm that the task supports
+            (`SUPPORTED_ROBOTS`).
     """
 
     SUPPORTED_ROBOTS: tuple[str, ...] = tuple(WRIST_MESH_ROBOTS.values())
