@@ -16,7 +16,9 @@ import pytest
 from websockets.sync.client import connect
 
 from tests.page.test_report_page import COLOR, Page, episode, full_run, stored
+from tests.probe.test_probe_report import PROBE_RUNS
 from vla_eval.page.build import write_page
+from vla_eval.probe.page_sections import probe_sections
 from vla_eval.results.report import build_table
 from vla_eval.results.table_columns import lay_out
 
@@ -158,6 +160,23 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(browser: Browser, tmp
     browser.open(write_page([full_run()], tmp_path / "page"), width=390)
     assert browser.ask("document.documentElement.scrollWidth") <= 390
     assert browser.ask("getComputedStyle(document.querySelector('svg.wide')).display") == "none"
+
+
+def test_a_section_on_a_probe_fits_a_phone_in_light_and_dark(browser: Browser, tmp_path: Path) -> None:
+    sections = probe_sections(PROBE_RUNS)
+    page = write_page(PROBE_RUNS, tmp_path / "page", probes=sections)
+    colors = []
+    for scheme in ("light", "dark"):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        browser.call("Emulation.setEmulatedMedia", {"features": [feature]})
+        for width in (390, 1400):
+            browser.open(page, width=width)
+            assert browser.ask("document.documentElement.scrollWidth") <= width
+        colors.append(browser.ask("getComputedStyle(document.querySelector('#probe svg text')).fill"))
+    assert len(set(colors)) == 2
+    assert browser.ask("document.querySelectorAll('#probe td.right').length") == 1
+    assert browser.complaints == []
+    assert {url for url in browser.requests if not url.startswith("data:")} == {page.as_uri()}
 
 
 def test_thirty_thousand_episodes_are_listed_in_one_file(browser: Browser, tmp_path: Path) -> None:

@@ -47,19 +47,25 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: a RUN is no run folder, holds nothing yet, or has no such baseline.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
+    from vla_eval.probe.report_text import probe_texts
     from vla_eval.storage.run_folder import read_run
 
     runs = [read_run(path) for path in args.runs]
     if args.html is not None:
         from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
+        from vla_eval.probe.page_sections import probe_sections
 
         if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
             raise ReportError(
                 "--html writes a page, which has no --format, --preset, --columns, --wide and --paper. "
                 "Remove them."
             )
-        print(write_page(runs, args.html, baseline=args.baseline))
+        page = write_page(runs, args.html, baseline=args.baseline, probes=probe_sections(runs))
+        print(page)
         return 0
     print_table(runs, args, columns=args.columns)
+    if args.format == "markdown":
+        for text in probe_texts(runs):
+            print(f"\n{text}")
     return 0

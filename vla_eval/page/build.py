@@ -17,6 +17,7 @@ from vla_eval.errors import ReportError
 from vla_eval.page import choice_sections, machine_sections, rates
 from vla_eval.page.episode_list import episode_list
 from vla_eval.page.material import Material, gather
+from vla_eval.page.probe_section import ProbeSection
 from vla_eval.results.table_formats import render
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun
@@ -27,12 +28,15 @@ SCRIPT = "episodes.js"
 N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
-def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str:
+def build_page(
+    runs: Sequence[StoredRun], *, baseline: str | None = None, probes: Sequence[ProbeSection] = ()
+) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
     Args:
         runs: what the run folders hold. Timings and videos are read from the folders themselves.
         baseline: as for `build_table`.
+        probes: those that the run folders are of.
 
     Raises:
         ReportError: there is no episode yet.
@@ -47,6 +51,7 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
         summary=_summary(material),
         version=__version__,
         material=material,
+        probes=probes,
         verdicts=verdicts(material.table),
         episodes=episode_list(material),
         script=Markup(script),
@@ -68,19 +73,26 @@ def build_page(runs: Sequence[StoredRun], *, baseline: str | None = None) -> str
     )
 
 
-def write_page(runs: Sequence[StoredRun], folder: Path, *, baseline: str | None = None) -> Path:
+def write_page(
+    runs: Sequence[StoredRun],
+    folder: Path,
+    *,
+    baseline: str | None = None,
+    probes: Sequence[ProbeSection] = (),
+) -> Path:
     """Write the page and return its path.
 
     Args:
         runs: as for `build_page`.
         folder: created if it does not exist.
         baseline: as for `build_page`.
+        probes: as for `build_page`.
 
     Raises:
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(runs, baseline=baseline)
+    page = build_page(runs, baseline=baseline, probes=probes)
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)

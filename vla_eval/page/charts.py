@@ -123,7 +123,13 @@ def _forest(bars: Sequence[Bar], width_px: float) -> Figure:
 
 
 def curves(
-    series: Sequence[Series], *, title: str, description: str, x_title: str, x_ticks: Sequence[float]
+    series: Sequence[Series],
+    *,
+    title: str,
+    description: str,
+    x_title: str,
+    x_ticks: Sequence[float],
+    x_labels: Sequence[str] | None = None,
 ) -> Chart:
     """Draw rates in [0, 1] over a number, one line per series.
 
@@ -133,12 +139,13 @@ def curves(
         description: what it shows, for screen readers.
         x_title: what x is, with its unit.
         x_ticks: in increasing order; the first and the last are the ends of the axis.
+        x_labels: what is written at each tick, if not its number.
     """
     with own_style():
         figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
         margin = (x_ticks[-1] - x_ticks[0] or 1) * 0.03
         axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
-        axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks])
+        axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks] if x_labels is None else x_labels)
         axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
         axes.grid(visible=False, axis="x")
         for one in _dodged(series, (x_ticks[-1] - x_ticks[0]) * DODGE):

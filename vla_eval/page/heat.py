@@ -88,7 +88,8 @@ def _draw(figure: Figure, heat: HeatMap, *, left: int, whole: tuple[int, int]) -
     axes = figure.add_axes((place[0] / whole[0], place[1] / whole[1], size[0] / whole[0], size[1] / whole[1]))
     axes.patch.set_visible(False)
     axes.grid(visible=False)
-    axes.set(xlim=(0, n_columns), ylim=(n_rows, 0), xlabel=heat.column_title, ylabel=heat.row_title)
+    axes.set(xlim=(0, n_columns), ylim=(n_rows, 0), xlabel=heat.column_title)
+    axes.set_ylabel(heat.row_title, labelpad=8)
     axes.set_xticks([i + 0.5 for i in range(n_columns)], list(map(str, heat.columns)))
     axes.set_yticks([i + 0.5 for i in range(n_rows)], list(map(str, heat.rows)))
     for y, rates in enumerate(heat.rates):

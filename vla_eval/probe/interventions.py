@@ -97,6 +97,11 @@ class World:
     level: Level
     config: EvalConfig
 
+    @property
+    def label(self) -> str:
+        """What is changed and by how much: `swap 1`."""
+        return self.intervention if self.level is None else f"{self.intervention} {self.level}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:

@@ -62,14 +62,18 @@ def _of_pairs(row: ProbeRow) -> str:
 
 
 def _half_life(curve: Retention) -> str:
-    half = curve.half_life
     of = " of following it in both worlds" if curve.of == "warranted_choice" else ""
-    if half is None:
+    if curve.half_life is None:
         return f"no half-life{of}, since at the shortest delay this is not more frequent than by chance"
+    return f"half-life{of} {half_life_text(curve.half_life)}"
+
+
+def half_life_text(half: HalfLife) -> str:
+    """Return a half-life with its interval: `187 steps [160 to more than 320]`."""
     if half.steps is None and half.interval.low is None:
-        return f"half-life{of} more than {half.longest_delay} steps"
+        return f"more than {half.longest_delay} steps"
     ends = " to ".join(_steps(end, half) for end in half.interval)
-    return f"half-life{of} {_steps(half.steps, half)} steps [{ends}]"
+    return f"{_steps(half.steps, half)} steps [{ends}]"
 
 
 def _steps(steps: float | None, half: HalfLife) -> str:

@@ -23,7 +23,7 @@ from vla_eval.probe.world_records import Records, by_policy, chance_of, compared
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names
-from vla_eval.storage.run_folder import read_run
+from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
 
 
@@ -83,8 +83,14 @@ class ProbeTable:
 def read_probe(worlds: Sequence[World], out: Path) -> ProbeTable:
     """Read the run folders of all worlds and return their table."""
     runs = [read_run(out / world.config.name) for world in worlds]
-    order = dict.fromkeys(name for run in runs for name in config_names(run, "policies"))
-    return probe_table(worlds, [run.records for run in runs], order=tuple(order))
+    return probe_table(worlds, [run.records for run in runs], order=policy_order(runs))
+
+
+def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:
+    """Return the policies of some runs: as their configurations name them, then others by name."""
+    named = dict.fromkeys(name for run in runs for name in config_names(run, "policies"))
+    others = {record.policy for run in runs for record in run.records} - set(named)
+    return (*named, *sorted(others))
 
 
 def probe_table(

@@ -1,0 +1,75 @@
+"""What the page shows of a probe: tables, charts and text. Knows neither worlds nor statistics."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from vla_eval.page.charts import Chart
+from vla_eval.page.rates import Plots
+from vla_eval.page.tables import PageTable
+
+
+class PairCell(NamedTuple):
+    """The number of pairs, the opacity (0 to 1), and whether some of them follow both cues."""
+
+    n_pairs: int
+    opacity: float
+    is_right: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairMatrix:
+    """Pairs by first choice in the world as drawn (rows) and in the other one (columns)."""
+
+    title: str
+    names: tuple[str, ...]
+    rows: tuple[tuple[PairCell, ...], ...]
+
+
+class FilmFrame(NamedTuple):
+    """An image as `data:` URI, and the control step that it is of."""
+
+    step: int
+    src: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filmstrip:
+    """One episode: what it is, and frames of it."""
+
+    caption: str
+    frames: tuple[FilmFrame, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmPair:
+    """The two episodes of a pair."""
+
+    title: str
+    strips: tuple[Filmstrip, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeSection:
+    """A probe, or a grid.
+
+    Attributes:
+        title: its folder.
+        table: its rows.
+        sentences: what it found, in words.
+        notes: what a reader has to know.
+        plots: curves; None where there are none.
+        curves_table: numbers of the curves; None where there are none.
+        heat: heat maps by what they are of.
+        matrices: pairs by choice.
+        films: pairs of episodes.
+    """
+
+    title: str
+    table: PageTable
+    sentences: tuple[str, ...]
+    notes: tuple[str, ...]
+    plots: Plots | None = None
+    curves_table: PageTable | None = None
+    heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
+    matrices: tuple[PairMatrix, ...] = ()
+    films: tuple[FilmPair, ...] = ()

@@ -1,0 +1,169 @@
+"""The sections of the report page on probes and grids, from their run folders."""
+
+import math
+from collections.abc import Sequence
+
+from vla_eval.page.charts import Chart, Point, Series, curves, reference_sign, sign
+from vla_eval.page.heat import heat_chart
+from vla_eval.page.probe_section import PairCell, PairMatrix, ProbeSection
+from vla_eval.page.rates import Plots, Sign
+from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
+from vla_eval.probe import grid_text, probe_text
+from vla_eval.probe.choice_pairs import ChoicePairs
+from vla_eval.probe.films import film_pairs
+from vla_eval.probe.found import FoundGridWorld, FoundProbe, find_probes
+from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
+from vla_eval.probe.grid_heat import heat_maps
+from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
+from vla_eval.probe.retention_curves import Retention
+from vla_eval.probe.sentences import half_life_text, notes, sentences
+from vla_eval.probe.table import ProbeTable
+from vla_eval.storage.run_folder import StoredRun
+
+DARKEST = 0.65  # opacity of the most frequent cell
+CURVES: dict[str, str] = {
+    "follows": "follows the cue",
+    "warranted_choice": "follows the cue in both worlds",
+}
+
+
+def probe_sections(runs: Sequence[StoredRun]) -> list[ProbeSection]:
+    """Return a section for each probe and each grid among the run folders; videos are read from these."""
+    sections = []
+    for probe in find_probes(runs):
+        if probe.worlds:
+            sections.append(_probe_section(probe))
+        if probe.grid:
+            sections.append(_grid_section(f"{probe.folder}: grid", probe.grid))
+    return sections
+
+
+def _probe_section(probe: FoundProbe) -> ProbeSection:
+    table, pairs = found_table(probe.worlds), found_pairs(probe.worlds)
+    return ProbeSection(
+        title=str(probe.folder),
+        table=_page_table(probe_text.TITLES, probe_text.probe_cells(table), probe_text.TEXT_TITLES),
+        sentences=tuple(sentences(table)),
+        notes=(*notes(table), *probe.doubles),
+        plots=_retention_plots(table) if table.retention else None,
+        curves_table=_half_lives(table) if table.retention else None,
+        matrices=tuple(map(_matrix, pairs)),
+        films=film_pairs(probe.worlds, pairs),
+    )
+
+
+def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
+    table = found_grid(worlds)
+    return ProbeSection(
+        title=title,
+        table=_page_table(grid_text.TITLES, grid_text.grid_cells(table), grid_text.TEXT_TITLES),
+        sentences=tuple(grid_sentences(table)),
+        notes=tuple(grid_notes(table)),
+        heat=tuple(
+            (f"{task}: success once by K and {axis}", tuple(map(heat_chart, maps)))
+            for (task, axis), maps in heat_maps(table).items()
+        ),
+    )
+
+
+def _page_table(
+    titles: Sequence[str], rows: Sequence[Sequence[str]], text_titles: Sequence[str]
+) -> PageTable:
+    return PageTable(
+        columns=tuple(Column(title, "text" if title in text_titles else "number") for title in titles),
+        rows=tuple(map(tuple, rows)),
+        caption="Every row",
+    )
+
+
+def _retention_plots(table: ProbeTable) -> Plots:
+    """Draw the retention curves, one chart per task and kind of curve; delays on a logarithmic axis."""
+    names = {name: number for number, name in enumerate(dict.fromkeys(map(_name, table.retention)))}
+    charts: list[Chart] = []
+    for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
+        own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
+        charts.append(_chart(task, of, own, names))
+    legend = (
+        *(Sign(name, sign(number, is_line=False)) for name, number in names.items()),
+        Sign("chance", reference_sign("chance")),
+    )
+    return Plots(legend=legend, charts=tuple(charts))
+
+
+def _half_lives(table: ProbeTable) -> PageTable:
+    rows = [
+        [
+            f"{curve.task} · {_name(curve)}",
+            CURVES[curve.of],
+            UNKNOWN if curve.half_life is None else half_life_text(curve.half_life),
+            UNKNOWN if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
+        ]
+        for curve in table.retention
+    ]
+    return page_table(
+        rows,
+        text=("policy", "curve", "half-life"),
+        numbers=("chance",),
+        caption="Half-lives; —: at the shortest delay no better than chance",
+    )
+
+
+def _name(curve: Retention) -> str:
+    return f"{curve.policy} · K={curve.n_action_steps}"
+
+
+def _chart(task: str, of: str, own: Sequence[Retention], names: dict[str, int]) -> Chart:
+    delays = sorted({point.delay_steps for curve in own for point in curve.points})
+    series = [
+        Series(
+            name=_name(curve),
+            color=names[_name(curve)],
+            points=tuple(
+                Point(_x(point.delay_steps), point.share.rate, *point.share.interval)
+                for point in curve.points
+            ),
+        )
+        for curve in own
+    ]
+    chances = {
+        point.delay_steps: point.chance for curve in own for point in curve.points if point.chance is not None
+    }
+    if chances:
+        points = tuple(Point(_x(delay), chances[delay]) for delay in sorted(chances))
+        series.append(Series(name="chance", color=0, points=points, kind="chance"))
+    said = "; ".join(f"{_name(curve)}: {_points_in_words(curve)}" for curve in own)
+    return curves(
+        series,
+        title=f"{task}: {CURVES[of]}",
+        description=said,
+        x_title="delay, steps (logarithmic)",
+        x_ticks=[_x(delay) for delay in delays],
+        x_labels=[str(delay) for delay in delays],
+    )
+
+
+def _points_in_words(curve: Retention) -> str:
+    return ", ".join(f"{p.share.n} of {p.share.of} after {p.delay_steps}" for p in curve.points)
+
+
+def _x(delay_steps: int) -> float:
+    """Return the place of a delay on a logarithmic axis that has a place for 0."""
+    return math.log2(1 + delay_steps)
+
+
+def _matrix(pairs: ChoicePairs) -> PairMatrix:
+    most = max(pairs.counts.values())
+    indices = range(len(pairs.names))
+    return PairMatrix(
+        title=f"{pairs.world.task}, {pairs.policy} · K={pairs.n_action_steps}: as drawn (rows), "
+        f"{pairs.world.label} (columns)",
+        names=pairs.names,
+        rows=tuple(
+            tuple(
+                PairCell(n, DARKEST * n / most, pairs.is_right(row, column))
+                for column in indices
+                for n in (pairs.count(row, column),)
+            )
+            for row in indices
+        ),
+    )

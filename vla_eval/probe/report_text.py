@@ -1,0 +1,38 @@
+"""What `mikasa-vla report` prints of probes below its table: their tables, and pairs by choice."""
+
+from collections.abc import Sequence
+
+from vla_eval.probe.choice_pairs import ChoicePairs
+from vla_eval.probe.found import find_probes
+from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
+from vla_eval.probe.grid_text import render_grid
+from vla_eval.probe.probe_text import render_probe
+from vla_eval.results.cells import markdown_text
+from vla_eval.results.table_formats import markdown_table
+from vla_eval.storage.run_folder import StoredRun
+
+
+def probe_texts(runs: Sequence[StoredRun]) -> list[str]:
+    """Return Markdown for each probe and each grid among the run folders."""
+    texts = []
+    for probe in find_probes(runs):
+        if probe.worlds:
+            matrices = map(_pairs_text, found_pairs(probe.worlds))
+            table = render_probe(found_table(probe.worlds), "markdown")
+            doubles = [f"- {markdown_text(note)}" for note in probe.doubles]
+            texts.append("\n\n".join([f"**Probe {probe.folder}**", table, *doubles, *matrices]))
+        if probe.grid:
+            grid = render_grid(found_grid(probe.grid), "markdown")
+            texts.append(f"**Grid {probe.folder}**\n\n{grid}")
+    return texts
+
+
+def _pairs_text(pairs: ChoicePairs) -> str:
+    title = (
+        f"First choices of {pairs.policy} on {pairs.world.task}, K = {pairs.n_action_steps}: as drawn "
+        f"(rows), {pairs.world.label} (columns)"
+    )
+    indices = range(len(pairs.names))
+    rows = [[pairs.names[row], *(str(pairs.count(row, column)) for column in indices)] for row in indices]
+    table = markdown_table(("drawn ↓ other →", *pairs.names), rows, [False, *(True for _ in indices)])
+    return f"{title}\n\n{table}"
