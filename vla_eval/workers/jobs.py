@@ -1,4 +1,4 @@
-"""Jobs, where they come from and what comes of them. Knows neither processes nor machines."""
+"""Jobs, where they come from and how they end. Knows neither processes nor machines."""
 
 from collections.abc import Collection, Hashable
 from dataclasses import dataclass
