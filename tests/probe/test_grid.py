@@ -86,7 +86,8 @@ def test_an_inference_between_two_items_sees_none_of_them() -> None:
 
 def test_a_grid_runs_on_its_own_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["probe", "--grid", "--task", TASK, "--policy", "hold", *FAKE, "--episodes", "6"]
-    command += ["--n-action-steps", "1", "8", "--delay", "5", "--out", str(tmp_path), "--format"]
+    out = tmp_path / "grid"
+    command += ["--n-action-steps", "1", "8", "--delay", "5", "--out", str(out), "--format"]
     assert main([*command, "json"]) == 0
     found = json.loads(capsys.readouterr().out)
     cells = {(one["policy"], one["n_action_steps"]): one for one in found["cells"]}
@@ -104,7 +105,7 @@ def test_a_grid_runs_on_its_own_and_resumes(tmp_path: Path, capsys: pytest.Captu
     assert cells["oracle", 8]["success_once"] == 1.0
     assert (cells["hold", 8]["reference"], cells["oracle", 8]["reference"]) == ("cue_reader", None)
     assert cells["hold", 8]["reference_success_once"] == cells["cue_reader", 8]["success_once"]
-    assert (tmp_path / f"{TASK}_grid_delay.png").read_bytes().startswith(PNG_SIGNATURE)
+    assert (tmp_path / f"grid_{TASK}_delay.png").read_bytes().startswith(PNG_SIGNATURE)
 
     for style in ("csv", "markdown"):
         assert main([*command, style]) == 0

@@ -108,7 +108,7 @@ def test_report_prints_and_shows_what_probe_printed(
     assert main([*base, "--grid", "--n-action-steps", "1", "--delay", "5"]) == 0
     grid = capsys.readouterr().out.strip()
 
-    folders = [str(path) for path in sorted(out.iterdir()) if path.is_dir()]
+    folders = [str(path) for path in sorted(out.iterdir())]
     assert main(["report", *folders]) == 0
     text = capsys.readouterr().out
     assert printed in text

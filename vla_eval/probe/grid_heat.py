@@ -22,14 +22,20 @@ def heat_maps(table: GridTable) -> dict[Group, list[HeatMap]]:
 
 
 def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
-    """Write a PNG file per task and phase, `TASK_grid_delay.png`, and return their paths.
+    """Write a PNG file per task and phase, `OUT_TASK_delay.png`, and return their paths.
+
+    They are beside the folder and not in it, so that all it holds are run folders.
+
+    Args:
+        table: the grid.
+        folder: OUT, where its run folders are.
 
     Raises:
         ReportError: a file cannot be written.
     """
     written = []
     for (task, axis), maps in heat_maps(table).items():
-        path = folder / f"{task}_grid_{axis}.png"
+        path = folder.parent / f"{folder.resolve().name}_{task}_{axis}.png"
         try:
             path.write_bytes(heat_png(maps))
         except OSError as exc:
