@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import UNKNOWN, Column, PageTable
+from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable
 from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
 from vla_eval.tasks.item_names import item_names
 
@@ -25,7 +25,6 @@ EXPLANATIONS: dict[Cause, str] = {
     "could_not_move": f"the arm was never {MOVED_M * 100:.0f} cm from where it began",
 }
 KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
-DARKEST = 0.65  # opacity of the most frequent cell
 
 
 class Explanation(NamedTuple):
@@ -35,17 +34,9 @@ class Explanation(NamedTuple):
     rule: str
 
 
-class MatrixCell(NamedTuple):
-    """The number of episodes, the opacity (0 to 1), and whether target and choice are the same."""
-
-    n_episodes: int
-    opacity: float
-    is_right: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matrix:
-    """Episodes by target (rows) and first choice (columns)."""
+    """Episodes by target (rows) and first choice (columns); right where the two are the same."""
 
     kind: str
     names: tuple[str, ...]

@@ -10,12 +10,11 @@ from matplotlib.patches import Rectangle
 
 from vla_eval.page.charts import PX, Chart
 from vla_eval.page.svg import PALETTE, inline_svg, own_style
-from vla_eval.page.tables import UNKNOWN
+from vla_eval.page.tables import DARKEST, UNKNOWN
 
 CELL_PX = (62, 34)
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 10, 8, 44
 TITLE_PX = 24
-DARKEST = 0.65  # opacity at a rate of 1: text stays legible on it, in light and in dark
 PNG_DPI = 144
 
 

@@ -5,24 +5,19 @@ from typing import NamedTuple
 
 from vla_eval.page.charts import Chart
 from vla_eval.page.rates import Plots
-from vla_eval.page.tables import PageTable
-
-
-class PairCell(NamedTuple):
-    """The number of pairs, the opacity (0 to 1), and whether some of them follow both cues."""
-
-    n_pairs: int
-    opacity: float
-    is_right: bool
+from vla_eval.page.tables import MatrixCell, PageTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairMatrix:
-    """Pairs by first choice in the world as drawn (rows) and in the other one (columns)."""
+    """Pairs by first choice in the world as drawn (rows) and in the other one (columns).
+
+    A cell is right if some of its pairs follow both cues.
+    """
 
     title: str
     names: tuple[str, ...]
-    rows: tuple[tuple[PairCell, ...], ...]
+    rows: tuple[tuple[MatrixCell, ...], ...]
 
 
 class FilmFrame(NamedTuple):

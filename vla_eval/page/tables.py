@@ -10,6 +10,18 @@ LONGEST_WORD = 30  # characters: a cell with more is prose, and may be broken in
 ColumnKind = Literal["text", "number", "code"]
 
 
+DARKEST = 0.65
+"""Opacity of the most frequent cell of a matrix: text stays legible on it, in light and in dark."""
+
+
+class MatrixCell(NamedTuple):
+    """A count, the opacity (0 to 1), and whether the cell is outlined as right."""
+
+    n: int
+    opacity: float
+    is_right: bool
+
+
 class Column(NamedTuple):
     """A column: its title, and the style of its cells."""
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 from vla_eval.page.charts import Chart, Point, Series, curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
-from vla_eval.page.probe_section import PairCell, PairMatrix, ProbeSection
+from vla_eval.page.probe_section import PairMatrix, ProbeSection
 from vla_eval.page.rates import Plots, Sign
-from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
+from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable, page_table
 from vla_eval.probe import grid_text, probe_text
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.films import film_pairs
@@ -20,7 +20,6 @@ from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
 from vla_eval.storage.run_folder import StoredRun
 
-DARKEST = 0.65  # opacity of the most frequent cell
 CURVES: dict[str, str] = {
     "follows": "follows the cue",
     "warranted_choice": "follows the cue in both worlds",
@@ -160,7 +159,7 @@ def _matrix(pairs: ChoicePairs) -> PairMatrix:
         names=pairs.names,
         rows=tuple(
             tuple(
-                PairCell(n, DARKEST * n / most, pairs.is_right(row, column))
+                MatrixCell(n, DARKEST * n / most, pairs.is_right(row, column))
                 for column in indices
                 for n in (pairs.count(row, column),)
             )
