@@ -80,6 +80,10 @@ class TooManyErrorsError(VlaEvalError):
     """A run was stopped because episode after episode ended in an error."""
 
 
+class ClusterError(VlaEvalError):
+    """There is no cluster at an address, or no machine of it can be used."""
+
+
 class CheckpointError(VlaEvalError):
     """A checkpoint is incomplete or damaged, or its weights are not those that the policy needs."""
 

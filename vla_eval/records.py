@@ -174,14 +174,24 @@ REQUIRED_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeTiming:
-    """Wall-clock seconds of one episode; kept beside the record, never part of it."""
+    """Wall-clock seconds of one episode; kept beside the record, never part of it.
+
+    Attributes:
+        key: the episode's.
+        total_seconds, reset_seconds, step_seconds, inference_seconds: of the episode, and of its parts.
+        kind: name of the kind of machine that ran it; None: that of the run's environment.
+    """
 
     key: EpisodeKey
     total_seconds: Seconds
     reset_seconds: Seconds
     step_seconds: Seconds
     inference_seconds: Seconds
+    kind: str | None = None
 
     def to_json(self) -> str:
         """Return the timing as one line of JSON, without the line's end."""
-        return json.dumps({**asdict(self), "key": self.key._asdict()})
+        data = {**asdict(self), "key": self.key._asdict()}
+        if self.kind is None:
+            del data["kind"]  # as in files of earlier versions
+        return json.dumps(data)

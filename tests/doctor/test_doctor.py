@@ -11,6 +11,7 @@ import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.doctor import CHECKS, Finding, ProbeFailure, findings, machine, packages, run_probe
+from vla_eval.storage import provenance
 
 HEALTHY: Mapping[str, Mapping[str, Any]] = {
     "cv2_build": {"version": "4.13.0", "gui": "NONE"},
@@ -108,8 +109,8 @@ class TestVulkan:
     @pytest.fixture
     def icd(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         """The only folder of driver files; empty."""
-        monkeypatch.setattr(machine, "ICD_FOLDERS", (str(tmp_path),))
-        for variable in machine.ICD_VARIABLES:
+        monkeypatch.setattr(provenance, "ICD_FOLDERS", (str(tmp_path),))
+        for variable in provenance.ICD_VARIABLES:
             monkeypatch.delenv(variable, raising=False)
         return tmp_path
 

@@ -14,6 +14,7 @@ from vla_eval.cli.arguments import (
     add_workers,
     typed_command,
 )
+from vla_eval.cli.cluster import add_cluster, backend_of
 from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
@@ -47,6 +48,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--episodes", type=int, default=30, metavar="N", help="per task and control (30)")
     parser.add_argument("--protocol", choices=("paper", "strict", "both"), default="both", help="(both)")
     add_workers(parser, default="auto")
+    add_cluster(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
     add_shard(parser)
     add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
     configs = _configs(args)
     out, command = shard_folder(args.out, args.shard), typed_command()
-    with stop_on_signals() as stop:
+    with backend_of(args) as backend, stop_on_signals() as stop:
         n_errors = 0
         for config in configs:
             summary = evaluate_with_progress(
@@ -78,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
                 stop=stop,
                 allow_environment_change=args.allow_environment_change,
                 shard=args.shard,
+                backend=backend,
             )
             n_errors += summary.n_errors
             if summary.was_stopped:

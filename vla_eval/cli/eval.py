@@ -18,6 +18,7 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
+from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
 from vla_eval.cli.output import add_table_arguments
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.evaluation import EvalConfig
@@ -26,6 +27,7 @@ from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
 from vla_eval.policies.recipe import policy_name
 from vla_eval.storage.shard import shard_folder
+from vla_eval.workers.needed import Needed
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -76,6 +78,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
     parser.add_argument("--runs", type=int, metavar="R", help="independent runs over the same seeds (1)")
     add_workers(parser)
+    add_cluster(parser)
     parser.add_argument(
         "--serve",
         action="store_true",
@@ -131,7 +134,9 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
     from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
-    from vla_eval.evaluation.evaluate import default_run_folder
+    from vla_eval.evaluation.evaluate import RUNS_FOLDER, default_run_folder
+    from vla_eval.evaluation.inference_choice import with_inference
+    from vla_eval.evaluation.needed import needed_files
     from vla_eval.storage.run_folder import read_run
 
     if args.config is not None and is_model_table(args.config):
@@ -146,8 +151,14 @@ def run(args: argparse.Namespace) -> int:
     check_table_arguments(args)
     check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
-    out = shard_folder(args.out or default_run_folder(config), args.shard)
-    with stop_on_signals() as stop:
+
+    def needs() -> tuple[Needed, ...]:
+        captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.is_on else ()
+        return (*needed_files(config), *captured)
+
+    with backend_of(args, needs=needs) as backend, stop_on_signals() as stop:
+        config = with_inference(config, backend)
+        out = shard_folder(args.out or default_run_folder(config), args.shard)
         summary = evaluate_with_progress(
             config,
             out=out,
@@ -155,6 +166,7 @@ def run(args: argparse.Namespace) -> int:
             stop=stop,
             allow_environment_change=args.allow_environment_change,
             shard=args.shard,
+            backend=backend,
         )
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open

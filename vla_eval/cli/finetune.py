@@ -15,6 +15,7 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
+from vla_eval.cli.cluster import add_cluster
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -70,6 +71,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
     )
     add_overrides(parser, help="change any field of the recipe's `finetune` section")
+    add_cluster(parser)
     add_dry_run(parser)
     parser.add_argument(
         "--tflops",
@@ -101,6 +103,11 @@ def run(args: argparse.Namespace) -> int:
 
     from vla_eval.training.finetune import finetune
 
+    if args.cluster is not None:
+        raise RecipeError(
+            "--cluster is for a table of learned policies, whose fine-tunings run side by side. One "
+            "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
+        )
     if args.dry_run:
         from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
+from vla_eval.cli.cluster import backend_of, shared_folder
 from vla_eval.errors import FolderInUseError, RecipeError
 from vla_eval.evaluation.grid import (
     EVALUATION_FOLDER,
@@ -21,6 +22,9 @@ from vla_eval.evaluation.grid import (
     narrow,
 )
 from vla_eval.storage.shard import shard_folder
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+from vla_eval.workers.needed import Needed
 
 RUNS_FOLDER = Path("runs")
 FINETUNE_FLAGS = {
@@ -68,7 +72,9 @@ def finetune_table(args: argparse.Namespace) -> int:
     """
     _refuse(args, FINETUNE_FLAGS)
     work = _work(args, rows=args.policy)
-    _finetune(work, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
+    with backend_of(args, needs=lambda: _needs(work)) as backend:
+        device = args.device or "auto"
+        _finetune(work, backend, device=device, allow_unreplayed=args.allow_unreplayed)
     for one in finetunings(work.table, work.out):
         print(one.config.out)
     return 0
@@ -99,24 +105,31 @@ def evaluate_table(args: argparse.Namespace) -> int:
     Raises:
         VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
     """
-    from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
-    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
-    from vla_eval.storage.run_folder import read_run
+    from vla_eval.cli.output import check_baseline, check_table_arguments
 
     _refuse(args, EVAL_FLAGS)
     check_table_arguments(args)
     work = _work(args, rows=args.policies)
     check_baseline(args.baseline, [*work.table.controls, *(row.name for row in work.table.rows)])
-    if args.tiny:
-        _record_tiny(work, allow_environment_change=args.allow_environment_change)
-        _finetune(work, device="cpu")
-    _refuse_unfinished(work, args)
+    with backend_of(args, needs=lambda: _needs(work)) as backend:
+        if args.tiny:
+            _record_tiny(work, backend, allow_environment_change=args.allow_environment_change)
+            _finetune(work, backend, device="cpu")
+        _refuse_unfinished(work, args)
+        return _evaluate(work, backend, args)
+
+
+def _evaluate(work: _Work, backend: Backend, args: argparse.Namespace) -> int:
+    from vla_eval.cli.output import hint_merge, print_table, write_html
+    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
+    from vla_eval.storage.run_folder import read_run
+
     command = typed_command()
     n_errors, folders = 0, []
     with stop_on_signals() as stop, _tiny_models(work):
         for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
             folder = shard_folder(folder.parent, args.shard) / folder.name
-            config = replace(config, workers=1 if args.tiny else (args.workers or config.workers))
+            config = replace(config, workers=args.workers or (1 if args.tiny else config.workers))
             summary = evaluate_with_progress(
                 config,
                 out=folder,
@@ -124,6 +137,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
                 stop=stop,
                 allow_environment_change=args.allow_environment_change,
                 shard=args.shard,
+                backend=backend,
             )
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)
@@ -151,23 +165,46 @@ def _work(args: argparse.Namespace, *, rows: Sequence[str] | None) -> _Work:
     return _Work(tiny, out, adapters)
 
 
-def _finetune(work: _Work, *, device: str, allow_unreplayed: bool = False) -> None:
-    """Run one fine-tuning after the other; leave out those that another process has begun."""
-    from vla_eval.training.finetune import finetune
+def _needs(work: _Work) -> tuple[Needed, ...]:
+    """Return the folders that workers write into and read from."""
+    return (shared_folder(work.out), shared_folder(Path(work.table.datasets)))
 
+
+def _finetune(work: _Work, backend: Backend, *, device: str, allow_unreplayed: bool = False) -> None:
+    """Run all fine-tunings that are not finished; leave out those that another process has begun."""
     everything = finetunings(work.table, work.out)
     unfinished = _unfinished(work)
     _say(describe_effort(work.table, n_finished=len(everything) - len(unfinished)))
     _check(work.table, unfinished)
+    todo = [
+        one._replace(
+            config=replace(
+                one.config,
+                device=device,
+                allow_unreplayed=allow_unreplayed or one.config.allow_unreplayed,
+            )
+        )
+        for one in unfinished
+    ]
+    if backend is LOCAL:
+        _finetune_here(work, todo)
+    else:
+        from vla_eval.cli.table_on_cluster import finetune_on
+
+        finetune_on(backend, todo, logs=work.out / "logs", is_tiny=bool(work.adapters), say=_say)
+
+
+def _finetune_here(work: _Work, todo: Sequence[Finetuning]) -> None:
+    """Run one fine-tuning after the other in this process: each takes all GPUs of this machine."""
+    from vla_eval.training.finetune import finetune
+
     with contextlib.redirect_stdout(sys.stderr), _tiny_models(work):
-        for index, one in enumerate(unfinished):
+        for index, one in enumerate(todo):
             if _is_finished(one):
                 continue
-            _say(f"[{index + 1}/{len(unfinished)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
-            allowed = allow_unreplayed or one.config.allow_unreplayed
-            config = replace(one.config, device=device, allow_unreplayed=allowed)
+            _say(f"[{index + 1}/{len(todo)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
             try:
-                finetune(config, command=typed_command(), say=_say)
+                finetune(one.config, command=typed_command(), say=_say)
             except FolderInUseError:
                 _say("  another process is training it")
             _free_memory()
@@ -219,7 +256,7 @@ def _part(args: argparse.Namespace) -> str:
     return "".join(f" {flag} {' '.join(names)}" for flag, names in flags if names)
 
 
-def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
+def _record_tiny(work: _Work, backend: Backend, *, allow_environment_change: bool) -> None:
     from vla_eval.data.recording import record
     from vla_eval.testing.tiny_table import tiny_dataset
 
@@ -229,6 +266,7 @@ def _record_tiny(work: _Work, *, allow_environment_change: bool) -> None:
         out=Path(work.table.datasets),
         command=typed_command(),
         allow_environment_change=allow_environment_change,
+        backend=backend,
     )
 
 

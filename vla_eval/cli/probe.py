@@ -13,6 +13,7 @@ from vla_eval.cli.arguments import (
     add_shard,
     workers_argument,
 )
+from vla_eval.cli.cluster import add_cluster
 from vla_eval.cli.output import FORMATS
 from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
 from vla_eval.cli.probe_runs import run_all
@@ -58,6 +59,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("--episodes", type=int, metavar="N", help=f"per policy and world ({EPISODES})")
     parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
     parser.add_argument("--workers", type=workers_argument, metavar="W", help="processes, or 'auto'")
+    add_cluster(parser)
     _add_interventions(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/probe"), metavar="DIR", help="(runs/probe)")
     add_shard(parser)

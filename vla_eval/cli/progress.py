@@ -14,6 +14,8 @@ from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.shard import Shard
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
@@ -64,6 +66,7 @@ def evaluate_with_progress(
     stop: StopRequest,
     allow_environment_change: bool = False,
     shard: Shard | None = None,
+    backend: Backend = LOCAL,
 ) -> EvaluationSummary:
     """Run an evaluation with progress on standard error, and end early if asked to stop.
 
@@ -79,6 +82,7 @@ def evaluate_with_progress(
             allow_environment_change=allow_environment_change,
             observer=progress,
             shard=shard,
+            backend=backend,
         )
     finally:
         progress.close()

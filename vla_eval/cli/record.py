@@ -13,6 +13,7 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
+from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
@@ -46,6 +47,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task (250)")
     parser.add_argument("--seed-start", type=int, metavar="S", help="the first seed that is tried (1000)")
     add_workers(parser)
+    add_cluster(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
     add_overrides(parser, help="change any field of the recipe")
     add_allow_environment_change(parser)
@@ -61,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
     recipe = _recipe(args)
     command = typed_command()
     out = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
-    with stop_on_signals() as stop:
+    needs = (shared_folder(out),)
+    with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop)
         try:
             summary = record(
@@ -70,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
                 command=command,
                 allow_environment_change=args.allow_environment_change,
                 observer=progress,
+                backend=backend,
             )
         finally:
             progress.close()

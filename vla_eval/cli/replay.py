@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import add_verb, add_workers
+from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
 from vla_eval.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
     add_workers(parser, default="auto")
+    add_cluster(parser)
     parser.add_argument(
         "--rebuild",
         type=Path,
@@ -51,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.cli.recording_progress import RecordingProgress
     from vla_eval.data.replay import find_datasets, replay
 
-    code = 0
-    with stop_on_signals() as stop:
+    code, needs = 0, (shared_folder(args.dataset),)
+    with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop)
         try:
             for dataset in find_datasets(args.dataset):
@@ -64,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
                         episodes=args.episodes,
                         pixels=args.pixels,
                         workers=args.workers,
+                        backend=backend,
                     )
                 if report is None:
                     return stop.exit_code
@@ -96,10 +99,17 @@ def _rebuild(args: argparse.Namespace) -> int:
         raise RecipeError(
             "--rebuild makes the whole dataset again: it does not go with --episodes or --pixels."
         )
-    with stop_on_signals() as stop:
+    needs = (shared_folder(args.rebuild),)
+    with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop)
         try:
-            rebuilt = rebuild(args.dataset, out=args.rebuild, workers=args.workers, observer=progress)
+            rebuilt = rebuild(
+                args.dataset,
+                out=args.rebuild,
+                workers=args.workers,
+                observer=progress,
+                backend=backend,
+            )
         finally:
             progress.close()
     if rebuilt is None:

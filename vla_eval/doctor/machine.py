@@ -1,24 +1,21 @@
 """Checks of drivers, devices and disk, and of all together: one episode."""
 
-import os
 import re
 import shutil
 from ctypes.util import find_library
 from pathlib import Path
 
 from vla_eval.doctor.findings import SET_UP, Finding, Probe, ProbeFailure
-from vla_eval.storage.provenance import mesa_version, nvidia_driver_version
+from vla_eval.storage.provenance import mesa_version, nvidia_driver_version, vulkan_drivers
 
 MINIMAL_MESA = "24.3"  # older ones lack features that SAPIEN asks for: ErrorFeatureNotPresent
-ICD_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
-ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 LITTLE_DISK_GB, NO_DISK_GB = 5.0, 0.5  # a run with videos; a run without
 
 
 def check_vulkan(_: Probe) -> Finding:
     """Whether there is a Vulkan driver that SAPIEN can render with."""
     mesa, nvidia = mesa_version(), nvidia_driver_version()
-    drivers = _icd_names()
+    drivers = vulkan_drivers()
     loader = find_library("vulkan") or "loader: SAPIEN's own"
     found = f"{loader}; drivers: {', '.join(drivers) or 'none'}; Mesa: {mesa or '—'}; NVIDIA: {nvidia or '—'}"
     if nvidia and any("nvidia" in name for name in drivers):
@@ -107,9 +104,3 @@ def is_older(version: str, minimum: str) -> bool:
         return [int(part) for part in re.findall(r"\d+", re.split(r"[-~+]", text)[0])]
 
     return numbers(version.split(":")[-1]) < numbers(minimum)
-
-
-def _icd_names() -> list[str]:
-    named = [path for key in ICD_VARIABLES for path in os.environ.get(key, "").split(":") if path]
-    found = [path for folder in ICD_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
-    return [Path(path).stem for path in (named or found) if Path(path).is_file()]

@@ -6,17 +6,19 @@ means, the same call resumes where it stopped.
 """
 
 import functools
+import logging
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from types import TracebackType
+from typing import Literal, Protocol, Self
 
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
 from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
-from vla_eval.evaluation.phases import phases, with_servers
+from vla_eval.evaluation.phases import ReadyPhase, phases, with_servers
 from vla_eval.evaluation.plan import (
     EpisodeJob,
     Plan,
@@ -30,11 +32,11 @@ from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
-from vla_eval.storage.run_folder import RunDescription, RunFolder
+from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
 from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.backend import Backend, Pool
-from vla_eval.workers.jobs import Answered
+from vla_eval.workers.jobs import Answered, MachineKind
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerMain
@@ -43,7 +45,10 @@ from vla_eval.workers.start import simulator_modules
 RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
 WORKER_MODULE = "vla_eval.evaluation.worker"
+MAX_SERVER_STARTS = 3  # of one policy, so that one that always dies ends in errors
 EpisodePool = Pool[EpisodeBatch, Finished]
+
+logger = logging.getLogger(__name__)
 
 
 class EvaluationObserver(Protocol):
@@ -191,20 +196,24 @@ def _run_phases(
         if not JobQueue(phase.jobs, finished=finished).n_episodes:
             continue
         stops = bookkeeper.observer.on_tick
-        with with_servers(phase, config, plan, backend=backend, logs=logs, stops=stops) as jobs:
-            if jobs is None:
+        for n_starts in range(1, MAX_SERVER_STARTS + 1):
+            with with_servers(phase, config, plan, backend=backend, logs=logs, stops=stops) as ready:
+                if ready is None:
+                    return True
+                bookkeeper.queue = JobQueue(ready.jobs, finished={*finished, *bookkeeper.keys})
+                pool: EpisodePool = backend.pool(
+                    _worker_main(bookkeeper),
+                    answers=(Finished,),
+                    size=worker_count(config, plan, n_jobs=bookkeeper.queue.n_batches, backend=backend),
+                    timeouts=config.timeouts,
+                    logs=logs,
+                    preload=_modules(config, plan),
+                )
+                ending = _run(ready, bookkeeper, pool, is_last_start=n_starts == MAX_SERVER_STARTS)
+            if ending == "stopped":
                 return True
-            queue = bookkeeper.queue = JobQueue(jobs, finished=finished)
-            pool: EpisodePool = backend.pool(
-                _worker_main(bookkeeper),
-                answers=(Finished,),
-                size=worker_count(config, plan, n_jobs=queue.n_batches, backend=backend),
-                timeouts=config.timeouts,
-                logs=logs,
-                preload=_modules(config, plan),
-            )
-            if _run(queue, bookkeeper, pool):
-                return True
+            if ending == "finished":
+                break
     return False
 
 
@@ -218,17 +227,25 @@ def _worker_main(bookkeeper: "_Bookkeeper") -> WorkerMain:
     return functools.partial(worker_main, capture=capture)
 
 
-def _run(queue: JobQueue, bookkeeper: "_Bookkeeper", pool: EpisodePool) -> bool:
-    """Run the queue's episodes; return whether the observer stopped it."""
-    with pool as running:
-        for event in running.run(queue):
+def _run(
+    phase: ReadyPhase, bookkeeper: "_Bookkeeper", pool: EpisodePool, *, is_last_start: bool
+) -> Literal["finished", "stopped", "server lost"]:
+    """Run the queue's episodes until they are finished, the observer stops it, or a server has died."""
+    with bookkeeper, pool as running:
+        for event in running.run(bookkeeper.queue):
             if isinstance(event, Answered):
+                failed = event.answer if isinstance(event.answer, Failed) else None
+                if failed and not is_last_start and phase.lost_its_server(failed.error):
+                    logger.warning("a policy server has died; it is started again: %s", failed.error.message)
+                    return "server lost"
                 bookkeeper.take(event)
             elif isinstance(event, DeviceFound):
                 bookkeeper.folder.note_device(event.device)
-            elif bookkeeper.observer.on_tick():
-                return True
-    return False
+            else:
+                bookkeeper.store()
+                if bookkeeper.observer.on_tick():
+                    return "stopped"
+    return "finished"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -244,6 +261,18 @@ class _Bookkeeper:
     n_errors: int = 0
     n_consecutive_errors: int = 0
     proven: set[SetupKey] = field(default_factory=set)  # groups with an episode that ran to its end
+    keys: set[EpisodeKey] = field(default_factory=set)  # of the episodes that were stored in this call
+    kinds: set[str] = field(default_factory=set)  # of machines that are unlike this one
+    unstored: list[StoredEpisode] = field(default_factory=list)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Store what has come, whatever ended the run."""
+        self.store()
 
     def take(self, answered: Answered[EpisodeBatch, Finished]) -> None:
         """Store the results, or the error in their place."""
@@ -259,17 +288,33 @@ class _Bookkeeper:
             return
         self.proven.add(batch.setup_key)
         self.n_consecutive_errors = 0
+        self._note_kind(answered.kind)
         for record, timing in zip(answer.records, answer.timings, strict=True):
-            self.folder.append(record, timing)
-            self.n_results += 1
+            if answered.kind is not None:
+                timing = replace(timing, kind=answered.kind.name)
+            self.unstored.append(StoredEpisode(record, timing))
+
+    def store(self) -> None:
+        """Make all that has come since the last tick durable at once: a disk waits once for all of them."""
+        stored, self.unstored = self.unstored, []
+        if not stored:
+            return
+        self.folder.append_all(stored)
+        for record, _ in stored:
+            self.keys.add(record.key)
+            self.n_results += record.error is None
+            self.n_errors += record.error is not None
             self.observer.on_record(record)
+
+    def _note_kind(self, kind: MachineKind | None) -> None:
+        if kind is not None and kind.name not in self.kinds:
+            self.folder.note_machine(kind.name, kind.facts)
+            self.kinds.add(kind.name)
 
     def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:
         record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)
-        self.folder.append(record)
-        self.n_errors += 1
+        self.unstored.append(StoredEpisode(record, None))
         self.n_consecutive_errors += 1
-        self.observer.on_record(record)
         if self.n_consecutive_errors >= self.config.max_consecutive_errors:
             raise TooManyErrorsError(
                 f"{self.n_consecutive_errors} episodes in a row ended in an error (max_consecutive_errors). "

@@ -11,13 +11,18 @@ from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
-from vla_eval.errors import RunChangedError
+from vla_eval.errors import RemoteConnectionError, RemoteReplyError, RemoteTimeoutError, RunChangedError
 from vla_eval.evaluation.plan import EpisodeJob, Plan
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.records import EpisodeError
 from vla_eval.serving.host import HostOptions
 from vla_eval.serving.shared import KEY_VARIABLE, SharedServers
 from vla_eval.workers.backend import Backend
+
+CONNECTION_ERRORS = frozenset(
+    error.__name__ for error in (RemoteConnectionError, RemoteReplyError, RemoteTimeoutError)
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +49,23 @@ def phases(plan: Plan) -> Iterator[Phase]:
             yield Phase(jobs=jobs, policy=policy)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadyPhase:
+    """A phase that can be run.
+
+    Attributes:
+        jobs: its episodes as workers get them.
+        servers: those that its episodes need; None: it needs none.
+    """
+
+    jobs: Sequence[EpisodeJob]
+    servers: SharedServers | None
+
+    def lost_its_server(self, error: EpisodeError) -> bool:
+        """Whether an episode's error comes of a server that is there no longer."""
+        return self.servers is not None and error.kind in CONNECTION_ERRORS and self.servers.one_has_ended()
+
+
 @contextlib.contextmanager
 def with_servers(
     phase: Phase,
@@ -53,8 +75,8 @@ def with_servers(
     backend: Backend,
     logs: Path,
     stops: Callable[[], bool],
-) -> Iterator[Sequence[EpisodeJob] | None]:
-    """Give the episodes of a phase as workers get them; of a shared policy, while its servers are there.
+) -> Iterator[ReadyPhase | None]:
+    """Give a phase as workers get it; of a shared policy, while its servers are there.
 
     Args:
         phase: the episodes.
@@ -69,7 +91,7 @@ def with_servers(
         RunChangedError: the policy is not what it was when the run was planned.
     """
     if phase.policy is None:
-        yield phase.jobs
+        yield ReadyPhase(jobs=phase.jobs, servers=None)
         return
     options = HostOptions(policy=plan.shared[phase.policy], max_batch=config.inference_max_batch)
     adapters = [job.group.adapter for job in phase.jobs[:1]]
@@ -85,7 +107,7 @@ def with_servers(
             yield None
             return
         _check_same(phase.policy, plan, servers)
-        yield [_remote(job, servers, config) for job in phase.jobs]
+        yield ReadyPhase(jobs=[_remote(job, servers, config) for job in phase.jobs], servers=servers)
 
 
 def _check_same(policy: str, plan: Plan, servers: SharedServers) -> None:

@@ -29,6 +29,7 @@ from vla_eval.workers.start import VISIBLE_GPUS
 KEY_VARIABLE = "MIKASA_VLA_SHARED_KEY"
 """Environment variable with the key of an evaluation's servers, for its workers."""
 POLL_SECONDS = 0.05
+NOTICE_SECONDS = 1.0  # until the end of a server is seen, after its connections have ended
 
 logger = logging.getLogger(__name__)
 
@@ -99,6 +100,15 @@ class SharedServers:
     def was_stopped(self) -> bool:
         """Whether it was given up before all servers were ready."""
         return len(self._ready) < len(self._services)
+
+    def one_has_ended(self) -> bool:
+        """Whether a server is there no longer; asked after an error of a connection."""
+        deadline = time.monotonic() + NOTICE_SECONDS
+        while not any(service.has_ended() for service in self._services):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(POLL_SECONDS)
+        return True
 
     def __enter__(self) -> Self:
         """Start all servers and wait for them; workers that start now know the key.

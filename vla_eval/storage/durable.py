@@ -9,6 +9,7 @@ import errno
 import fcntl
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from vla_eval.errors import FolderInUseError, RunFolderError, StorageFullError
@@ -74,13 +75,19 @@ class LineFile:
             StorageFullError: the line could not be written; the file is as it was before.
             RunFolderError: an earlier failure left the file in a state that must be repaired first.
         """
+        self.append_all([line])
+
+    def append_all(self, lines: Sequence[str]) -> None:
+        """Append several lines at once: all of them or, if that fails, none. See `append`."""
+        if not lines:
+            return
         if self._is_broken:
             raise RunFolderError(
                 f"{self._path}: an earlier line could neither be written nor taken back. Run the same "
                 f"command again: it repairs the end of the file."
             )
         # A lone surrogate (a file name in a traceback, say) has no UTF-8; `\udc80` is the same in JSON.
-        data = f"{line}\n".encode("utf-8", errors="backslashreplace")
+        data = "".join(f"{line}\n" for line in lines).encode("utf-8", errors="backslashreplace")
         size_before = os.fstat(self._fd).st_size
         try:
             # One write, so that a killed process leaves at most one incomplete line, and at the end.

@@ -24,6 +24,8 @@ HASH_DIGITS = 12
 NVIDIA_VERSION_FILE = Path("/proc/driver/nvidia/version")
 CPUINFO_FILE = Path("/proc/cpuinfo")
 TOOL_TIMEOUT_SECONDS = 30.0
+ICD_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 
 
 def collect_environment() -> dict[str, JsonValue]:
@@ -95,6 +97,13 @@ def mesa_version() -> str | None:
     # One line per architecture; "config-files" is what is left of a removed package.
     lines = (_output(query) or b"").decode().splitlines()
     return next((line.split()[1] for line in lines if line.startswith("installed ")), None)
+
+
+def vulkan_drivers() -> tuple[str, ...]:
+    """Return the names of the Vulkan drivers that are registered, such as `lvp_icd.x86_64`."""
+    named = [path for key in ICD_VARIABLES for path in os.environ.get(key, "").split(":") if path]
+    found = [path for folder in ICD_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
+    return tuple(Path(path).stem for path in (named or found) if Path(path).is_file())
 
 
 def _digest_changes(root: Path, diff: bytes, added: bytes) -> str | None:

@@ -145,12 +145,14 @@ class RunFile:
     def with_device(self, device: Mapping[str, JsonValue], changes: Sequence[Change]) -> "RunFile":
         """Return this with more known of the device, and with changes noted in the current session."""
         environment = {**self.description.environment, DEVICE: device}
+        description = replace(self.description, environment=environment)
+        return replace(self, description=description).with_changes(changes)
+
+    def with_changes(self, changes: Sequence[Change]) -> "RunFile":
+        """Return this with changes noted in the current session."""
         *earlier, current = self.sessions
         noted = (*current.environment_changes, *(c for c in changes if c not in current.environment_changes))
-        return RunFile(
-            description=replace(self.description, environment=environment),
-            sessions=(*earlier, replace(current, environment_changes=noted)),
-        )
+        return replace(self, sessions=(*earlier, replace(current, environment_changes=noted)))
 
 
 def run_changed(changes: Sequence[Change], where: Path, *, remedy: str) -> RunChangedError:

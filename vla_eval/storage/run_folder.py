@@ -9,11 +9,11 @@ Knows nothing of tasks, policies or statistics.
 """
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
@@ -43,6 +43,13 @@ __all__ = ["JsonValue", "RunDescription", "RunFolder", "Session", "StoredRun", "
 logger = logging.getLogger(__name__)
 
 _OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", EPISODES_FILE, TIMINGS_FILE, LOCK_FILE)
+
+
+class StoredEpisode(NamedTuple):
+    """A record, and how long the episode took, where that is known."""
+
+    record: EpisodeRecord
+    timing: EpisodeTiming | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,9 +157,30 @@ class RunFolder:
                 other, or the folder is closed.
             StorageFullError: it could not be stored; the folder is as it was before.
         """
+        self.append_all([StoredEpisode(record, timing)])
+
+    def append_all(self, episodes: Sequence[StoredEpisode]) -> None:
+        """Store several episodes at once; all are durable when this returns. See `append`.
+
+        Raises:
+            RunFolderError: as for one; the episodes before it are stored.
+            StorageFullError: they could not be stored; the folder is as it was before.
+        """
+        sound: list[StoredEpisode] = []
+        keys: set[EpisodeKey] = set()
+        try:
+            for episode in episodes:
+                self._check(episode.record, keys)
+                sound.append(episode)
+                keys.add(episode.record.key)
+        finally:
+            self._write(sound)
+
+    def _check(self, record: EpisodeRecord, others: Collection[EpisodeKey]) -> None:
+        """Raise `RunFolderError` if an episode cannot be stored after the others."""
         if self._episodes is None:
             raise RunFolderError(f"{self.path}: the run folder is closed. Open it again before appending.")
-        if record.outcome != "error" and record.key in self._finished:
+        if record.outcome != "error" and (record.key in self._finished or record.key in others):
             raise RunFolderError(
                 f"{self.path}: {shown_key(record.key)} has a result already; a second one would be counted "
                 f"twice. Skip the keys in finished_keys()."
@@ -164,15 +192,38 @@ class RunFolder:
                 f"{objection}. Nothing was stored."
             )
         record.check(where=f"{self.path}: {shown_key(record.key)}")  # or nobody could read the folder again
+
+    def _write(self, episodes: Sequence[StoredEpisode]) -> None:
+        if not episodes or self._episodes is None:
+            return
         self._has_lines = True  # also if the line could not be written as a whole
-        self._episodes.append(record.to_json())
-        if record.outcome != "error":
-            self._finished.add(record.key)
-        if timing is not None:
-            try:
-                self._timings.append(timing.to_json())
-            except RunFolderError as exc:
-                logger.warning("%s: a timing was not kept (%s)", self.path, exc)
+        self._episodes.append_all([record.to_json() for record, _ in episodes])
+        self._finished.update(record.key for record, _ in episodes if record.outcome != "error")
+        timings = [timing.to_json() for _, timing in episodes if timing is not None]
+        try:
+            self._timings.append_all(timings)
+        except RunFolderError as exc:
+            logger.warning("%s: %d timings were not kept (%s)", self.path, len(timings), exc)
+
+    def note_machine(self, kind: str, facts: Mapping[str, JsonValue]) -> None:
+        """Record that episodes run on a machine of another kind; their timings name it.
+
+        Args:
+            kind: its name.
+            facts: those of the environment's facts in which it may differ.
+
+        Raises:
+            RunChangedError: it differs, and changes are not allowed.
+            StorageFullError: it could not be recorded.
+        """
+        environment = self._run_file.description.environment
+        own = {name: environment.get(name) for name in facts}
+        changes = find_changes(own, facts, prefix=f"environment.machine {kind}")
+        check_allowed(changes, shown=self.path, allowed=self._allow_environment_change)
+        updated = self._run_file.with_changes(changes)
+        if updated != self._run_file:
+            updated.save(self.path)
+            self._run_file = updated
 
     def note_device(self, device: Mapping[str, JsonValue]) -> None:
         """Record facts about the device; what is known already must not have changed.

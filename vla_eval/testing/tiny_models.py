@@ -15,6 +15,7 @@ from unittest.mock import patch
 from vla_eval.evaluation.worker import worker_main
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.training.worker import finetune_main
 from vla_eval.workers.inside import SharedStage
 
 Family = Literal["pi0", "pi05", "pi0_fast"]
@@ -178,3 +179,9 @@ def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> 
     """Run a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
     with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
         worker_main(connection, shared, log)
+
+
+def tiny_finetune_main(connection: Connection, shared: SharedStage, log: Path) -> None:
+    """Run a worker that fine-tunes, in which π0 is tiny; see `finetune_main`."""
+    with tiny_paligemma("pi0"):
+        finetune_main(connection, shared, log)

@@ -98,6 +98,7 @@ class Backend(Protocol):
         timeouts: TimeoutConfig,
         logs: Path,
         preload: Sequence[str] = (),
+        takes_gpu: bool = False,
     ) -> Pool[J, A]:
         """Return workers.
 
@@ -108,6 +109,7 @@ class Backend(Protocol):
             timeouts: how long a worker may be busy with one thing.
             logs: folder for what workers of this machine write to standard output and error.
             preload: modules that the workers need and that take long to import.
+            takes_gpu: a worker takes a whole GPU, where there are GPUs.
         """
 
     def services(self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()) -> Sequence[Service]:

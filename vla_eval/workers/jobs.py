@@ -1,9 +1,10 @@
 """Jobs, where they come from and how they end. Knows neither processes nor machines."""
 
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from vla_eval.storage.run_file import JsonValue
 from vla_eval.workers.messages import DeviceFound, Failed
 
 
@@ -26,11 +27,26 @@ class JobSource[J: Job](Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MachineKind:
+    """What kind of machine a worker ran on: its name, and what bits may depend on."""
+
+    name: str
+    facts: Mapping[str, JsonValue]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Answered[J: Job, A]:
-    """The result of one job."""
+    """The result of one job.
+
+    Attributes:
+        job: the job.
+        answer: what the worker answered, or why it did not.
+        kind: the worker's machine; None: of the same kind as the one that plans.
+    """
 
     job: J
     answer: A | Failed
+    kind: MachineKind | None = None
 
 
 type Event[J: Job, A] = Answered[J, A] | DeviceFound | None

@@ -47,8 +47,10 @@ class LocalBackend:
         timeouts: TimeoutConfig,
         logs: Path,
         preload: Sequence[str] = (),
+        takes_gpu: bool = False,
     ) -> WorkerPool[J, A]:
-        """Return worker processes."""
+        """Return worker processes; those that take a GPU each share all of them, so there is one."""
+        size = 1 if takes_gpu else size
         return WorkerPool(main, answers=answers, size=size, timeouts=timeouts, logs=logs, preload=preload)
 
     def services(

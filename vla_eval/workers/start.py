@@ -24,6 +24,8 @@ from vla_eval.workers.server import IMPORTS_VARIABLE
 
 SERVER_MODULE = "vla_eval.workers.server"
 
+NEAR_VARIABLE = "MIKASA_VLA_NEAR"
+"""Environment variable of a cluster's workers: the address of their machine; servers there are preferred."""
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 _GPU_DEVICE = re.compile(r"nvidia\d+")
 

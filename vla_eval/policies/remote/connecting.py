@@ -3,11 +3,13 @@
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
+from urllib.parse import urlsplit
 
 from vla_eval.policies.remote.settings import RemoteSettings
 from vla_eval.policies.remote.vla_eval_dialect import VlaEvalClient
 from vla_eval.wire.client import OpenpiClient, PolicyClient
 from vla_eval.wire.connection import Connection
+from vla_eval.workers.start import NEAR_VARIABLE
 
 
 class Connected(NamedTuple):
@@ -28,6 +30,8 @@ class Connected(NamedTuple):
 def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_seconds: float) -> Connected:
     """Connect to the server with the fewest sessions; of several with as few, the process number decides.
 
+    A worker of a cluster takes one of its own machine, if there is one.
+
     Args:
         urls: the servers; all are of the same policy, so that no result depends on the choice.
         settings: timeouts, the API key, the words.
@@ -36,7 +40,8 @@ def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_sec
     Raises:
         RemotePolicyError: one of them is no policy server, or is not there.
     """
-    connected = connect_all(urls, settings, connect_seconds=connect_seconds)
+    near = [url for url in urls if urlsplit(url).hostname == os.environ.get(NEAR_VARIABLE)]
+    connected = connect_all(near or urls, settings, connect_seconds=connect_seconds)
     n_sessions = [one.client.metadata.n_sessions or 0 for one in connected]
     free = [one for one, n in zip(connected, n_sessions, strict=True) if n == min(n_sessions)]
     chosen = free[os.getpid() % len(free)]

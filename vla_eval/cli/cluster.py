@@ -1,0 +1,61 @@
+"""The flag `--cluster`: where workers, servers and fine-tunings run."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+from vla_eval.workers.needed import Needed
+
+
+def add_cluster(parser: argparse.ArgumentParser) -> None:
+    """Declare `--cluster`."""
+    parser.add_argument(
+        "--cluster",
+        metavar="WHERE",
+        help="run on a Ray cluster: auto, local or ray://HOST:PORT (docs/cluster.md)",
+    )
+
+
+@contextlib.contextmanager
+def backend_of(
+    args: argparse.Namespace, *, needs: Callable[[], tuple[Needed, ...]] = tuple
+) -> Iterator[Backend]:
+    """Give what `--cluster` names; without it, this machine.
+
+    Args:
+        args: of the command line.
+        needs: returns the files that each machine of a cluster must have; called if there is a cluster.
+
+    Raises:
+        RecipeError: the flag's value is no cluster.
+        MissingDependencyError, ClusterError: see `cluster`.
+    """
+    if args.cluster is None:
+        yield LOCAL
+        return
+    # Here and not above: `mikasa-vla --help` need not wait for it.
+    from vla_eval.workers.cluster.backend import cluster
+    from vla_eval.workers.cluster.connect import check_address
+
+    address = check_address(args.cluster)
+    allowed: bool = getattr(args, "allow_environment_change", False)
+    with cluster(address, say=_say, allow_other_kind=allowed, needs=needs()) as backend:
+        yield backend
+
+
+def shared_folder(path: Path) -> Needed:
+    """Return a folder that workers write into or read from, or the one that it will be made in."""
+    folder = path.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    return Needed(path=str(folder))
+
+
+def _say(line: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(line, file=sys.stderr)

@@ -1,0 +1,127 @@
+"""The inside of a cluster's actor: one worker process with its watchdog, or one policy server.
+
+An actor has a pool of one process: its time limits, its guard and its messages are those of the process pool
+of one machine, and the process has the same environment. If the actor is killed, the guard ends the process
+and all that it has started.
+"""
+
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.workers.job_list import JobList
+from vla_eval.workers.jobs import Answered, Job
+from vla_eval.workers.local import LocalService
+from vla_eval.workers.messages import DeviceFound, Failed
+from vla_eval.workers.pool import WorkerPool
+from vla_eval.workers.process import CLOSE_SECONDS, WorkerMain
+from vla_eval.workers.start import NEAR_VARIABLE, worker_context
+
+OWN_VARIABLES = "MIKASA_VLA_"
+"""How the environment variables begin that travel with a job."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """What an actor takes over from the driver.
+
+    Attributes:
+        folder: the driver's working directory, which relative paths in jobs begin at.
+        variables: environment variables.
+        path: where it imports from, for a policy's own module.
+        logs: the driver's folder of logs; used where the storage is shared.
+    """
+
+    folder: str
+    variables: Mapping[str, str]
+    path: tuple[str, ...]
+    logs: str
+
+    def enter(self, address: str) -> Path:
+        """Take it over on the machine with this address; return the folder of logs."""
+        os.environ.update({**self.variables, NEAR_VARIABLE: address})
+        if Path(self.folder).is_dir():
+            os.chdir(self.folder)
+        sys.path += [folder for folder in self.path if folder not in sys.path]
+        # Ray's own entry point: each child would import it again, and Ray with it.
+        vars(sys.modules["__main__"]).pop("__file__", None)
+        shared = Path(self.logs)
+        return shared if shared.is_dir() else Path(tempfile.mkdtemp(prefix="mikasa-vla-logs-"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerSpec:
+    """What a worker is made of; see `WorkerPool`."""
+
+    main: WorkerMain
+    answers: tuple[type, ...]
+    timeouts: TimeoutConfig
+    preload: tuple[str, ...]
+    place: Place
+
+
+class WorkerActor[J: Job, A]:
+    """A pool of one process; lives as long as its process's jobs last."""
+
+    def __init__(self, spec: WorkerSpec, index: int, address: str) -> None:
+        """Take over the driver's place; no process starts yet."""
+        self._pool: WorkerPool[J, A] = WorkerPool(
+            spec.main,
+            answers=spec.answers,
+            size=1,
+            timeouts=spec.timeouts,
+            logs=spec.place.enter(address),
+            preload=spec.preload,
+            first_index=index,
+        )
+
+    def ready(self) -> None:
+        """Return once the actor is there."""
+
+    def do(self, jobs: Sequence[J]) -> list[A | Failed | DeviceFound]:
+        """Do jobs of one setup key; return their answers, in order, and between them what was found."""
+        events = [event for event in self._pool.run(JobList(jobs)) if event is not None]
+        return [event.answer if isinstance(event, Answered) else event for event in events]
+
+    def close(self) -> None:
+        """Close the simulator and end the process."""
+        self._pool.__exit__(None, None, None)
+
+
+class ServiceActor:
+    """A policy server's process; see `Service`."""
+
+    def __init__(
+        self, main: WorkerMain, preload: tuple[str, ...], place: Place, index: int, address: str
+    ) -> None:
+        """Take over the driver's place; the process starts with its job."""
+        log = place.enter(address) / f"server-{index}.log"
+        self._service = LocalService(main, worker_context(preload=preload), index=index, log=log)
+
+    def give(self, job: object) -> None:
+        """Start the process."""
+        self._service.give(job)
+
+    def read(self) -> list[object]:
+        """Return what it has sent; see `Service.read`."""
+        if self._service.start_error is not None:
+            raise self._service.start_error
+        return self._service.read()
+
+    def wait(self, seconds: float) -> int | None:
+        """Wait for its end; return its exit code if there is one."""
+        return self._service.wait(seconds)
+
+    def close(self) -> None:
+        """Have it end by itself, then kill it."""
+        self._service.ask_to_close()
+        self._service.wait(CLOSE_SECONDS)
+        self._service.end()
+
+    def tail(self) -> str | None:
+        """Return the end of what it has written."""
+        return self._service.tail()

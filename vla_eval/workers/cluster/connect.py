@@ -1,0 +1,104 @@
+"""Connect to a Ray cluster, or start one on this machine. The only file that imports Ray.
+
+Ray is an engine here: its object store, dashboard and retries are not used.
+"""
+
+import contextlib
+import importlib
+import os
+import re
+from collections.abc import Iterator
+from typing import Any  # Ray is optional: not looked at by mypy
+
+from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
+from vla_eval.workers.start import available_cores, visible_gpus
+
+OBJECT_STORE_BYTES = 100 << 20  # jobs and answers have a few kilobytes, and do not go through it
+ADDRESS = re.compile(r"(ray://)?[^\s/:]+:\d+")
+LOCAL_VARIABLES = {
+    # Ray's own switch for "this cluster stays on this machine": its ports are bound to the loopback address.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    # Each would take 100 MB, and only the workers that are asked for have something to do.
+    "RAY_enable_worker_prestart": "0",
+    "RAY_prestart_worker_first_driver": "0",
+}
+
+
+def check_address(text: str) -> str:
+    """Return the value of `--cluster`.
+
+    Raises:
+        RecipeError: it is none of `auto`, `local`, `ray://HOST:PORT` and `HOST:PORT`.
+    """
+    if text in ("auto", "local") or ADDRESS.fullmatch(text):
+        return text
+    raise RecipeError(
+        f"--cluster {text:.80}: expected auto (the cluster that this machine belongs to), local (start one "
+        f"on this machine), ray://HOST:PORT or HOST:PORT."
+    )
+
+
+@contextlib.contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """Give the module `ray`, connected to a cluster; disconnect in the end.
+
+    Args:
+        address: what `check_address` returns.
+
+    Raises:
+        MissingDependencyError: Ray, or the part of it that `ray://` needs, is not installed.
+        ClusterError: there is no cluster at the address.
+    """
+    if address == "local":
+        os.environ.update({name: os.environ.get(name, value) for name, value in LOCAL_VARIABLES.items()})
+    ray = load_ray()
+    if ray.is_initialized():  # by the caller, as tests do: it stays
+        yield ray
+        return
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == "local":
+        quiet |= {
+            "include_dashboard": False,
+            "object_store_memory": OBJECT_STORE_BYTES,
+            "num_cpus": available_cores(),
+            "num_gpus": len(visible_gpus()),
+        }
+    try:
+        ray.init(address=address, **quiet)
+    except ImportError as exc:
+        raise _missing(exc) from exc
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as exc:
+        raise ClusterError(
+            f"--cluster {address}: there is no cluster to connect to ({exc}). Start one with `ray start "
+            f"--head` (docs/cluster.md), name its address, or use --cluster local."
+        ) from exc
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def on_machine(node: str) -> Any:
+    """Return Ray's strategy for: on the machine with this id, or not at all."""
+    strategies: Any = importlib.import_module("ray.util.scheduling_strategies")
+    return strategies.NodeAffinitySchedulingStrategy(node_id=node, soft=False)
+
+
+def load_ray() -> Any:
+    """Import Ray.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return importlib.import_module("ray")
+    except ImportError as exc:
+        raise _missing(exc) from exc
+
+
+def _missing(exc: ImportError) -> MissingDependencyError:
+    return MissingDependencyError(
+        f"--cluster: the package '{exc.name or 'ray'}' is not installed. Install it with pip install "
+        "'mikasa-vla-eval[cluster]', or leave --cluster out."
+    )

@@ -1,0 +1,35 @@
+"""A file or folder that every machine must have, and how it is recognised. Knows nothing of its content."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_eval.errors import VlaEvalError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Needed:
+    """A path, as the planning machine has it.
+
+    Attributes:
+        path: absolute, or below the working directory.
+        sha256: its digest; None: it is enough that it is there.
+        digest: what computes the digest.
+    """
+
+    path: str
+    sha256: str | None = None
+    digest: Callable[[Path], str] | None = None
+
+    def objection(self) -> str | None:
+        """Return what is wrong with it on this machine; None: nothing."""
+        if self.digest is None:
+            there = Path(self.path).exists()
+            return None if there else f"{self.path}: it is not there; is the storage shared?"
+        try:
+            found = self.digest(Path(self.path))
+        except (OSError, VlaEvalError) as exc:
+            return f"{self.path}: cannot be read ({exc})"
+        if found != self.sha256:
+            return f"{self.path}: another one (sha256 {found:.12}…, expected {self.sha256:.12}…)"
+        return None
