@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -71,6 +72,31 @@ def add_shard(parser: argparse.ArgumentParser) -> None:
         type=shard_argument,
         metavar="I/N",
         help="run only part I of N, to OUT-shard-I-of-N; `mikasa-vla merge` puts them together",
+    )
+
+
+def descriptor_argument(text: str) -> int:
+    """Read the number of an open file descriptor that is none of input and results."""
+    try:
+        descriptor = int(text)
+        if descriptor < 2:
+            raise ValueError
+        os.fstat(descriptor)
+    except (ValueError, OverflowError, OSError) as exc:
+        raise argparse.ArgumentTypeError(
+            f"expected the number of an open file descriptor, 2 (standard error) or above, found '{text}'. "
+            "For a file: --json-progress 3 3>FILE"
+        ) from exc
+    return descriptor
+
+
+def add_json_progress(parser: argparse.ArgumentParser) -> None:
+    """Declare `--json-progress FD`."""
+    parser.add_argument(
+        "--json-progress",
+        type=descriptor_argument,
+        metavar="FD",
+        help="also write progress as JSON lines to this file descriptor; 2: in place of the bar",
     )
 
 

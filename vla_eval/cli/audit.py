@@ -8,6 +8,7 @@ from typing import Any
 from vla_eval.cli.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
+    add_json_progress,
     add_overrides,
     add_shard,
     add_verb,
@@ -51,6 +52,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     add_cluster(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
     add_shard(parser)
+    add_json_progress(parser)
     add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
     add_allow_environment_change(parser)
@@ -81,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
                 allow_environment_change=args.allow_environment_change,
                 shard=args.shard,
                 backend=backend,
+                json_progress=args.json_progress,
             )
             n_errors += summary.n_errors
             if summary.was_stopped:

@@ -16,10 +16,12 @@ class EpisodeBar:
 
     Args:
         clock: seconds that only grow.
+        is_quiet: write nothing: standard error is for another program.
     """
 
-    def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, *, clock: Callable[[], float] = time.monotonic, is_quiet: bool = False) -> None:
         self._clock = clock
+        self._is_quiet = is_quiet
         self._bar: tqdm[Any] | None = None
         self._title = self._note = ""
         self._n_done = self._n_before = self._n_total = 0
@@ -32,7 +34,7 @@ class EpisodeBar:
         self._n_done = self._n_before = n_done
         self._n_total = n_total
         self._begun = self._last_line = self._clock()
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not self._is_quiet:
             self._bar = tqdm(
                 total=n_total,
                 initial=n_done,
@@ -67,8 +69,9 @@ class EpisodeBar:
 
     def write(self, text: str) -> None:
         """Write a sentence above the bar."""
-        tqdm.write(text, file=sys.stderr)
-        sys.stderr.flush()
+        if not self._is_quiet:
+            tqdm.write(text, file=sys.stderr)
+            sys.stderr.flush()
 
     def _line(self) -> None:
         self._last_line = self._clock()

@@ -9,6 +9,7 @@ from vla_eval.cli.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
     add_dry_run,
+    add_json_progress,
     add_old_flag,
     add_overrides,
     add_shard,
@@ -86,6 +87,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
     add_shard(parser)
+    add_json_progress(parser)
     add_overrides(parser, help="change any field of the configuration")
     _add_dry_run_arguments(parser)
     add_allow_environment_change(parser, consequence="; the table will say so")
@@ -167,6 +169,7 @@ def run(args: argparse.Namespace) -> int:
             allow_environment_change=args.allow_environment_change,
             shard=args.shard,
             backend=backend,
+            json_progress=args.json_progress,
         )
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open

@@ -138,6 +138,7 @@ def _evaluate(work: _Work, backend: Backend, args: argparse.Namespace) -> int:
                 allow_environment_change=args.allow_environment_change,
                 shard=args.shard,
                 backend=backend,
+                json_progress=args.json_progress,
             )
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vla_eval.cli.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
+    add_json_progress,
     add_overrides,
     add_shard,
     workers_argument,
@@ -63,6 +64,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     _add_interventions(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/probe"), metavar="DIR", help="(runs/probe)")
     add_shard(parser)
+    add_json_progress(parser)
     add_overrides(parser, help="change any field of the evaluations")
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
     add_allow_environment_change(parser)

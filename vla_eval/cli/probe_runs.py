@@ -34,6 +34,7 @@ def run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | No
                 allow_environment_change=args.allow_environment_change,
                 shard=args.shard,
                 backend=backend,
+                json_progress=args.json_progress,
             )
             if summary.was_stopped:
                 print(f"Stopped. To resume: {command}", file=sys.stderr)

@@ -9,6 +9,7 @@ from types import FrameType
 from typing import Any
 
 from vla_eval.cli.episode_bar import EpisodeBar
+from vla_eval.cli.json_progress import EvaluationLines, JsonLines
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
@@ -67,13 +68,16 @@ def evaluate_with_progress(
     allow_environment_change: bool = False,
     shard: Shard | None = None,
     backend: Backend = LOCAL,
+    json_progress: int | None = None,
 ) -> EvaluationSummary:
     """Run an evaluation with progress on standard error, and end early if asked to stop.
+
+    `json_progress` is the file descriptor of lines for other programs.
 
     Raises:
         VlaEvalError: see `evaluate`.
     """
-    progress = Progress(stop, out=str(out))
+    progress = Progress(stop, out=out, json_progress=json_progress)
     try:
         return evaluate(
             config,
@@ -91,15 +95,18 @@ def evaluate_with_progress(
 class Progress:
     """Implements `EvaluationObserver` on standard error."""
 
-    def __init__(self, stop: StopRequest, *, out: str) -> None:
-        """Take the request to stop, and the name of the run folder for messages."""
+    def __init__(self, stop: StopRequest, *, out: Path, json_progress: int | None = None) -> None:
+        """Take the request to stop, the run folder, and where lines for other programs go."""
+        lines = JsonLines(json_progress)
         self._stop = stop
         self._out = out
-        self._bar = EpisodeBar()
+        self._bar = EpisodeBar(is_quiet=lines.is_stderr)
+        self._lines = EvaluationLines(lines, out=out)
         self._n_done = self._n_errors = self._n_results = self._n_successes = 0
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Say how much there is to do, and what is left out."""
+        self._lines.on_start(plan, n_finished=n_finished, n_workers=n_workers)
         n_episodes = len(plan.jobs)
         for pair in plan.left_out:
             self._bar.write(f"left out: {pair}")
@@ -115,6 +122,7 @@ class Progress:
 
     def on_record(self, record: EpisodeRecord) -> None:
         """Count the record; say at once what went wrong."""
+        self._lines.on_record(record)
         self._n_done += 1
         if record.error is not None:
             self._n_errors += 1
@@ -129,8 +137,10 @@ class Progress:
     def on_tick(self) -> bool:
         """Write a line now and then; return whether a signal has asked to stop."""
         self._bar.tick()
+        self._lines.on_tick()
         return self._stop.signal_number is not None
 
     def close(self) -> None:
         """Write how far it has come."""
         self._bar.close()
+        self._lines.close(stopped=self._stop.signal_number is not None)

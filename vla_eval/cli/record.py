@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import (
     add_allow_environment_change,
+    add_json_progress,
     add_overrides,
     add_verb,
     add_workers,
@@ -49,6 +50,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     add_workers(parser)
     add_cluster(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
+    add_json_progress(parser)
     add_overrides(parser, help="change any field of the recipe")
     add_allow_environment_change(parser)
 
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
     needs = (shared_folder(out),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop)
+        progress = RecordingProgress(stop, json_progress=args.json_progress)
         try:
             summary = record(
                 recipe,

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import add_verb, add_workers
+from vla_eval.cli.arguments import add_json_progress, add_verb, add_workers
 from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
 from vla_eval.errors import RecipeError
 
@@ -36,6 +36,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
     add_workers(parser, default="auto")
     add_cluster(parser)
+    add_json_progress(parser)
     parser.add_argument(
         "--rebuild",
         type=Path,
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     code, needs = 0, (shared_folder(args.dataset),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop)
+        progress = RecordingProgress(stop, json_progress=args.json_progress)
         try:
             for dataset in find_datasets(args.dataset):
                 with tempfile.TemporaryDirectory() as logs:
@@ -101,7 +102,7 @@ def _rebuild(args: argparse.Namespace) -> int:
         )
     needs = (shared_folder(args.rebuild),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop)
+        progress = RecordingProgress(stop, json_progress=args.json_progress)
         try:
             rebuilt = rebuild(
                 args.dataset,

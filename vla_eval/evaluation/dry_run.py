@@ -86,7 +86,7 @@ def evaluation_effort(config: EvalConfig, *, out: Path, shard: Shard | None = No
     finished = _finished(out)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
-    steps = [_horizon(job) for job in ahead]
+    steps = [horizon_steps(job) for job in ahead]
     inferences = [_inferences(job) for job in ahead]
     learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
     return EvaluationEffort(
@@ -135,13 +135,14 @@ def _finished(out: Path) -> frozenset[EpisodeKey]:
     return frozenset(record.key for record in read_run(out).records if record.error is None)
 
 
-def _horizon(job: EpisodeJob) -> int:
+def horizon_steps(job: EpisodeJob) -> int:
+    """Return after how many control steps an episode ends at the latest."""
     own = job.group.env.kwargs.get("horizon_steps")
     return int(own) if own is not None else task_spec(job.group.key.task).horizon_steps
 
 
 def _inferences(job: EpisodeJob) -> int:
-    return math.ceil(_horizon(job) / job.group.key.n_action_steps)
+    return math.ceil(horizon_steps(job) / job.group.key.n_action_steps)
 
 
 def _copies(plan: Plan) -> dict[str, int]:

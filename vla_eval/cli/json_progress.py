@@ -1,0 +1,187 @@
+"""`--json-progress FD`: progress for other programs, one JSON object per line of a file descriptor.
+
+`docs/evaluation.md` has the schema. What is not known is null, never 0. Knows nothing of bars.
+"""
+
+import json
+import logging
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from vla_eval.evaluation.dry_run import horizon_steps
+from vla_eval.evaluation.plan import Plan
+from vla_eval.records import EpisodeKey, EpisodeRecord
+from vla_eval.storage.run_folder import read_run
+
+logger = logging.getLogger(__name__)
+
+FORMAT_VERSION = 1
+"""Of the lines. Raise it when a field changes its meaning."""
+
+STDERR = 2
+EVERY_SECONDS = 1.0  # between two lines `progress`
+
+
+class JsonLines:
+    """Writes lines to a file descriptor; a reader that is gone does not stop the run.
+
+    Args:
+        descriptor: an open file descriptor; None: nothing is written.
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, descriptor: int | None, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self.descriptor = descriptor
+        self.clock = clock
+        if descriptor is not None and descriptor > STDERR:
+            os.set_inheritable(descriptor, False)  # a worker that lives on would keep the reader waiting
+
+    @property
+    def is_stderr(self) -> bool:
+        """Whether messages for people go to the same place, and so are left out."""
+        return self.descriptor == STDERR
+
+    def write(self, event: str, fields: dict[str, Any]) -> None:  # Any: plain data
+        """Write one line."""
+        if self.descriptor is None:
+            return
+        line = json.dumps({"format_version": FORMAT_VERSION, "event": event, **fields}, allow_nan=False)
+        data = f"{line}\n".encode()
+        try:
+            while data:
+                data = data[os.write(self.descriptor, data) :]
+        except OSError as exc:
+            logger.warning("--json-progress %d: no more lines (%s)", self.descriptor, exc.strerror)
+            self.descriptor = None
+
+
+class _Count:
+    """How far one run, or one phase of a recording, has come."""
+
+    def __init__(self, lines: JsonLines, run: str, phase: str | None) -> None:
+        self._lines = lines
+        self._begun = self._written = lines.clock()
+        self._n_before = 0
+        self._is_ended = False
+        self.state: dict[str, Any] = {"run": run, "phase": phase}  # Any: plain data
+
+    def begin(self, *, n_done: int, n_total: int, **more: Any) -> None:
+        """Write the first line; `more` are fields that only some kinds of runs know."""
+        self._n_before = n_done
+        self.state |= {"episodes_done": n_done, "episodes_total": n_total}
+        self.state |= {"steps_done": None, "steps_total": None, "successes": None, "errors": None, **more}
+        self._write("begin")
+
+    def tick(self) -> None:
+        """Write a line if it is time."""
+        if "episodes_total" in self.state and self._lines.clock() - self._written >= EVERY_SECONDS:
+            self._write("progress")
+
+    def note(self, event: str, fields: dict[str, Any]) -> None:
+        """Write a line about something that has happened."""
+        self._lines.write(event, {"run": self.state["run"], "phase": self.state["phase"], **fields})
+
+    def end(self, *, stopped: bool) -> None:
+        """Write the last line, once."""
+        if "episodes_total" in self.state and not self._is_ended:
+            self._is_ended = True
+            self.state["stopped"] = stopped
+            self._write("end")
+
+    def _write(self, event: str) -> None:
+        self._written = self._lines.clock()
+        elapsed = self._written - self._begun
+        n_here = self.state["episodes_done"] - self._n_before
+        n_left = self.state["episodes_total"] - self.state["episodes_done"]
+        remaining = 0.0 if not n_left else round(elapsed / n_here * n_left, 1) if n_here else None
+        times = {"elapsed_seconds": round(elapsed, 1), "remaining_seconds": remaining}
+        self._lines.write(event, {**self.state, **times})
+
+
+class EvaluationLines:
+    """The lines of an evaluation; its methods are those of `EvaluationObserver`."""
+
+    def __init__(self, lines: JsonLines, *, out: Path) -> None:
+        """Take the lines and the run folder."""
+        self._count = _Count(lines, str(out), None)
+        self._lines = lines
+        self._folder = out
+        self._open_steps: dict[EpisodeKey, int] = {}  # episode without a result -> its horizon
+
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Write what there is to do."""
+        if self._lines.descriptor is None:
+            return
+        records = read_run(self._folder).records if n_finished else ()
+        finished = {record.key: record.n_steps or 0 for record in records if record.error is None}
+        horizons = {job.key: horizon_steps(job) for job in plan.jobs}
+        self._open_steps = {key: steps for key, steps in horizons.items() if key not in finished}
+        self._count.begin(
+            n_done=n_finished,
+            n_total=len(plan.jobs),
+            steps_done=sum(finished.values()),
+            steps_total=sum(finished.values()) + sum(self._open_steps.values()),
+            successes=sum(bool(record.success_once) for record in records),
+            errors=0,
+            workers=n_workers,
+            left_out=list(plan.left_out),
+        )
+
+    def on_record(self, record: EpisodeRecord) -> None:
+        """Count the record; write a line about an error."""
+        if self._lines.descriptor is None:
+            return
+        state = self._count.state
+        state["episodes_done"] += 1
+        if record.error is None:
+            steps = record.n_steps or 0
+            state["steps_done"] += steps
+            # An episode that ended early leaves less to do.
+            state["steps_total"] += steps - self._open_steps[record.key]
+            state["successes"] += bool(record.success_once)
+        else:
+            state["errors"] += 1
+            error = {name: getattr(record.error, name) for name in ("kind", "stage", "message")}
+            self._count.note("error", {"episode": record.key._asdict(), **error})
+
+    def on_tick(self) -> None:
+        """Write a line if it is time."""
+        self._count.tick()
+
+    def close(self, *, stopped: bool) -> None:
+        """Write the last line."""
+        self._count.end(stopped=stopped)
+
+
+class PhaseLines:
+    """The lines of a recording or a replay, phase by phase."""
+
+    def __init__(self, lines: JsonLines) -> None:
+        """Take the lines."""
+        self._lines = lines
+        self._count = _Count(lines, "", None)
+
+    def on_phase(self, task: str, phase: str, *, n_done: int, n_total: int) -> None:
+        """End the last phase and begin this one."""
+        self._count.end(stopped=False)
+        self._count = _Count(self._lines, task, phase)
+        self._count.begin(n_done=n_done, n_total=n_total)
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Count."""
+        self._count.state["episodes_done"] = n_done
+
+    def on_mismatch(self, sentence: str) -> None:
+        """Write a line about it."""
+        self._count.note("mismatch", {"message": sentence})
+
+    def on_tick(self) -> None:
+        """Write a line if it is time."""
+        self._count.tick()
+
+    def close(self, *, stopped: bool) -> None:
+        """Write the last line."""
+        self._count.end(stopped=stopped)
