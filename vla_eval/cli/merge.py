@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_allow_environment_change, add_verb
 from vla_eval.errors import MergeError
+from vla_eval.storage.folders import not_a_run_folder
+from vla_eval.storage.run_file import RUN_FILE
 
 if TYPE_CHECKING:
     from vla_eval.storage.merging import MergedRun
@@ -42,12 +44,24 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 
 def run(args: argparse.Namespace) -> int:
-    """Merge; the new run folders go to standard output, everything else to standard error.
+    """Merge; the new run folders or datasets go to standard output, everything else to standard error.
 
     Raises:
         VlaEvalError: shards that do not fit together, or are not all there.
     """
-    # Here and not above: `mikasa-vla --help` need not wait for pydantic.
+    # Here and not above, as all that follows: `mikasa-vla --help` need not wait for it.
+    from vla_eval.data.recording_folder import STATE_FOLDER
+
+    recordings = [path for path in args.runs if (path / STATE_FOLDER / RUN_FILE).is_file()]
+    if not recordings:
+        return _merge_runs(args)
+    others = [str(path) for path in args.runs if path not in recordings]
+    if others:
+        raise MergeError(f"{', '.join(others)}: expected a recording, as {recordings[0]} is, found none.")
+    return _merge_recordings(args)
+
+
+def _merge_runs(args: argparse.Namespace) -> int:
     from vla_eval.storage.merging import merge_runs, write_merged
 
     merged = {
@@ -64,6 +78,16 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_EPISODE_ERRORS if any(one.n_errors for one in merged.values()) else 0
 
 
+def _merge_recordings(args: argparse.Namespace) -> int:
+    from vla_eval.data.merging import merge_recordings, write_recording
+
+    merged = merge_recordings(args.runs, allow_environment_change=args.allow_environment_change)
+    _refuse_missing(merged.missing, allowed=args.allow_missing)
+    for facts in write_recording(merged, args.out):
+        print(f"{args.out / facts.task}: {facts.n_episodes} episodes, {facts.n_frames} frames")
+    return 0
+
+
 def describe(folder: Path, merged: "MergedRun") -> str:
     """Return what was merged, in one line."""
     errors = f", {merged.n_errors} of them errors" if merged.n_errors else ""
@@ -75,9 +99,6 @@ def _by_name(runs: Sequence[Path]) -> dict[str, list[Path]]:
 
     A run folder itself has the name ".".
     """
-    from vla_eval.storage.folders import not_a_run_folder
-    from vla_eval.storage.run_file import RUN_FILE
-
     found: dict[str, list[Path]] = {}
     for path in runs:
         inside = sorted(file.parent.name for file in path.glob(f"*/{RUN_FILE}"))

@@ -9,6 +9,7 @@ from vla_eval.cli.arguments import (
     add_allow_environment_change,
     add_json_progress,
     add_overrides,
+    add_shard,
     add_verb,
     add_workers,
     set_flags,
@@ -19,6 +20,7 @@ from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
+from vla_eval.storage.shard import shard_folder
 
 if TYPE_CHECKING:
     from vla_eval.data.recording import RecordedDataset
@@ -50,6 +52,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     add_workers(parser)
     add_cluster(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
+    add_shard(parser)
     add_json_progress(parser)
     add_overrides(parser, help="change any field of the recipe")
     add_allow_environment_change(parser)
@@ -58,13 +61,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Record; the datasets' names go to standard output, everything else to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for lerobot.
+    from vla_eval.cli.output import hint_merge
     from vla_eval.cli.progress import stop_on_signals
     from vla_eval.cli.recording_progress import RecordingProgress
     from vla_eval.data.recording import record
 
     recipe = _recipe(args)
     command = typed_command()
-    out = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
+    whole = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
+    out = shard_folder(whole, args.shard)
     needs = (shared_folder(out),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop, json_progress=args.json_progress)
@@ -76,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 allow_environment_change=args.allow_environment_change,
                 observer=progress,
                 backend=backend,
+                part=args.shard,
             )
         finally:
             progress.close()
@@ -84,6 +90,12 @@ def run(args: argparse.Namespace) -> int:
         return stop.exit_code
     for dataset in summary.datasets:
         print(describe(dataset))
+    for part in summary.parts:
+        minutes = part.seconds / 60
+        print(f"{out}: {part.task}: {part.n_episodes} of {part.n_total} episodes, {minutes:.1f} min")
+    if args.shard is not None:
+        sys.stdout.flush()
+        hint_merge(whole, args.shard)
     return 0
 
 

@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, Protocol
 
-from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
+from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe
 from vla_eval.config.files import content_of, options_of
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
@@ -24,17 +24,21 @@ from vla_eval.data.recording_jobs import (
     AttemptJob,
     DatasetWritten,
     JoinJob,
+    Origin,
     RecordingAnswer,
     RecordingJob,
     ShardJob,
     ShardWritten,
     TaskPlan,
+    join_job,
+    shard_jobs,
 )
 from vla_eval.data.recording_plan import RecordingPlan, plan_recording
 from vla_eval.data.seed_queue import SeedQueue, Selection
 from vla_eval.errors import RecordingError
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
+from vla_eval.storage.shard import Shard
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
@@ -93,12 +97,26 @@ class RecordedDataset:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedPart:
+    """What one part of a recording has of a task: `n_episodes` of `n_total`."""
+
+    task: str
+    n_episodes: int
+    n_total: int
+    seconds: float  # of this call
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSummary:
-    """What one call of `record` has come to; fewer datasets than tasks if it was stopped."""
+    """What one call of `record` has come to; fewer datasets than tasks if it was stopped.
+
+    A part of a recording has no datasets yet.
+    """
 
     out: Path
     datasets: tuple[RecordedDataset, ...]
     was_stopped: bool
+    parts: tuple[RecordedPart, ...] = ()
 
 
 def recording_main(connection: Connection, shared: SharedStage, log: Path) -> None:
@@ -121,6 +139,7 @@ def record(
     allow_environment_change: bool = False,
     observer: RecordingObserver | None = None,
     backend: Backend = LOCAL,
+    part: Shard | None = None,
 ) -> RecordingSummary:
     """Record all datasets of a recipe that are not there yet.
 
@@ -131,6 +150,7 @@ def record(
         allow_environment_change: resume although package versions or the machine have changed.
         observer: gets the progress.
         backend: where the workers run; they write shards and datasets into the folder.
+        part: render only this part of the episodes; `merge_recordings` makes the datasets.
 
     Raises:
         VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk. What was
@@ -144,6 +164,7 @@ def record(
         allow_environment_change=allow_environment_change,
         observer=observer or _Silence(),
         backend=backend,
+        part=part,
     )
 
 
@@ -158,6 +179,7 @@ def run_plan(
     selections: Mapping[str, Selection] | None = None,
     source: str | None = None,
     backend: Backend = LOCAL,
+    part: Shard | None = None,
 ) -> RecordingSummary:
     """Record what is planned; see `record`.
 
@@ -171,7 +193,9 @@ def run_plan(
         selections: task -> the attempts to render, where they are known already.
         source: digest of what the selections were read from.
         backend: see `record`.
+        part: see `record`.
     """
+    part = part and part.of_blocks(recipe.episodes_per_shard, recipe.episodes)
     versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
         name=recipe.name,
@@ -180,8 +204,10 @@ def run_plan(
         environment=collect_environment(),
         options=options_of(recipe, options=OPTION_FIELDS),
         command=command,
+        shard=part,
     )
     datasets: list[RecordedDataset] = []
+    parts: list[RecordedPart] = []
     n_workers = backend.n_cores if recipe.workers == "auto" else recipe.workers
     with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
         pool: RecordingPool = backend.pool(
@@ -202,10 +228,14 @@ def run_plan(
             )
             try:
                 for task in plan.tasks:
-                    datasets.append(recorder.record(task, (selections or {}).get(task.task)))
+                    if part is None:
+                        datasets.append(recorder.record(task, (selections or {}).get(task.task)))
+                    else:
+                        parts.append(recorder.record_part(task, part))
+                was_stopped = False
             except _Stopped:
-                return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=True)
-    return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=False)
+                was_stopped = True
+    return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=was_stopped, parts=tuple(parts))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -224,7 +254,8 @@ class _Recorder:
         path = self.folder.dataset(task.task)
         if not self.folder.is_finished(task.task):
             selection = selection or self._try_seeds(task)
-            shards = self._render(task, selection.kept)
+            shards = self._shard_jobs(task, selection)
+            self._render(shards)
             self._join(task, selection, shards)
         self.folder.remove_shards(task.task)  # also what a killed session has left
         return RecordedDataset(
@@ -233,6 +264,22 @@ class _Recorder:
             failed=read_failed(path),
             seconds=time.monotonic() - begun,
         )
+
+    def record_part(self, task: TaskPlan, part: Shard) -> RecordedPart:
+        """Try all seeds, since each decides on the others, and render the part's share of the episodes."""
+        begun = time.monotonic()
+        jobs = self._shard_jobs(task, self._try_seeds(task))
+        own = [job for job in jobs if part.holds(job.first_index)]
+        self._render(own)
+        return RecordedPart(
+            task=task.task,
+            n_episodes=sum(len(job.attempts) for job in own),
+            n_total=task.recipe.episodes,
+            seconds=time.monotonic() - begun,
+        )
+
+    def _shard_jobs(self, task: TaskPlan, selection: Selection) -> tuple[ShardJob, ...]:
+        return shard_jobs(task, selection.kept, functools.partial(self.folder.shard, task.task))
 
     def _try_seeds(self, task: TaskPlan) -> Selection:
         queue = SeedQueue(
@@ -248,26 +295,25 @@ class _Recorder:
             self.observer.on_progress(n_done=queue.n_kept)
         return queue.selection()
 
-    def _render(self, task: TaskPlan, kept: Sequence[Attempt]) -> tuple[Path, ...]:
-        jobs = list(self._shard_jobs(task, kept))
+    def _render(self, jobs: Sequence[ShardJob]) -> None:
         open_jobs = [job for job in jobs if not job.path.exists()]
-        n_done = len(kept) - sum(len(job.attempts) for job in open_jobs)
-        self._begin(task, "rendering", n_done=n_done)
+        n_total = sum(len(job.attempts) for job in jobs)
+        n_done = n_total - sum(len(job.attempts) for job in open_jobs)
+        self.observer.on_phase(jobs[0].plan.task, "rendering", n_done=n_done, n_total=n_total)
         for done, _ in self._answers(JobList(open_jobs)):
             assert isinstance(done, ShardJob)
             n_done += len(done.attempts)
             self.observer.on_progress(n_done=n_done)
-        return tuple(job.path for job in jobs)
 
-    def _join(self, task: TaskPlan, selection: Selection, shards: tuple[Path, ...]) -> None:
+    def _join(self, task: TaskPlan, selection: Selection, shards: Sequence[ShardJob]) -> None:
         self._begin(task, "joining", n_done=0)
-        job = JoinJob(
-            plan=task,
-            path=self.folder.dataset(task.task),
-            shards=shards,
-            failed=tuple(FailedSeed(seed=one.seed, n_steps=one.n_steps) for one in selection.failed),
-            facts=self._facts(task, n_failed_seeds=len(selection.failed)),
+        origin = Origin(
+            recipe_files=self.plan.recipe_files,
+            environment=self.folder.environment,
+            device=self.folder.device,
         )
+        path = self.folder.dataset(task.task)
+        job = join_job(task, path, shards=shards, failed=selection.failed, origin=origin)
         for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)
 
@@ -301,35 +347,6 @@ class _Recorder:
 
     def _begin(self, task: TaskPlan, phase: Phase, *, n_done: int) -> None:
         self.observer.on_phase(task.task, phase, n_done=n_done, n_total=task.recipe.episodes)
-
-    def _shard_jobs(self, task: TaskPlan, kept: Sequence[Attempt]) -> Iterable[ShardJob]:
-        size = task.recipe.episodes_per_shard
-        for first in range(0, len(kept), size):
-            yield ShardJob(
-                plan=task,
-                path=self.folder.shard(task.task, first // size),
-                first_index=first,
-                attempts=tuple(kept[first : first + size]),
-            )
-
-    def _facts(self, task: TaskPlan, *, n_failed_seeds: int) -> DatasetFacts:
-        return DatasetFacts(
-            complete=True,
-            name=task.recipe.name,
-            task=task.task,
-            task_version=task.task_version,
-            instruction=task.group.instruction,
-            state=task.recipe.state,
-            n_episodes=0,
-            n_frames=0,
-            n_failed_seeds=n_failed_seeds,
-            recipe=content_of(task.recipe, options=OPTION_FIELDS),
-            recipe_sha256=fingerprint(task.recipe),
-            recipe_files=self.plan.recipe_files,
-            environment=dict(self.folder.environment),
-            device=self.folder.device,
-            files={},
-        )
 
 
 def _raise_if_last(failed: Failed, n_failed: int, name: str) -> None:

@@ -39,6 +39,7 @@ from vla_eval.strict_json import Source, as_dataclass, read_json
 STATE_FOLDER = "recording"
 LOCK_FILE = "recording.lock"
 ATTEMPTS_FILE = "attempts.jsonl"
+SHARDS = "shards"
 _OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOCK_FILE)  # of a recording that has no attempt yet
 
 
@@ -104,8 +105,7 @@ class RecordingFolder:
     @property
     def device(self) -> dict[str, str]:
         """What is known of the device that renders the images."""
-        device = self._run_file.description.environment.get(DEVICE)
-        return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
+        return device_of(self._run_file)
 
     def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
         """Record the device; all images of a dataset must come from one device.
@@ -138,7 +138,9 @@ class RecordingFolder:
 
     def shard(self, task: str, index: int) -> Path:
         """Return where a shard appears."""
-        return _made(self._task_folder(task) / "shards") / f"shard-{index:05d}"
+        path = shard_path(self.out, task, index)
+        _made(path.parent)
+        return path
 
     def attempts(self, task: str) -> dict[int, Attempt]:
         """Return seed -> attempt of all that is known.
@@ -146,11 +148,8 @@ class RecordingFolder:
         Raises:
             DatasetError: the file is damaged.
         """
-        path = self._task_folder(task) / ATTEMPTS_FILE
-        cut_tail(path)
-        lines = read_lines(path).split(b"\n")[:-1]
-        found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
-        return {one.seed: one for one in found}
+        cut_tail(self._task_folder(task) / ATTEMPTS_FILE)
+        return read_attempts(self.out, task)
 
     def append(self, task: str, attempt: Attempt) -> None:
         """Keep an attempt; it is durable when this returns.
@@ -164,10 +163,38 @@ class RecordingFolder:
 
     def remove_shards(self, task: str) -> None:
         """Remove what is not needed once the dataset is there."""
-        shutil.rmtree(self._task_folder(task) / "shards", ignore_errors=True)
+        remove_shards(self.out, task)
 
     def _task_folder(self, task: str) -> Path:
         return _made(self.out / STATE_FOLDER / task)
+
+
+def read_attempts(out: Path, task: str) -> dict[int, Attempt]:
+    """Return seed -> attempt of a recording, without touching it.
+
+    Raises:
+        DatasetError: the file is damaged.
+    """
+    path = out / STATE_FOLDER / task / ATTEMPTS_FILE
+    lines = read_lines(path).split(b"\n")[:-1]
+    found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
+    return {one.seed: one for one in found}
+
+
+def shard_path(out: Path, task: str, index: int) -> Path:
+    """Return where a shard of a recording is, or would be."""
+    return out / STATE_FOLDER / task / SHARDS / f"shard-{index:05d}"
+
+
+def device_of(run_file: RunFile) -> dict[str, str]:
+    """Return what is known of the device that renders the images."""
+    device = run_file.description.environment.get(DEVICE)
+    return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
+
+
+def remove_shards(out: Path, task: str) -> None:
+    """Remove the shards of a recording, which are not needed once the dataset is there."""
+    shutil.rmtree(out / STATE_FOLDER / task / SHARDS, ignore_errors=True)
 
 
 def _refuse_foreign(out: Path) -> None:

@@ -3,15 +3,18 @@
 Knows nothing of lerobot, simulators or processes.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
+from vla_eval.config.files import content_of
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import SLOT, Attempt
 from vla_eval.data.manifest import DatasetFacts, FailedSeed
 from vla_eval.evaluation.plan import EpisodeGroup
+from vla_eval.storage.run_file import JsonValue
 
 
 class SetupKey(NamedTuple):
@@ -122,6 +125,21 @@ class JoinJob:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """With what a recording was made.
+
+    Attributes:
+        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts and weights.
+        environment: commit, versions and machine.
+        device: what is known of the device that rendered.
+    """
+
+    recipe_files: Mapping[str, str]
+    environment: Mapping[str, JsonValue]
+    device: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ShardWritten:
     """A shard is on the disk."""
 
@@ -133,6 +151,64 @@ class DatasetWritten:
     """A dataset is on the disk, complete."""
 
     facts: DatasetFacts
+
+
+def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], Path]) -> tuple[ShardJob, ...]:
+    """Return the jobs that render the kept attempts.
+
+    Args:
+        plan: what is recorded.
+        kept: the attempts, in their order.
+        place: number of a shard -> where it appears.
+    """
+    size = plan.recipe.episodes_per_shard
+    return tuple(
+        ShardJob(
+            plan=plan,
+            path=place(first // size),
+            first_index=first,
+            attempts=tuple(kept[first : first + size]),
+        )
+        for first in range(0, len(kept), size)
+    )
+
+
+def join_job(
+    plan: TaskPlan, path: Path, *, shards: Sequence[ShardJob], failed: Sequence[Attempt], origin: Origin
+) -> JoinJob:
+    """Return the job that makes the dataset of a task.
+
+    Args:
+        plan: what was recorded.
+        path: where the dataset is to appear.
+        shards: all of them, in order; they are there.
+        failed: the attempts that did not succeed.
+        origin: with what it was recorded.
+    """
+    facts = DatasetFacts(
+        complete=True,
+        name=plan.recipe.name,
+        task=plan.task,
+        task_version=plan.task_version,
+        instruction=plan.group.instruction,
+        state=plan.recipe.state,
+        n_episodes=0,
+        n_frames=0,
+        n_failed_seeds=len(failed),
+        recipe=content_of(plan.recipe, options=OPTION_FIELDS),
+        recipe_sha256=fingerprint(plan.recipe),
+        recipe_files=dict(origin.recipe_files),
+        environment=dict(origin.environment),
+        device=dict(origin.device),
+        files={},
+    )
+    return JoinJob(
+        plan=plan,
+        path=path,
+        shards=tuple(job.path for job in shards),
+        failed=tuple(FailedSeed(seed=one.seed, n_steps=one.n_steps) for one in failed),
+        facts=facts,
+    )
 
 
 RecordingJob = AttemptJob | ShardJob | JoinJob

@@ -79,7 +79,7 @@ class RecordingRunner:
                 return self._attempt(job)
             if isinstance(job, ShardJob):
                 return self._write_shard(job)
-            return self._join(job)
+            return join_dataset(job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
             logger.exception("%s, stage %s", job.setup_key, self._heartbeat.stage)
             known = _explained(exc, job)
@@ -118,24 +118,6 @@ class RecordingRunner:
                 writer.add_episode(episode, frames_of(plan.recipe, episode, log))
         return ShardWritten(n_episodes=len(job.attempts))
 
-    def _join(self, job: JoinJob) -> DatasetWritten:
-        home = job.shards[0].parent / job.path.name
-        remove_drafts(home)
-        draft = draft_path(home)
-        episodes = join_shards(job.shards, draft)
-        (draft / MIKASA_FOLDER).mkdir()
-        write_lines(draft / MANIFEST_FILE, episodes)
-        write_lines(draft / FAILED_FILE, job.failed)
-        facts = dataclasses.replace(
-            job.facts,
-            n_episodes=len(episodes),
-            n_frames=sum(episode.n_steps for episode in episodes),
-            files=digest_files(draft),
-        )
-        write_entry(draft / RECORDING_FILE, facts)
-        publish(draft, job.path)
-        return DatasetWritten(facts=facts)
-
     def _make_env(self, settings: EnvSettings) -> SimEnv:
         if self._env is None or self._env_settings != settings:
             self.close()
@@ -145,6 +127,26 @@ class RecordingRunner:
             if device is not None and settings.cameras:
                 self._tell(DeviceFound(device=device))
         return self._env
+
+
+def join_dataset(job: JoinJob) -> DatasetWritten:
+    """Put the shards of a task together; the dataset appears whole."""
+    home = job.shards[0].parent / job.path.name
+    remove_drafts(home)
+    draft = draft_path(home)
+    episodes = join_shards(job.shards, draft)
+    (draft / MIKASA_FOLDER).mkdir()
+    write_lines(draft / MANIFEST_FILE, episodes)
+    write_lines(draft / FAILED_FILE, job.failed)
+    facts = dataclasses.replace(
+        job.facts,
+        n_episodes=len(episodes),
+        n_frames=sum(episode.n_steps for episode in episodes),
+        files=digest_files(draft),
+    )
+    write_entry(draft / RECORDING_FILE, facts)
+    publish(draft, job.path)
+    return DatasetWritten(facts=facts)
 
 
 def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: int) -> RecordedEpisode:
