@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,19 +28,24 @@ time.sleep(600)
 """
 
 
-def ask(*names: str) -> dict[str, str | None]:
+def ask(*names: str) -> Any:
     """Return variables of the environment that a new worker sees."""
+    return in_a_worker("{name: os.environ.get(name) for name in names}", names=names)
+
+
+def in_a_worker(expression: str, **given: object) -> Any:
+    """Return the value of an expression in a new worker."""
     context = worker_context()
     here, there = context.Pipe()
     their_lifeline, lifeline = context.Pipe(duplex=False)
-    code = "import os; there.send({name: os.environ.get(name) for name in names})"
+    code = f"import gc, os; there.send({expression})"
     with worker_environment() as environment:
         process = context.Process(
-            target=begin, args=(environment, their_lifeline, exec, code, {"there": there, "names": names})
+            target=begin, args=(environment, their_lifeline, exec, code, {"there": there, **given})
         )
         process.start()
     there.close()
-    found: dict[str, str | None] = here.recv()
+    found = here.recv()
     process.join()
     lifeline.close()
     return found
@@ -53,6 +59,12 @@ def test_a_worker_has_the_environment_of_its_own_start(monkeypatch: pytest.Monke
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert ask("MIKASA_A_TEST", "OMP_NUM_THREADS") == {"MIKASA_A_TEST": "second", "OMP_NUM_THREADS": "1"}
     assert "OMP_NUM_THREADS" not in os.environ
+
+
+def test_a_worker_collects_its_own_garbage_and_nothing_that_was_imported_before_the_fork() -> None:
+    is_enabled, n_left_out = in_a_worker("(gc.isenabled(), gc.get_freeze_count())")
+    assert is_enabled
+    assert n_left_out > 0
 
 
 def test_where_there_is_an_nvidia_driver_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> None:

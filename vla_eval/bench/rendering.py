@@ -9,33 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings, RenderSettings
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, SimEnv
+from vla_eval.core import EpisodeStart, SimEnv
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import ConformanceError
 from vla_eval.rollout import RolloutSettings, rollout
-from vla_eval.seeding import Stream, generator
-from vla_eval.specs import PolicySpec
-
-CAMERAS = ("base_camera", "hand_camera")
-
-
-class _Looker:
-    """A policy that looks at both cameras and acts at random: all cost is the environment's."""
-
-    def __init__(self, chunk_size: int, cameras: tuple[str, ...]) -> None:
-        self.spec = PolicySpec(name="looker", reads="last", cameras=cameras, states=(), chunk_size=chunk_size)
-        self._rng = np.random.default_rng(0)
-
-    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        self._rng = generator(episodes[0].seed, Stream.POLICY)
-
-    def act(self, window: ObservationWindow) -> ActionChunk:
-        drawn = self._rng.uniform(-1, 1, (self.spec.chunk_size, 7))
-        return ActionChunk(actions=drawn.astype(np.float32))
+from vla_eval.testing.looking_policy import CAMERAS, LookingPolicy
 
 
 class Cost(NamedTuple):
@@ -140,5 +120,5 @@ def _episode(env: SimEnv, n_action_steps: int, cameras: tuple[str, ...], *, eage
     )
     settings = RolloutSettings(chunking=chunking, eager_rendering=eager)
     wall, cpu = time.perf_counter(), time.process_time()
-    (record,) = rollout(env, _Looker(n_action_steps, cameras), [start], settings)
+    (record,) = rollout(env, LookingPolicy(n_action_steps, cameras), [start], settings)
     return Cost(time.perf_counter() - wall, time.process_time() - cpu, record.trajectory_sha256)

@@ -6,9 +6,11 @@ from pathlib import Path
 from vla_eval.bounds import MAX_STEPS, check_bounds
 
 SYNTHETIC = "synthetic"
+EAGER = ""  # the baseline of --against-official without an interpreter
 SMALL = ""  # the policy of --serve that is made for it
 MAX_REPEATS, MAX_SAMPLES = 1000, 1_000_000
 MAX_SESSIONS, MAX_SECONDS = 256, 3600
+MAX_WORKERS, MAX_MEASURED_EPISODES = 256, 10_000
 MIB = 2**20
 
 
@@ -21,6 +23,27 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
     parser.add_argument("--wrist-mesh", choices=("shipped", "whole", "simplified"), default="shipped")
+    parser.add_argument(
+        "--against-official",
+        nargs="?",
+        const=EAGER,
+        metavar="PYTHON",
+        help="instead: whole evaluations against the official runner, installed where this interpreter is, "
+        "or against our own eager loop if none is named",
+    )
+    parser.add_argument(
+        "--workers", type=int, default=2, metavar="N", help="with --against-official (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=48, metavar="N", help="with --against-official (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--baseline-episodes",
+        type=int,
+        default=6,
+        metavar="N",
+        help="of the official runner, the first one only for its start-up (default: %(default)s)",
+    )
     parser.add_argument(
         "--loader",
         nargs="?",
@@ -52,10 +75,15 @@ def run(args: argparse.Namespace) -> int:
         "samples": (1, MAX_SAMPLES),
         "sessions": (1, MAX_SESSIONS),
         "seconds": (0.1, MAX_SECONDS),
+        "workers": (1, MAX_WORKERS),
+        "episodes": (1, MAX_MEASURED_EPISODES),
+        "baseline_episodes": (2, MAX_MEASURED_EPISODES),
     }
     check_bounds(args, bounds, prefix="bench: ")
     if args.serve is not None:
         return _serving(args)
+    if args.against_official is not None:
+        return _official(args)
     return _loader(args) if args.loader else _rendering(args)
 
 
@@ -97,6 +125,46 @@ def _rendering(args: argparse.Namespace) -> int:
             f"| {row.eager_cpu_ms:.1f} | {row.lazy_cpu_ms:.1f} | {row.cpu_speed_up:.1f} |"
         )
     print("States and actions of lazy and eager episodes were bit-equal.")
+    return 0
+
+
+def _official(args: argparse.Namespace) -> int:
+    from vla_eval.bench.official import run_official_bench
+
+    report = run_official_bench(
+        args.task,
+        python=Path(args.against_official) if args.against_official else None,
+        chunk_lengths=args.n_action_steps,
+        n_workers=args.workers,
+        n_episodes=args.episodes,
+        n_baseline_episodes=args.baseline_episodes,
+    )
+    costs, baseline = report.costs, report.baseline
+    print(
+        f"{report.task}, two cameras of 128 x 128; when it began, {report.load:.1f} other processes wanted a "
+        "core"
+    )
+    print(
+        f"CPU milliseconds: a step {costs.step_ms:.1f}, a frame of both cameras {costs.frame_ms:.1f}, "
+        f"a reset without its frame {costs.reset_ms:.1f}"
+    )
+    cpu = (
+        "" if baseline.cpu_seconds is None else f", {baseline.cpu_seconds / baseline.n_steps:.3f} CPU s each"
+    )
+    print(
+        f"{baseline.name}, one process, every step rendered: {baseline.per_second:.1f} steps/s{cpu}; "
+        f"start-up {baseline.start_seconds:.1f} s"
+    )
+    print(f"ours, {report.n_workers} workers, {report.n_episodes} episodes, start-up included:")
+    print("| K | steps/s | ratio | ratio, both starts | CPU s/frame | first record s | wall s | wall/floor |")
+    print("|--:|--:|--:|--:|--:|--:|--:|--:|")
+    for row in report.rows:
+        print(
+            f"| {row.n_action_steps} | {row.n_steps / row.seconds:.1f} | {report.ratio(row):.1f} "
+            f"| {report.ratio_with_both_starts(row):.1f} | {row.cpu_seconds / row.n_frames:.3f} "
+            f"| {row.first_seconds:.1f} | {row.seconds:.1f} | {row.seconds / row.floor_seconds:.2f} |"
+        )
+    print("ratio: the start-up is counted for ours and not for the other one.")
     return 0
 
 

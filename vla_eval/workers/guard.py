@@ -35,7 +35,7 @@ def fork_guarded(lifeline: Connection) -> None:
     """
     with contextlib.suppress(PermissionError):  # a leader of a group is alone in it already
         os.setsid()  # signals to the command's group are for the command
-    _prctl(PR_SET_CHILD_SUBREAPER, 1)
+    become_subreaper()
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
     before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGCHLD, signal.SIGTERM)}
@@ -53,6 +53,11 @@ def fork_guarded(lifeline: Connection) -> None:
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != guard:  # it died before the line above
         os._exit(1)
+
+
+def become_subreaper() -> None:
+    """Become the parent of every descendant that loses its own."""
+    _prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 def _guard(worker: int, lifeline: int, woken: int, wake: int) -> None:

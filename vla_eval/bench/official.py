@@ -1,0 +1,291 @@
+"""Measure whole evaluations, start-up included, against the official runner or our own eager loop.
+
+Each is a command of its own, as a user starts it. What one step, one frame and one reset cost is measured in
+this process; from that follows the floor, which an evaluation with these frames cannot be faster than.
+"""
+
+import contextlib
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import vla_eval.bench.official_episodes as official_script
+from vla_eval.config.environment import EnvSettings
+from vla_eval.core import SimEnv
+from vla_eval.envs.factory import make_env
+from vla_eval.errors import ConformanceError, MissingDependencyError
+from vla_eval.storage.folders import EPISODES_FILE
+from vla_eval.testing.looking_policy import CAMERAS, write_looking
+from vla_eval.workers.guard import become_subreaper
+from vla_eval.workers.start import available_cores
+
+POLL_SECONDS = 0.02
+N_MEASURED = 40  # steps, and frames, of which the mean is taken
+N_RESETS = 5
+
+
+class Costs(NamedTuple):
+    """CPU milliseconds in one process, without other work beside it."""
+
+    step_ms: float
+    frame_ms: float
+    reset_ms: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Baseline:
+    """One process that renders every step.
+
+    Attributes:
+        name: what was run.
+        n_steps: control steps after its first episode.
+        seconds: for these.
+        cpu_seconds: for these; None: not measured.
+        start_seconds: until its first episode would have begun: the rest of the first one's time.
+    """
+
+    name: str
+    n_steps: int
+    seconds: float
+    cpu_seconds: float | None
+    start_seconds: float
+
+    @property
+    def per_second(self) -> float:
+        """Control steps per second once it runs."""
+        return self.n_steps / self.seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationRow:
+    """One evaluation at one chunk length.
+
+    Attributes:
+        n_action_steps: K.
+        n_steps, n_frames: control steps and rendered observations of all episodes.
+        seconds: from the command to its end.
+        first_seconds: from the command to the first record.
+        cpu_seconds: of all its processes.
+        floor_seconds: steps and frames, spread evenly over the workers.
+    """
+
+    n_action_steps: int
+    n_steps: int
+    n_frames: int
+    seconds: float
+    first_seconds: float
+    cpu_seconds: float
+    floor_seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OfficialReport:
+    """What one run measured; `load` is how many processes wanted a core when it began."""
+
+    task: str
+    n_workers: int
+    n_episodes: int
+    load: float
+    costs: Costs
+    baseline: Baseline
+    rows: tuple[EvaluationRow, ...]
+
+    def ratio(self, row: EvaluationRow) -> float:
+        """How many times as many steps per second, our start-up counted and the baseline's not."""
+        return row.n_steps / row.seconds / self.baseline.per_second
+
+    def ratio_with_both_starts(self, row: EvaluationRow) -> float:
+        """The same with the baseline's start-up counted, too."""
+        theirs = self.baseline.start_seconds + row.n_steps / self.baseline.per_second
+        return theirs / row.seconds
+
+
+def run_official_bench(
+    task: str,
+    *,
+    python: Path | None,
+    chunk_lengths: Sequence[int],
+    n_workers: int,
+    n_episodes: int,
+    n_baseline_episodes: int,
+) -> OfficialReport:
+    """Measure.
+
+    Args:
+        task: its id; the official package has it as `…-VLA-v0`.
+        python: interpreter of the environment that the official package is installed in; None: our own eager
+            loop is the baseline.
+        chunk_lengths: values of K.
+        n_workers: of our evaluations.
+        n_episodes: of each of our evaluations.
+        n_baseline_episodes: of the baseline, of which the first is only for its start-up.
+
+    Raises:
+        MissingDependencyError: the interpreter is not there.
+        ConformanceError: a command failed.
+    """
+    load = os.getloadavg()[0]
+    costs, horizon_steps = _costs(task)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        if python is None:
+            baseline = _eager(task, folder, n_baseline_episodes, horizon_steps)
+        else:
+            baseline = _official(task, python, n_baseline_episodes, horizon_steps)
+        rows = tuple(
+            _row(task, folder, k, costs, horizon_steps, n_workers=n_workers, n_episodes=n_episodes)
+            for k in chunk_lengths
+        )
+    return OfficialReport(
+        task=task,
+        n_workers=n_workers,
+        n_episodes=n_episodes,
+        load=load,
+        costs=costs,
+        baseline=baseline,
+        rows=rows,
+    )
+
+
+def _row(
+    task: str, folder: Path, k: int, costs: Costs, horizon_steps: int, *, n_workers: int, n_episodes: int
+) -> EvaluationRow:
+    ran = _evaluation(task, folder, f"k{k}", k, n_episodes, "--workers", str(n_workers))
+    n_frames = n_episodes * math.ceil(horizon_steps / k)
+    n_steps = n_episodes * horizon_steps
+    work_ms = n_steps * costs.step_ms + n_frames * costs.frame_ms
+    return EvaluationRow(
+        n_action_steps=k,
+        n_steps=n_steps,
+        n_frames=n_frames,
+        seconds=ran.seconds,
+        first_seconds=ran.record_seconds[0],
+        cpu_seconds=ran.cpu_seconds,
+        floor_seconds=work_ms / 1000 / min(n_workers, available_cores()),
+    )
+
+
+# ------------------------------------------------------------------------------------------ commands
+
+
+class _Ran(NamedTuple):
+    """When a command wrote each record, when it ended, and the CPU time of all its processes; s."""
+
+    record_seconds: list[float]
+    seconds: float
+    cpu_seconds: float
+
+
+def _evaluation(task: str, folder: Path, name: str, k: int, n_episodes: int, *flags: str) -> _Ran:
+    """Run an evaluation of the policy that reads both cameras, in a run folder of its own."""
+    out = folder / name
+    policy = write_looking(folder / "looking.yaml")
+    command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", task, "--policy", policy]
+    command += ["--n-action-steps", str(k), "--episodes", str(n_episodes), "--out", str(out), *flags]
+    become_subreaper()  # so that the CPU time of processes that outlive the command is counted
+    records = out / EPISODES_FILE
+    cpu, begun = _children_seconds(), time.perf_counter()
+    times: list[float] = []
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output)
+        while process.poll() is None:
+            time.sleep(POLL_SECONDS)
+            n_records = records.read_bytes().count(b"\n") if records.exists() else 0
+            times += [time.perf_counter() - begun] * (n_records - len(times))
+        seconds = time.perf_counter() - begun
+        if process.returncode or not times:
+            output.seek(0)
+            raise ConformanceError(f"bench: the evaluation failed: {output.read()[-2000:]}")
+    with contextlib.suppress(ChildProcessError):  # none is left
+        while True:
+            os.wait()
+    return _Ran(times, seconds, _children_seconds() - cpu)
+
+
+def _children_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _eager(task: str, folder: Path, n_episodes: int, horizon_steps: int) -> Baseline:
+    flags = ("--workers", "1", "--set", "eager_rendering=true", "--set", "render.wrist_mesh=whole")
+    times = _evaluation(task, folder, "eager", 1, n_episodes, *flags).record_seconds
+    each = (times[-1] - times[0]) / (n_episodes - 1)
+    return Baseline(
+        name="our own loop, eager, with the whole mesh",
+        n_steps=horizon_steps * (n_episodes - 1),
+        seconds=times[-1] - times[0],
+        cpu_seconds=None,
+        start_seconds=times[0] - each,
+    )
+
+
+def _official(task: str, python: Path, n_episodes: int, horizon_steps: int) -> Baseline:
+    script = Path(official_script.__file__)
+    command = [str(python), str(script), task.replace("-v0", "-VLA-v0"), str(horizon_steps), str(n_episodes)]
+    # Without our own path: the other environment has its own packages.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    begun = time.perf_counter()
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    except OSError as exc:
+        raise MissingDependencyError(
+            f"bench: expected a Python interpreter that has mikasa-robo-suite at {python}, found none "
+            f"({exc}). docs/speed.md says how to install it."
+        ) from exc
+    seconds = time.perf_counter() - begun
+    if done.returncode:
+        raise ConformanceError(
+            f"bench: the official runner failed in {python}; docs/speed.md says how to install it. "
+            f"The end of its output: {done.stderr[-2000:]}"
+        )
+    found = json.loads(done.stdout.splitlines()[-1])
+    running = found["seconds"][-1] - found["seconds"][0]
+    return Baseline(
+        name="the official runner",
+        n_steps=sum(found["n_steps"][1:]),
+        seconds=running,
+        cpu_seconds=found["cpu_seconds"][-1] - found["cpu_seconds"][0],
+        start_seconds=seconds - running * n_episodes / (n_episodes - 1),
+    )
+
+
+# ------------------------------------------------------------------------------------------ in this process
+
+
+def _costs(task: str) -> tuple[Costs, int]:
+    """Return the costs, and the length of an episode."""
+    env, blind = make_env(EnvSettings(task=task, cameras=CAMERAS)), make_env(EnvSettings(task=task))
+    try:
+        env.reset({0: 1}, render=True)  # starts the renderer and compiles its shaders
+        blind.reset({0: 1}, render=False)
+        _step_ms(env, render=True, n=2)
+        step, drawn = _step_ms(blind, render=False), _step_ms(env, render=True)
+        begun = time.process_time()
+        for seed in range(N_RESETS):
+            env.reset({0: 1 + seed}, render=True)
+        reset = 1000 * (time.process_time() - begun) / N_RESETS
+        return Costs(step, drawn - step, reset - (drawn - step)), env.spec.horizon_steps
+    finally:
+        env.close()
+        blind.close()
+
+
+def _step_ms(env: SimEnv, *, render: bool, n: int = N_MEASURED) -> float:
+    draws = np.random.default_rng(0)
+    begun = time.process_time()
+    for _ in range(n):
+        action = draws.uniform(-1, 1, 7).astype(np.float32)
+        env.step({0: action}, render=frozenset({0} if render else ()))
+    return 1000 * (time.process_time() - begun) / n
