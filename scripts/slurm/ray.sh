@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# One command on all nodes of one allocation, by a Ray cluster that is started and ended with it.
+#
+#   sbatch --nodes=4 scripts/slurm/ray.sh eval demo --out runs/demo
+#
+# The arguments are what follows `mikasa-vla`; --cluster auto is added. Submit it from the root of the
+# checkout, which all nodes must see under the same path. Not verified on a Slurm cluster.
+#
+#SBATCH --job-name=mikasa-vla-ray
+#SBATCH --nodes=2
+#SBATCH --ntasks-per-node=1
+#SBATCH --cpus-per-task=16
+#SBATCH --mem=64G
+#SBATCH --time=04:00:00
+#SBATCH --requeue
+#SBATCH --open-mode=append
+set -euo pipefail
+
+bin="${MIKASA_VLA_BIN:-.venv/bin}"
+nodes="${SLURM_JOB_NUM_NODES:?expected an allocation: sbatch --nodes=2 ray.sh …}"
+head="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)"
+address="$(srun --nodes=1 --ntasks=1 --nodelist="$head" hostname --ip-address | cut -d' ' -f1)"
+
+# Whoever reaches Ray's ports can run code: only processes of this job know the token.
+RAY_AUTH_TOKEN="$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')"
+export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
+
+# Starts Ray on each node, runs the command on the first one, and stops Ray everywhere.
+exec srun --nodes="$nodes" --ntasks="$nodes" --ntasks-per-node=1 \
+  "$bin/ray" symmetric-run --address "$address:6379" --min-nodes "$nodes" \
+  --num-cpus "${SLURM_CPUS_PER_TASK:-1}" --include-dashboard=false \
+  -- "$bin/mikasa-vla" "$@" --cluster auto
