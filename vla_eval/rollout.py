@@ -22,7 +22,9 @@ from vla_eval.core import (
     StepObserver,
     StepResult,
 )
+from vla_eval.cue_view import AS_SHOWN, CueBoxes, CueLocator, CueView, CueViewSettings
 from vla_eval.episode_log import EpisodeLog, check_chunk, check_first_inference, check_instruction
+from vla_eval.errors import SpecMismatchError
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import PolicySpec, check_compatible
 
@@ -39,6 +41,7 @@ class RolloutSettings:
         steps_after_success: with `stop_at_success`, continue for this many control steps.
         reset_policy_at_step: reset the policy in mid-episode: at the first inference at or after this
             control step it is reset for the episode, and is given no frame of an earlier step. None: never.
+        cue_view: what the policy is given to see of the cue; observers get what was rendered.
     """
 
     chunking: ChunkingSpec
@@ -46,6 +49,7 @@ class RolloutSettings:
     stop_at_success: bool = False
     steps_after_success: int = 0
     reset_policy_at_step: int | None = None
+    cue_view: CueViewSettings = AS_SHOWN
 
 
 @dataclass(slots=True, kw_only=True)
@@ -53,6 +57,7 @@ class _Running:
     """One running episode: what the policy has not been given yet, its chunks, its log."""
 
     log: EpisodeLog
+    view: CueView
     executor: ChunkExecutor
     window: list[Observation]
     reset_policy_at_step: int | None
@@ -91,8 +96,8 @@ def rollout(
         heartbeat: called with what is about to be done, for a watchdog.
 
     Raises:
-        SpecMismatchError: policy, environment and chunking do not fit together, or the first inference is
-            after the end of the episode.
+        SpecMismatchError: policy, environment, chunking and view of the cue do not fit together, or the first
+            inference is after the end of the episode.
         MissingInstructionError: an episode has no instruction.
         InvalidActionError: the policy returned something that is no finite chunk.
         SimulationError: the simulator returned a reward or a state that is not finite.
@@ -102,6 +107,11 @@ def rollout(
     for episode in episodes:
         check_instruction(episode)
         check_first_inference(episode, settings.chunking)
+    if settings.cue_view.hides and policy.spec.cameras and not isinstance(env, CueLocator):
+        raise SpecMismatchError(
+            f"cue_view={settings.cue_view.kind}: {env.spec.task}: this environment cannot tell where in its "
+            "images the cue is. Use another one, or leave this view out."
+        )
     loop = _Loop(env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat)
     running = loop.begin(episodes)
     while active := [episode for episode in running if not episode.done]:
@@ -134,15 +144,22 @@ class _Loop:
         for start in episodes:
             for observer in self.observers:
                 observer.on_reset(start, results[start.slot])
-        return [
-            _Running(
-                log=EpisodeLog.begin(start, results[start.slot]),
-                executor=ChunkExecutor(self.settings.chunking),
-                window=[results[start.slot].observation],
-                reset_policy_at_step=self.settings.reset_policy_at_step,
-            )
-            for start in episodes
-        ]
+        return [self._begun(start, results[start.slot]) for start in episodes]
+
+    def _begun(self, start: EpisodeStart, result: StepResult) -> _Running:
+        view = CueView(settings=self.settings.cue_view, locate=lambda: self._cue_boxes(start.slot))
+        return _Running(
+            log=EpisodeLog.begin(start, result),
+            view=view,
+            executor=ChunkExecutor(self.settings.chunking),
+            window=[view.seen(result.observation, result.status.phase)],
+            reset_policy_at_step=self.settings.reset_policy_at_step,
+        )
+
+    def _cue_boxes(self, slot: int) -> CueBoxes:
+        if isinstance(self.env, CueLocator) and self.policy.spec.cameras:
+            return self.env.cue_boxes(slot)
+        return {}
 
     def infer(self, active: Sequence[_Running]) -> None:
         """Ask the policy for a chunk for each episode that is due."""
@@ -188,7 +205,7 @@ class _Loop:
         for episode in active:
             slot = episode.start.slot
             episode.log.note_step(actions[slot], results[slot], self.env.spec.action)
-            episode.window.append(results[slot].observation)
+            episode.window.append(episode.view.seen(results[slot].observation, results[slot].status.phase))
             episode.done = _is_done(episode, results[slot], self.settings)
             for observer in self.observers:
                 observer.on_step(episode.start, actions[slot], results[slot])
@@ -197,7 +214,8 @@ class _Loop:
         """Whether the observation after the coming step must hold images."""
         step, spec = episode.step + 1, self.policy.spec
         is_last = step >= episode.start.horizon_steps
-        for_policy = self.settings.eager_rendering or (not is_last and _is_given(episode, spec, step))
+        is_given = not is_last and _is_given(episode, spec, step)
+        for_policy = self.settings.eager_rendering or is_given or episode.view.needs_images(step)
         return (bool(spec.cameras) and for_policy) or any(o.wants_images(step) for o in self.observers)
 
 

@@ -25,6 +25,7 @@ class Stream(IntEnum):
     POLICY = 7
     NOISE = 8
     DISTRACTOR = 9
+    SHUFFLE = 10
 
 
 def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:

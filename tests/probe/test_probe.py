@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from vla_eval.cli.main import main
+from vla_eval.config.appearance import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
+from vla_eval.evaluation.plan import results_config
 from vla_eval.probe.interventions import ProbeSettings, plan_probe
 from vla_eval.probe.phases import CUE_STEPS, default_delay_steps, inferences, phases_of
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -98,13 +100,18 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--task", "ChainOfColors3-v0", "--policy", "oracle", "--delay", "0", "12"]
-    arguments += ["--probe", "swap,order,blank,delay,distractor,interference,reset", "--no-controls"]
+    kinds = "swap,order,blank,freeze,mask,shuffle,late,delay,distractor,interference,reset"
+    arguments += ["--probe", kinds, "--mask", "elsewhere", "--late", "5", "--no-controls"]
     found = probe(tmp_path, capsys, *arguments)
     assert [(row["intervention"], row["level"]) for row in found["rows"]] == [
         ("none", None),
         ("swap", 1),
         ("order", 1),
         ("blank", None),
+        ("freeze", None),
+        ("mask", "elsewhere"),
+        ("shuffle", None),
+        ("late", 5),
         ("delay", 0),
         ("delay", 12),
         ("distractor", 3),
@@ -129,10 +136,10 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
         assert main([*again, style]) == 0
         output = capsys.readouterr()
         shown[style] = output.out
-        assert output.err.count(f"all {N} episodes are there") == 10
+        assert output.err.count(f"all {N} episodes are there") == 14
     assert shown["markdown"].splitlines()[2].startswith("| ChainOfColors3-v0 | oracle | 1 | none | 9 | — |")
     table = list(csv.DictReader(io.StringIO(shown["csv"])))
-    assert (len(table), table[0]["sensitivity"], table[1]["sensitivity"]) == (10, "", "1.0")
+    assert (len(table), table[0]["sensitivity"], table[1]["sensitivity"]) == (14, "", "1.0")
     assert "\\toprule" in shown["latex"]
 
 
@@ -220,6 +227,38 @@ def test_what_a_chunk_lets_a_policy_see_of_the_cue(k: int, in_cue: tuple[int, ..
     assert inferences(phases, k) == (in_cue, n_late)
     assert phases_of(task_spec("TakeItBack-v0"), {}) is None
     assert phases_of(task_spec("RememberColor3-v0"), {"cue_steps": (1, 5)}) == "cue_steps"
+
+
+def test_views_and_looks_are_fields_of_the_evaluation() -> None:
+    settings = ProbeSettings(probes=("freeze", "mask", "shuffle", "late", "appearance"), lates=(7,))
+    color = plan_probe(config(), settings)
+    assert [(one.intervention, one.level, one.config.cue_view) for one in color.worlds[:5]] == [
+        ("none", None, "as_shown"),
+        ("freeze", None, "first_frame"),
+        ("mask", "cue", "hidden"),
+        ("mask", "elsewhere", "hidden_elsewhere"),
+        ("mask", "later", "hidden_later"),
+    ]
+    late, *looks = color.worlds[5:]
+    assert (late.config.env["cue_after_steps"], late.config.env["horizon_steps"]) == (7, 67)
+    assert [one.level for one in looks] == ["light", "camera", "table", "hue"]
+    assert len({one.config.appearance for one in (late, *looks)}) == 5
+    assert color.left_out == ("shuffle on RememberColor3-v0: its cue is not several items one after another",)
+
+    shells = plan_probe(config(tasks=("ShellGameTouch-v0",)), settings)  # without a delay
+    assert [one.level for one in shells.worlds if one.intervention == "mask"] == ["cue", "elsewhere"]
+    ball = plan_probe(config(tasks=("InterceptMedium-v0",)), settings)
+    assert {one.intervention for one in ball.worlds} == {"none", "appearance"}
+    fake = plan_probe(config(simulator="fake"), settings)
+    assert "appearance" not in {one.intervention for one in fake.worlds}
+
+
+def test_what_is_not_changed_is_not_in_the_settings_that_a_run_is_resumed_by() -> None:
+    plain, hidden = results_config(config()), results_config(config(cue_view="hidden"))
+    assert not {"cue_view", "appearance"} & set(plain)
+    assert hidden == {**plain, "cue_view": "hidden"}
+    darker = results_config(config(appearance=AppearanceSettings(light=0.5)))
+    assert darker["appearance"]["light"] == 0.5
 
 
 def test_instructions_are_prompt_sets_other_than_that_of_the_evaluation() -> None:

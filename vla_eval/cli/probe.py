@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +30,12 @@ if TYPE_CHECKING:
 DESCRIPTION = """Run each task as it is and with one thing changed, on the same seeds, and compare.
 
 swap: another cue in the same scene. Who follows the cue chooses what was shown in each of the two worlds.
-order: the same items in another order (Seq, Chain). blank: the cue phase passes without a cue.
-cue, delay: other lengths of the phase. delay_swap: a swap after each delay. distractor: another item is
-seen in the delay. interference: the arm is moved in the delay. reset: the policy is reset in mid-episode.
-instruction: other sentences.
+order: the same items in another order (Seq, Chain). shuffle: as order, with the right answer as before.
+blank: the cue phase passes without a cue. freeze: the policy sees the cue's first frame throughout.
+mask: part of the image is hidden. late: nothing is shown before the cue. cue, delay: other lengths of the
+phase. delay_swap: a swap after each delay. distractor: another item is seen in the delay. interference: the
+arm is moved in the delay. reset: the policy is reset in mid-episode. instruction: other sentences.
+appearance: light, camera, colours.
 
 With --grid, chunk lengths against the lengths of the phases: what of the cue falls into an inference?
 
@@ -85,6 +87,19 @@ def _add_interventions(parser: argparse.ArgumentParser) -> None:
         "--delay", **many, type=int, dest="delays", metavar="L", help="steps (0 5 10 20 40 80 160 320)"
     )
     parser.add_argument("--cue", **many, type=int, dest="cues", metavar="L", help="steps of the cue (1 2 3)")
+    parser.add_argument(
+        "--mask", **many, dest="masks", metavar="M", help="what is hidden (cue elsewhere later)"
+    )
+    parser.add_argument(
+        "--late", **many, type=int, dest="lates", metavar="L", help="steps before the cue (5 20)"
+    )
+    parser.add_argument(
+        "--appearance",
+        **many,
+        dest="appearances",
+        metavar="A",
+        help="what looks different (light camera table hue)",
+    )
     parser.add_argument("--distract", **many, type=int, dest="distractors", metavar="L", help="steps (3)")
     parser.add_argument(
         "--instruction",
@@ -137,18 +152,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> "ProbeSettings":
     from vla_eval.probe.interventions import PROBES, ProbeSettings
+    from vla_eval.probe.views import APPEARANCES, MASKS
 
     chosen: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(getattr(args, name), name) for name in FLAGS
     }
     if args.instructions is not None:
         chosen["instructions"] = tuple(dict.fromkeys(args.instructions))
-    if args.probes is not None:
-        probes = tuple(dict.fromkeys(word for words in args.probes for word in words))
-        for word in probes:
-            if word not in PROBES:
-                raise unknown_name("probe", word, PROBES, where="--probe")
-        chosen["probes"] = probes
+    words = None if args.probes is None else [word for words in args.probes for word in words]
+    chosen["probes"] = _names(words, PROBES, kind="probe", flag="--probe")
+    chosen["masks"] = _names(args.masks, MASKS, kind="mask", flag="--mask")
+    chosen["appearances"] = _names(args.appearances, APPEARANCES, kind="appearance", flag="--appearance")
     given = {name: value for name, value in chosen.items() if value is not None}
     return ProbeSettings(**given, controls=not args.no_controls)
 
@@ -182,11 +196,21 @@ FLAGS = {
     "swaps": ("--swap", 1),
     "delays": ("--delay", 0),
     "cues": ("--cue", 1),
+    "lates": ("--late", 1),
     "distractors": ("--distract", 1),
     "reset_steps": ("--reset-at", 1),
 }
 """Attribute -> flag and least value."""
 GRID_FLAGS = {"first_inferences": ("--first-inference", 0)}
+
+
+def _names(
+    words: list[str] | None, known: Collection[str], *, kind: str, flag: str
+) -> tuple[str, ...] | None:
+    for word in words or ():
+        if word not in known:
+            raise unknown_name(kind, word, known, where=flag)
+    return None if words is None else tuple(dict.fromkeys(words))
 
 
 def _numbers(values: list[int] | None, name: str) -> tuple[int, ...] | None:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
+
 SimBackend = Literal["cpu", "gpu"]
 HUMAN_CAMERA = "human_camera"
 """Name of the camera for people; no policy can request it."""
@@ -39,6 +41,7 @@ class EnvSettings:
         simulator: `maniskill`, or `fake` (arrays only, for tests and dry runs).
         sim_backend: where the physics runs.
         render: how images are rendered.
+        appearance: how the scene looks.
         cameras: the cameras that may be rendered; empty: no renderer is started.
         privileged: whether observations carry the true state of the world.
         human_camera_stride: every so many control steps, and at the reset, images include `human_camera`,
@@ -51,6 +54,7 @@ class EnvSettings:
     simulator: Simulator = "maniskill"
     sim_backend: SimBackend = "cpu"
     render: RenderSettings = field(default_factory=RenderSettings)
+    appearance: AppearanceSettings = AS_DESIGNED
     cameras: tuple[str, ...] = ()
     privileged: bool = False
     human_camera_stride: int | None = None

@@ -16,10 +16,12 @@ from vla_eval.bounds import (
     require,
 )
 from vla_eval.chunking import ChunkingSettings
+from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
 from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
 from vla_eval.config.files import check_run_name
 from vla_eval.config.renamed import formerly
+from vla_eval.cue_view import CueViewKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,10 +58,12 @@ class EvalConfig:
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
     chunking: ChunkingSettings = field(default_factory=ChunkingSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
+    appearance: AppearanceSettings = AS_DESIGNED
     simulator: Simulator = "maniskill"
     sim_backend: SimBackend = "cpu"
     stop_at_success: bool = False
     reset_policy_at_step: int | None = None
+    cue_view: CueViewKind = "as_shown"
     eager_rendering: bool = False
     slots_per_worker: int = 1
     inference: Literal["auto", "in_process", "shared"] = "auto"

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
+from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
@@ -34,13 +36,17 @@ STATIC_ACTION = 0.2  # the point counts as at rest if every dimension is below i
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
 MAX_ITEMS = 100
-DISTRACTOR_LEVEL = 255  # of the first rows of an image; no cue has it
+CUE_ROWS = 8  # of an image: they show the cue, or what distracts
+DISTRACTOR_LEVEL = 255  # of these rows; no cue has it
 RULES = {
     **{"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False},
-    **{"move_in_delay": False, "distract_steps": 0},
+    **{"move_in_delay": False, "distract_steps": 0, "cue_after_steps": 0},
 }
 CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5, **RULES}
-SEVERAL_DEFAULTS = {"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0, **RULES}
+SEVERAL_DEFAULTS = {
+    **{"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0},
+    **{**RULES, "shuffle_cue": False},
+}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
 
 Vector = NDArray[np.float64]
@@ -67,8 +73,9 @@ class FakeEnv:
 
     Args:
         settings: `kwargs` may hold `horizon_steps` and `swap_cue`; `n_items`, `n_shown`, `cue_steps`,
-            `delay_steps`, `swap_order`, `show_cue`, `freeze_until_choice`, `move_in_delay`,
-            `distract_steps`, `strict_choice` for tasks with candidates; `velocity_range_m_s` for the others.
+            `delay_steps`, `swap_order`, `shuffle_cue`, `cue_after_steps`, `show_cue`,
+            `freeze_until_choice`, `move_in_delay`, `distract_steps`, `strict_choice` for tasks with
+            candidates; `velocity_range_m_s` for the others.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
@@ -87,15 +94,22 @@ class FakeEnv:
         self._in_order = task.memory == "sequential"
         self._touch_reach_m = MUG_REACH_M if task.id.startswith("ShellGame") else REACH_M
         self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
-        self._cue_steps: int = arguments.get("cue_steps", 0)
+        self._cue_after_steps: int = arguments.get("cue_after_steps", 0)
+        self._cue_steps: int = self._cue_after_steps + arguments.get("cue_steps", 0)
         self._response_step: int = self._cue_steps + arguments.get("delay_steps", 0)
         self._swap_cue: int = arguments["swap_cue"]
         self._swap_order: int = arguments.get("swap_order", 0)
+        self._shuffles_cue: bool = arguments.get("shuffle_cue", False)
         self._shows_cue: bool = arguments.get("show_cue", True)
         self._is_frozen: bool = arguments.get("freeze_until_choice", False)
         self._moves_in_delay: bool = arguments.get("move_in_delay", False)
         self._distract_steps: int = arguments.get("distract_steps", 0)
         self._is_strict: bool = arguments.get("strict_choice", False)
+        if settings.appearance != AS_DESIGNED:
+            raise TaskArgumentError(
+                f"appearance: {task.id}: the fake simulator has no lights and no colours. Use the simulator "
+                "'maniskill', or remove this setting."
+            )
         self._settings = settings
         self._episodes: dict[int, _Episode] = {}
         self.n_renders = 0
@@ -140,6 +154,10 @@ class FakeEnv:
         action = np.zeros(len(ACTION.dims), dtype=np.float32)
         action[-1] = self._episodes[slot].gripper_width_m / GRIPPER_MAX_M * 2 - 1
         return action
+
+    def cue_boxes(self, slot: int) -> CueBoxes:
+        """Return the first rows of each image; see `CueLocator`."""
+        return {camera.name: (PixelBox(0, CUE_ROWS, 0, CAMERA_SIZE_PX),) for camera in CAMERAS}
 
     def close(self) -> None:
         """Forget all episodes."""
@@ -217,7 +235,7 @@ class FakeEnv:
         return "cue" if episode.step < self._cue_steps else "delay"
 
     def _is_in_view(self, episode: _Episode) -> bool:
-        return self._shows_cue and self._phase(episode) == "cue"
+        return self._shows_cue and self._cue_after_steps <= episode.step < self._cue_steps
 
     def _result(self, slot: int, *, render: bool) -> StepResult:
         episode = self._episodes[slot]
@@ -273,10 +291,11 @@ class FakeEnv:
         )
         picture = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
         in_view = self._is_in_view(episode) and episode.targets
-        picture[:8] = 20 * (episode.targets[0] + 1) if in_view else 0
+        shown = episode.targets[1 if self._shuffles_cue else 0] if in_view else 0
+        picture[:CUE_ROWS] = 20 * (shown + 1) if in_view else 0
         first = self._cue_steps + (self._response_step - self._cue_steps - self._distract_steps) // 2
         if first <= episode.step < first + self._distract_steps:
-            picture[:8] = DISTRACTOR_LEVEL
+            picture[:CUE_ROWS] = DISTRACTOR_LEVEL
         return picture
 
     def _privileged(self, episode: _Episode) -> PrivilegedState:
@@ -305,7 +324,7 @@ class FakeEnv:
 def _argument_type(name: str) -> Any:  # Any: a type annotation
     if name == "velocity_range_m_s":
         return tuple[float, ...]
-    return bool if isinstance(RULES.get(name), bool) else int
+    return bool if isinstance(SEVERAL_DEFAULTS.get(name), bool) else int
 
 
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them

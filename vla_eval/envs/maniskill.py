@@ -16,10 +16,13 @@ import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
+from vla_eval.cue_view import CueBoxes
+from vla_eval.envs.cue_location import boxes_of_cue
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
+from vla_eval.tasks.appearance import with_appearance
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_argument, check_arguments
@@ -113,6 +116,11 @@ class ManiSkillEnv:
         index, row = divmod(slot, self._slots_per_env)
         return _array(self._envs[index].hold_action()[row])
 
+    def cue_boxes(self, slot: int) -> CueBoxes:
+        """Return where in the images the cue is; see `CueLocator`."""
+        index, row = divmod(slot, self._slots_per_env)
+        return boxes_of_cue(self._envs[index], row, self._settings.cameras)
+
     def close(self) -> None:
         """Release the simulator."""
         for env in self._envs:
@@ -183,7 +191,7 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
     if backend != "none":
         use_lean_shaders()
     try:
-        return cls(
+        return with_appearance(cls, settings.appearance)(
             num_envs=num_envs,
             obs_mode="none",
             reward_mode="normalized_dense",

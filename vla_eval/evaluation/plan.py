@@ -10,10 +10,12 @@ from itertools import product
 from typing import Any, NamedTuple
 
 from vla_eval.bounds import MAX_EPISODES
+from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, content_of, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
+from vla_eval.cue_view import CueViewSettings
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.inference_choice import (
     INFERENCE_FIELDS,
@@ -272,6 +274,10 @@ def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
         del data["reset_policy_at_step"]
     if config.chunking.first_inference_step == 0:
         del data["chunking"]["first_inference_step"]
+    if config.cue_view == "as_shown":
+        del data["cue_view"]
+    if config.appearance == AS_DESIGNED:
+        del data["appearance"]
     return data
 
 
@@ -330,6 +336,7 @@ def _groups(
                 simulator=config.simulator,
                 sim_backend=config.sim_backend,
                 render=config.render,
+                appearance=config.appearance,
                 n_slots=config.slots_per_worker,
             ),
             rollout=RolloutSettings(
@@ -337,6 +344,9 @@ def _groups(
                 eager_rendering=config.eager_rendering,
                 stop_at_success=config.stop_at_success,
                 reset_policy_at_step=config.reset_policy_at_step,
+                cue_view=CueViewSettings(
+                    kind=config.cue_view, begins_at=config.env.get("cue_after_steps", 0)
+                ),
             ),
             instruction=instruction,
             n_rows=n_rows,

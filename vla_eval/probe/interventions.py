@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.cue_view import CueViewKind
 from vla_eval.errors import RecipeError
 from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
+from vla_eval.probe.views import APPEARANCES, MASKS
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
@@ -20,6 +23,10 @@ Intervention = Literal[
     "swap",
     "order",
     "blank",
+    "freeze",
+    "mask",
+    "shuffle",
+    "late",
     "cue",
     "delay",
     "delay_swap",
@@ -27,10 +34,11 @@ Intervention = Literal[
     "interference",
     "reset",
     "instruction",
+    "appearance",
 ]
 PROBES: tuple[Intervention, ...] = (
-    *("swap", "order", "blank", "cue", "delay", "delay_swap", "distractor"),
-    *("interference", "reset", "instruction"),
+    *("swap", "order", "blank", "freeze", "mask", "shuffle", "late", "cue", "delay", "delay_swap"),
+    *("distractor", "interference", "reset", "instruction", "appearance"),
 )
 SWAPS: tuple[Intervention, ...] = ("swap", "order", "delay_swap")
 """Interventions whose worlds have another right answer than the world that they are compared with."""
@@ -38,6 +46,7 @@ DEFAULT_PROBES: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
 DEFAULT_DELAYS = (0, 5, 10, 20, 40, 80, 160, 320)
 DEFAULT_CUES = (1, 2, 3)
 DEFAULT_DISTRACTORS = (3,)
+DEFAULT_LATE = (5, 20)
 DEFAULT_INSTRUCTIONS = ("paraphrased", "other_task", "no_content")
 
 Level = int | str | None
@@ -51,7 +60,16 @@ ITEMS = ("items", "cubes")
 """Kinds of candidates that can be shown, and so can distract."""
 LEAST_MOTION_STEPS = 2
 """One step out and one back."""
-OWN_ARGUMENTS = ("swap_cue", "swap_order", "show_cue", "distract_steps", "move_in_delay")
+OWN_ARGUMENTS = (
+    *("swap_cue", "swap_order", "show_cue", "shuffle_cue", "cue_after_steps", "distract_steps"),
+    "move_in_delay",
+)
+OWN_FIELDS: Mapping[str, object] = {
+    "reset_policy_at_step": None,
+    "cue_view": "as_shown",
+    "appearance": AS_DESIGNED,
+}
+"""Fields of an evaluation that a probe changes, and their values in the world as drawn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +81,9 @@ class ProbeSettings:
         swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
         delays: values of `env.delay_steps`.
         cues: values of `env.cue_steps`.
+        masks: keys of `MASKS`.
+        lates: values of `env.cue_after_steps`.
+        appearances: keys of `APPEARANCES`.
         distractors: values of `env.distract_steps`.
         instructions: prompt sets.
         reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
@@ -74,6 +95,9 @@ class ProbeSettings:
     swaps: tuple[int, ...] = (1,)
     delays: tuple[int, ...] = DEFAULT_DELAYS
     cues: tuple[int, ...] = DEFAULT_CUES
+    masks: tuple[str, ...] = tuple(MASKS)
+    lates: tuple[int, ...] = DEFAULT_LATE
+    appearances: tuple[str, ...] = tuple(APPEARANCES)
     distractors: tuple[int, ...] = DEFAULT_DISTRACTORS
     instructions: tuple[str, ...] = DEFAULT_INSTRUCTIONS
     reset_steps: tuple[int, ...] = ()
@@ -146,12 +170,17 @@ WHY_NOT: Mapping[Intervention, str] = {
     "swap": "no other cue was asked for",
     "order": "its cue is not shown one item after another",
     "blank": "it has no cue phase",
+    "freeze": "it has no cue phase",
+    "mask": "it has no cue phase, or a mask that comes later needs a delay",
+    "shuffle": "its cue is not several items one after another",
+    "late": "it has no cue phase",
     "cue": "it has no cue phase",
     "delay": "it has no delay",
     "delay_swap": "it has no delay",
     "distractor": "it has no items, or its delay is shorter than the distractor",
     "interference": "it has no delay of two steps or more",
     "instruction": "the only prompt set that was named is that of the evaluation",
+    "appearance": "no change of appearance was named, or the simulator has none",
     "reset": "it has no phases; name the steps with --reset-at",
 }
 
@@ -174,6 +203,16 @@ class _Task:
             return [self.world(probe, swap, {"swap_order": swap}) for swap in swaps]
         if probe == "blank":
             return [self.world(probe, None, {"show_cue": False})] if has_phases else []
+        if probe == "freeze":
+            return [self._seeing(probe, None, "first_frame")] if has_phases else []
+        if probe == "mask":
+            return self._masking() if has_phases else []
+        if probe == "shuffle":
+            return self._shuffling()
+        if probe == "late":
+            return self._late() if has_phases else []
+        if probe == "appearance":
+            return self._looking()
         if probe == "cue":
             return self._of_lengths(probe, settings.cues) if has_phases else []
         if probe == "delay":
@@ -207,6 +246,36 @@ class _Task:
         ]
         usual = self.world("swap", swap, {"swap_cue": swap})
         return [usual, *delays, *swapped]
+
+    def _seeing(self, probe: Intervention, level: Level, view: CueViewKind) -> World:
+        world = self.world(probe, level, {})
+        return replace(world, config=replace(world.config, cue_view=view))
+
+    def _masking(self) -> list[World]:
+        has_delay = self._phases().delay_steps > 0
+        masks = [mask for mask in self.settings.masks if mask != "later" or has_delay]
+        return [self._seeing("mask", mask, MASKS[mask]) for mask in masks]
+
+    def _shuffling(self) -> list[World]:
+        if not self.spec.shows_one_by_one or self._phases().n_in_turn < 2:
+            return []
+        return [self.world("shuffle", None, {"shuffle_cue": True})]
+
+    def _late(self) -> list[World]:
+        horizon_steps = self._phases().horizon_steps
+        return [
+            self.world("late", steps, {"cue_after_steps": steps, "horizon_steps": horizon_steps + steps})
+            for steps in self.settings.lates
+        ]
+
+    def _looking(self) -> list[World]:
+        if self.config.simulator == "fake":
+            return []
+        return [self._looking_like(name) for name in self.settings.appearances]
+
+    def _looking_like(self, name: str) -> World:
+        world = self.world("appearance", name, {})
+        return replace(world, config=replace(world.config, appearance=APPEARANCES[name]))
 
     def _distracting(self) -> list[World]:
         if self.spec.candidates not in ITEMS:
@@ -277,5 +346,9 @@ def refuse_own_arguments(config: EvalConfig) -> None:
             raise RecipeError(
                 f"env.{name}: a probe sets this argument itself. `mikasa-vla eval` lets you set it."
             )
-    if config.reset_policy_at_step is not None:
-        raise RecipeError("reset_policy_at_step: a probe sets this field itself. Use --reset-at.")
+    for name, as_drawn in OWN_FIELDS.items():
+        if getattr(config, name) != as_drawn:
+            raise RecipeError(
+                f"{name}: a probe sets this field itself. `mikasa-vla eval` lets you set it; --reset-at, "
+                "--mask and --appearance choose what a probe sets."
+            )

@@ -25,6 +25,7 @@ class Phases:
     """The phases of a task whose lengths are not drawn per episode.
 
     Attributes:
+        cue_after_steps: control steps before the cue.
         cue_steps: control steps for which the cue, or each of its items, is shown.
         n_in_turn: how many items are shown one after another; 1 if all are shown at once.
         gap_steps: steps between two of them.
@@ -32,6 +33,7 @@ class Phases:
         horizon_steps: length of the episode.
     """
 
+    cue_after_steps: int
     cue_steps: int
     n_in_turn: int
     gap_steps: int
@@ -41,7 +43,8 @@ class Phases:
     @property
     def cue_end_step(self) -> int:
         """The first step after the cue."""
-        return total_cue_steps(self.cue_steps, self.n_in_turn, self.gap_steps)
+        of_all = total_cue_steps(self.cue_steps, self.n_in_turn, self.gap_steps)
+        return self.cue_after_steps + of_all
 
     @property
     def response_step(self) -> int:
@@ -51,7 +54,8 @@ class Phases:
     def shows_at(self, step: int) -> bool:
         """Whether a cue is in view at this step."""
         turn_steps = self.cue_steps + self.gap_steps
-        return step < self.cue_end_step and step % turn_steps < self.cue_steps
+        since = step - self.cue_after_steps
+        return since >= 0 and step < self.cue_end_step and since % turn_steps < self.cue_steps
 
     def with_length(self, phase: Literal["cue", "delay"], steps: int) -> dict[str, int]:
         """Return the arguments that give a phase this length, and the response as many steps as before."""
@@ -72,15 +76,18 @@ def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  #
         "cue_steps": CUE_STEPS,
         "delay_steps": default_delay_steps(spec),
         "gap_steps": 0,
+        "cue_after_steps": 0,
         **spec.kwargs,
         **env,
     }
-    for name in ("cue_steps", "delay_steps", "gap_steps", "horizon_steps"):
+    for name in ("cue_after_steps", "cue_steps", "delay_steps", "gap_steps", "horizon_steps"):
         if name in given and (not isinstance(given[name], int) or isinstance(given[name], bool)):
             return name
     n_in_turn = int(given["n_shown"]) if spec.shows_one_by_one else 1
-    wait_steps = total_cue_steps(given["cue_steps"], n_in_turn, given["gap_steps"]) + given["delay_steps"]
+    cue_steps = total_cue_steps(given["cue_steps"], n_in_turn, given["gap_steps"])
+    wait_steps = given["cue_after_steps"] + cue_steps + given["delay_steps"]
     return Phases(
+        cue_after_steps=given["cue_after_steps"],
         cue_steps=given["cue_steps"],
         n_in_turn=n_in_turn,
         gap_steps=given["gap_steps"],
@@ -108,7 +115,10 @@ def fixed_phases(spec: TaskSpec, env: Mapping[str, Any]) -> Phases:  # Any: a ta
 def divides(phases: Phases, n_action_steps: int) -> bool:
     """Whether each phase, and each item of the cue, begins with an inference if the first one is at 0."""
     turn_steps = phases.cue_steps + phases.gap_steps
-    begins = (phases.cue_end_step, phases.response_step, turn_steps if phases.n_in_turn > 1 else 0)
+    begins = (
+        *(phases.cue_after_steps, phases.cue_end_step, phases.response_step),
+        turn_steps if phases.n_in_turn > 1 else 0,
+    )
     return all(step % n_action_steps == 0 for step in begins)
 
 

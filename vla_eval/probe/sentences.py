@@ -38,6 +38,11 @@ def _clause(row: ProbeRow) -> str | None:
     where = {
         "none": "follows the cue in",
         "blank": "with a blank cue in",
+        "freeze": "with the first frame of the cue throughout in",
+        "mask": f"{_hidden(row)} in",
+        "shuffle": "with the items shown in another order than is right in",
+        "late": f"with a cue that begins at step {row.level} in",
+        "appearance": f"with another {row.level} in",
         "cue": f"with a cue of {row.level} steps in",
         "distractor": f"with a distractor for {row.level} steps in",
         "interference": "after a motion of the arm in the delay in",
@@ -48,6 +53,11 @@ def _clause(row: ProbeRow) -> str | None:
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
     idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
     return f"{where} {_of(row.followed)}{chance}{idle}"
+
+
+def _hidden(row: ProbeRow) -> str:
+    where = {"cue": "the cue", "elsewhere": "as much of the image beside it"}
+    return f"with {where.get(str(row.level), 'its place in the delay')} hidden"
 
 
 def _of(share: Share) -> str:

@@ -24,8 +24,9 @@ class CueFrames(NamedTuple):
 def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
     """Return how many frames of the cue a row's policy got per episode.
 
-    The observation at step s shows the cue if s < cue_steps. A policy that reads the last frame gets those
-    at steps 0, K, 2K, …; one that reads every frame gets all of them before it predicts.
+    The observation at step s shows the cue if s < cue_steps, counted from `cue_after_steps` on. A policy that
+    reads the last frame gets those of the steps 0, K, 2K, … that are among these; one that reads every frame
+    gets all of them before it predicts.
 
     Args:
         group: the row; its records show whether the policy got every frame.
@@ -46,7 +47,10 @@ def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None: 
     if _reads_every_frame(group):
         return CueFrames(fewest, most)
     k = group.key.n_action_steps
-    return CueFrames(-(-fewest // k), -(-most // k))  # rounded up: there is always an inference at step 0
+    after = arguments.get("cue_after_steps", 0)
+    # Inferences before a step: rounded up, as there is one at step 0.
+    earlier, by_fewest, by_most = (-(-step // k) for step in (after, after + fewest, after + most))
+    return CueFrames(by_fewest - earlier, by_most - earlier)
 
 
 def _reads_every_frame(group: RowEpisodes) -> bool:

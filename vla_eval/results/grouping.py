@@ -17,7 +17,7 @@ from vla_eval.storage.run_folder import StoredRun
 
 VARIANT_FIELDS = (
     *("env", "chunking", "render", "stop_at_success", "reset_policy_at_step", "prompt_set", "simulator"),
-    "sim_backend",
+    *("sim_backend", "cue_view", "appearance"),
 )
 """Fields of a configuration that affect success rates and are not part of an episode's key."""
 

@@ -4,7 +4,7 @@ Knows where candidates may lie, which one is touched first, and when the choice 
 defines what the candidates are and how the cue is shown.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,16 @@ from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
 
 NO_CHOICE = -1
+
+Place = tuple[float, float, float]
+"""x, y, z in m, world frame."""
+
+
+class CueSize(NamedTuple):
+    """A box upright on the table that holds a shown object whose place is in the middle of its base."""
+
+    half_width_m: float
+    height_m: float
 
 
 class ChoiceEnv(MemoryTableEnv):
@@ -28,6 +38,7 @@ class ChoiceEnv(MemoryTableEnv):
         strict_choice: the first wrong candidate that is touched ends the episode as a failure.
         show_cue: False: the cue phase passes without showing anything. Everything else is the same for
             the same seed. So a policy that is as good without the cue as with it does not need it.
+        cue_after_steps: the cue phase begins with so many steps in which nothing is shown.
     """
 
     REACH_SCALE_PER_M: float
@@ -41,6 +52,7 @@ class ChoiceEnv(MemoryTableEnv):
         goal_threshold_m: float,
         strict_choice: bool = False,
         show_cue: bool = True,
+        cue_after_steps: int = 0,
         **kwargs: Any,
     ) -> None:
         """Check the threshold and build the scene."""
@@ -49,6 +61,7 @@ class ChoiceEnv(MemoryTableEnv):
         self.goal_threshold_m = goal_threshold_m
         self.strict_choice = strict_choice
         self.show_cue = show_cue
+        self.cue_after_steps = cue_after_steps
         super().__init__(*args, **kwargs)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
@@ -65,6 +78,18 @@ class ChoiceEnv(MemoryTableEnv):
         self._first_choice[mask] = NO_CHOICE
         self._touch_rank[mask] = 0
         self._touched_wrongly[mask] = False
+
+    def total_cue_steps(self, cue_steps: int) -> int:
+        """Return the length of the cue phase, the steps before the cue included."""
+        return self.cue_after_steps + super().total_cue_steps(cue_steps)
+
+    def cue_places_m(self, env: int) -> list[Place]:
+        """Return where objects are shown as the cue of one environment's episode, each on the table."""
+        raise NotImplementedError
+
+    def cue_size_m(self) -> CueSize:
+        """Return a size that no object that is shown exceeds."""
+        raise NotImplementedError
 
     def candidate_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
@@ -98,8 +123,9 @@ class ChoiceEnv(MemoryTableEnv):
 
     def shown_candidates(self, env: int) -> tuple[int, ...]:
         """Return the right candidates of one environment's episode whose cue is in view now."""
-        in_cue = bool(self._elapsed_steps[env] < self._cue_end_step[env])
-        return self.right_candidates(env) if in_cue and self.show_cue else ()
+        step = int(self._elapsed_steps[env])
+        in_view = self.cue_after_steps <= step < int(self._cue_end_step[env])
+        return self.right_candidates(env) if in_view and self.show_cue else ()
 
     def right_first_choices(self, env: int) -> tuple[int, ...]:
         """Return the candidates that are right as a first touch."""

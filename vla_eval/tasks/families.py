@@ -13,7 +13,7 @@ from vla_eval.config.decoding import check_value
 from vla_eval.errors import RecipeError, TaskArgumentError
 from vla_eval.tasks.spec import TaskSpec
 
-CHOICE_ARGUMENTS = ("strict_choice", "show_cue")
+CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
 """Arguments that only tasks with candidates have."""
 
 

@@ -13,10 +13,11 @@ from mani_skill.utils.structs import Actor
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.choice import ChoiceEnv
+from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
 from vla_eval.tasks.items import Item, build_decoy, build_item
 from vla_eval.tasks.layout import Plane, jittered, slot_centres_m
 
+WIDEST_HALF_M = 0.03
 UPRIGHT_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -156,6 +157,15 @@ class ItemChoiceEnv(ChoiceEnv):
         self.move(self.candidates[index], moved if self._hides_items else seen, pose)
         if self._hides_items:
             self.move(self.decoys[index], seen, pose)
+
+    def cue_places_m(self, env: int) -> list[Place]:
+        """Return where items are shown as the cue, on the table, world frame."""
+        return [(0.0, 0.0, 0.0)]
+
+    def cue_size_m(self) -> CueSize:
+        """Return a size that no item exceeds: a cross is 6 cm wide."""
+        highest = max(item.shape.rest_height_m for item in self.items)
+        return CueSize(half_width_m=max(WIDEST_HALF_M, highest), height_m=2 * highest)
 
     def _set_visible(self, mask: torch.Tensor, visible: bool) -> None:
         """Let the items be seen or not, if decoys show the cue: on the CPU simulator alone."""

@@ -71,7 +71,7 @@ class RememberEnv(ItemChoiceEnv):
         return self.n_items - 1
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
-        cue_begins = mask & (step == 0) & (self._cue_end_step > 0) & self.show_cue
+        cue_begins = mask & (step == self.cue_after_steps) & (self._cue_end_step > step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
         self._show_in_middle(cue_begins, self._drawn, self._target)

@@ -6,12 +6,15 @@ They differ in how the cubes are shown (together, or one after another) and whet
 import math
 from typing import Any
 
+import numpy as np
 import sapien
 import torch
+from numpy.typing import NDArray
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.chance import chance_of_several
+from vla_eval.tasks.choice import Place
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
 from vla_eval.tasks.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
 from vla_eval.tasks.memory_env import nearness
@@ -25,6 +28,9 @@ BUNCH_SQUEEZE_M = 0.015
 MAX_STEPS = 10_000  # of anything: 500 s
 FOUND_REWARD = 90.0
 MISTAKE_REWARD = -10.0
+
+Order = NDArray[np.int64]
+"""(L,) the cubes that are shown, in their order."""
 
 
 def bunch_place_m(color: int, n_colors: int) -> tuple[float, float]:
@@ -66,7 +72,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
     together), `gap_steps` of empty table between two of them, `dwell_steps`, `cube_half_size_m`, and
     those of `ChoiceEnv` and `MemoryTableEnv`. `swap_cue` shows another cube instead of the first one;
     `swap_order` k exchanges the first cube and the one k later, if they are shown one after another (the
-    right answer changes only if the order counts). `strict_choice` ends the episode at the first mistake.
+    right answer changes only if the order counts). `shuffle_cue` shows the drawn cubes in another order,
+    drawn per episode, and leaves the right answer as it is. `strict_choice` ends the episode at the first
+    mistake.
 
     Chance level: for L of N, 1 / C(N, L); in order, 1 / (N (N - 1) … (N - L + 1)).
 
@@ -87,6 +95,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         gap_steps: int = 0,
         dwell_steps: int = 1,
         swap_order: int = 0,
+        shuffle_cue: bool = False,
         goal_threshold_m: float = TOUCH_RADIUS_M,
         cube_half_size_m: float = CUBE_HALF_SIZE_M,
         phase_gate_success: bool = True,
@@ -107,6 +116,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
         self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
         most = n_shown - 1 if self.ONE_BY_ONE else 0
         self.swap_order = self._checked_swap("swap_order", swap_order, most=most)
+        if shuffle_cue and most == 0:
+            raise TaskArgumentError("shuffle_cue: the cue of this task is not several cubes in turn.")
+        self.shuffle_cue = shuffle_cue
         self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
         shape = cube(cube_half_size_m)
         items = tuple(Item(shape, color) for color in COLORS[:n_items])
@@ -118,7 +130,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def total_cue_steps(self, cue_steps: int) -> int:
         """Return the length of the cue phase if each cube is shown for `cue_steps`."""
-        return total_cue_steps(cue_steps, self.n_shown if self.ONE_BY_ONE else 1, self.gap_steps)
+        of_all = total_cue_steps(cue_steps, self.n_shown if self.ONE_BY_ONE else 1, self.gap_steps)
+        return super().total_cue_steps(of_all)
 
     def chance_success(self) -> float:
         """Return the success rate of a perfect arm that knows how many cubes were shown, not which."""
@@ -130,6 +143,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         super()._load_scene(options)
         self._sequence = torch.zeros(self.num_envs, self.n_shown, dtype=torch.long, device=self.device)
         self._drawn_sequence = torch.zeros_like(self._sequence)
+        self._seen_sequence = torch.zeros_like(self._sequence)
         self._is_shown = torch.zeros_like(self._touch_rank, dtype=torch.bool)
         self._is_drawn = torch.zeros_like(self._is_shown)
         self._near = torch.full_like(self._target, -1)
@@ -143,15 +157,24 @@ class SeveralColorsEnv(ItemChoiceEnv):
         shown[[0, self.swap_order]] = shown[[self.swap_order, 0]]
         self._drawn_sequence[env] = torch.as_tensor(drawn[: self.n_shown])
         self._sequence[env] = torch.as_tensor(shown)
+        self._seen_sequence[env] = torch.as_tensor(self._shuffled(env, shown) if self.shuffle_cue else shown)
         for flags, sequence in ((self._is_drawn, self._drawn_sequence), (self._is_shown, self._sequence)):
             flags[env] = False
             flags[env, sequence[env]] = True
         self._sample_slots(env)
         self._sample_distractor(env, {int(index) for index in (*drawn[: self.n_shown], *shown)})
 
+    def _shuffled(self, env: int, shown: Order) -> Order:
+        """Return the cubes in another order than they have; each of the others is as probable."""
+        rng = self.episode_generator(env, Stream.SHUFFLE)
+        shuffled = shown
+        while np.array_equal(shuffled, shown):
+            shuffled = rng.permutation(shown)
+        return shuffled
+
     def is_swapped(self) -> bool:
-        """Return whether other cubes than the drawn ones are shown, or in another order."""
-        return super().is_swapped() or self.swap_order > 0
+        """Return whether other cubes than the drawn ones are seen, or in another order."""
+        return super().is_swapped() or self.swap_order > 0 or self.shuffle_cue
 
     def n_swaps(self) -> int:
         """Return how many cubes that are not shown could be shown instead of the first one."""
@@ -168,12 +191,18 @@ class SeveralColorsEnv(ItemChoiceEnv):
         if self.ONE_BY_ONE:
             moved = self._show_in_turn(step, in_cue)
         else:
-            moved = in_cue & (step == 0)
+            moved = in_cue & (step == self.cue_after_steps)
             self._show_together(moved)
         self._park_all(cue_ends)
         distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
         return bool((moved | cue_ends | distracts | choice_begins).any())
+
+    def cue_places_m(self, env: int) -> list[Place]:
+        """Return where cubes are shown: in turn at the same place, or each at its own."""
+        if self.ONE_BY_ONE:
+            return super().cue_places_m(env)
+        return [(*bunch_place_m(index, self.n_items), 0.0) for index in self.right_candidates(env)]
 
     def _show_together(self, mask: torch.Tensor) -> None:
         if not bool(mask.any()):
@@ -186,19 +215,23 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """Show or hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
+        step = step - self.cue_after_steps
+        mask = mask & (step >= 0)
         turn_steps = self._turn_steps()
-        turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(max=self.n_shown - 1)
+        turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(0, self.n_shown - 1)
         since = step - turn * turn_steps
         begins = mask & (since == 0)
         ends = mask & (since == turn_steps - self.gap_steps)
         self._park_all((begins & (step > 0)) | ends)
         drawn = self._drawn_sequence.gather(1, turn.long()[:, None])[:, 0]
-        self._show_in_middle(begins, drawn, self._of_sequence(turn.long()))
+        seen = self._seen_sequence.gather(1, turn.long()[:, None])[:, 0]
+        self._show_in_middle(begins, drawn, seen)
         return begins | ends
 
     def _turn_steps(self) -> torch.Tensor:
         """Return (B,) the steps from one cube to the next: `total_cue_steps` solved for them."""
-        steps: torch.Tensor = (self._cue_end_step + self.gap_steps) // self.n_shown
+        cue_steps = self._cue_end_step - self.cue_after_steps
+        steps: torch.Tensor = (cue_steps + self.gap_steps) // self.n_shown
         return steps
 
     def shown_candidates(self, env: int) -> tuple[int, ...]:
@@ -207,8 +240,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         if not shown or not self.ONE_BY_ONE:
             return shown
         turn_steps = int(self._turn_steps()[env])
-        turn, since = divmod(int(self._elapsed_steps[env]), turn_steps)
-        return (shown[turn],) if since < turn_steps - self.gap_steps else ()
+        turn, since = divmod(int(self._elapsed_steps[env]) - self.cue_after_steps, turn_steps)
+        return (int(self._seen_sequence[env, turn]),) if since < turn_steps - self.gap_steps else ()
 
     def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:
         return self._sequence.gather(1, position[:, None])[:, 0]

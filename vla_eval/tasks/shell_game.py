@@ -14,7 +14,7 @@ from mani_skill.utils.structs import Pose
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks import mug as mugs
-from vla_eval.tasks.choice import ChoiceEnv
+from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
 from vla_eval.tasks.durations import StepRange
 
 N_MUGS = 3
@@ -95,6 +95,15 @@ class ShellGameEnv(ChoiceEnv):
             place = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
             self._slots[env, index] = torch.tensor(place, dtype=torch.float32)
 
+    def cue_places_m(self, env: int) -> list[Place]:
+        """Return where the ball is shown."""
+        x, y, _ = self._slots[env, int(self._target[env])].tolist()
+        return [(x, y, 0.0)]
+
+    def cue_size_m(self) -> CueSize:
+        """Return the size of the ball."""
+        return CueSize(half_width_m=BALL_RADIUS_M, height_m=2 * BALL_RADIUS_M)
+
     def n_swaps(self) -> int:
         """Return at how many other places the ball could lie."""
         return N_MUGS - 1
@@ -103,7 +112,10 @@ class ShellGameEnv(ChoiceEnv):
         super()._on_episode_start(mask)
         for actor in self.candidates:
             self.move(actor, mask, self._mug_parking_pose(actor.name))
-        self._put_ball_under(self._of_target(self._slots), mask)
+        if self.cue_after_steps == 0:
+            self._put_ball_under(self._of_target(self._slots), mask)
+        else:
+            self.move(self.ball, mask, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
 
     def _put_ball_under(self, positions: torch.Tensor, mask: torch.Tensor) -> None:
         resting = positions.clone()
@@ -112,6 +124,8 @@ class ShellGameEnv(ChoiceEnv):
 
     def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
         choice_begins = mask & (step == self._response_step)
+        cue_begins = mask & (step == self.cue_after_steps) & (step > 0) & (step < self._cue_end_step)
+        self._put_ball_under(self._of_target(self._slots), cue_begins & self.show_cue)
         begun = self._cue_end_step if self.show_cue else torch.zeros_like(self._cue_end_step)
         hidden = mask & (step >= begun) & (step < self._response_step)
         self.reveal(choice_begins, self._mug_orientation_wxyz())
@@ -119,7 +133,7 @@ class ShellGameEnv(ChoiceEnv):
         self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
         covered = mask & (step >= self._response_step)
         self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
-        return bool((choice_begins | hidden | covered).any())
+        return bool((cue_begins | choice_begins | hidden | covered).any())
 
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         poses = torch.stack([actor.pose.raw_pose for actor in self.candidates], dim=1)

@@ -1,0 +1,148 @@
+"""What a policy is given to see of the cue, where that is not what was rendered.
+
+The world is the same: only the images in the policy's observations change. Knows nothing of simulators.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import ImageArray, Observation
+from vla_eval.errors import TaskArgumentError
+from vla_eval.task_state import Phase
+
+CueViewKind = Literal["as_shown", "first_frame", "hidden", "hidden_elsewhere", "hidden_later"]
+"""As rendered; its first frame throughout; its place grey; as many other pixels grey; its place grey, but
+in the delay."""
+
+GREY = 127  # of each channel, where an image is hidden
+SHIFT_PX = 8  # step of the search for other pixels
+
+PixelMask = NDArray[np.bool_]
+"""(H, W): the pixels to hide."""
+
+
+class PixelBox(NamedTuple):
+    """Rows top to bottom - 1 and columns left to right - 1 of an image."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
+CueBoxes = Mapping[str, tuple[PixelBox, ...]]
+"""Camera -> boxes, within its image, that hold all of the cue; none where the cue is out of its view."""
+
+
+@runtime_checkable
+class CueLocator(Protocol):
+    """An environment that knows where in its images the cue is, or would be if it were shown."""
+
+    def cue_boxes(self, slot: int) -> CueBoxes:
+        """Return the boxes in the images of the present step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CueViewSettings:
+    """What a policy sees of the cue.
+
+    Attributes:
+        kind: see `CueViewKind`.
+        begins_at: the step of the cue's first frame; earlier frames are never changed.
+    """
+
+    kind: CueViewKind = "as_shown"
+    begins_at: int = 0
+
+    @property
+    def hides(self) -> bool:
+        """Whether part of an image is hidden, so that the cue has to be located."""
+        return self.kind.startswith("hidden")
+
+
+AS_SHOWN = CueViewSettings()
+
+
+@dataclass(slots=True, kw_only=True)
+class CueView:
+    """What one episode's policy sees; observations are given in order, each step once."""
+
+    settings: CueViewSettings
+    locate: Callable[[], CueBoxes]
+    _first: Observation | None = None
+    _boxes: list[CueBoxes] = field(default_factory=list)
+    _n_delay_steps: int = 0
+
+    def needs_images(self, step: int) -> bool:
+        """Return whether the images of a step are shown again at later ones."""
+        return self.settings.kind == "first_frame" and step == self.settings.begins_at
+
+    def seen(self, observation: Observation, phase: Phase) -> Observation:
+        """Return what the policy is given in place of an observation.
+
+        Raises:
+            TaskArgumentError: the cue takes so much of an image that as much is not there elsewhere.
+        """
+        kind = self.settings.kind
+        in_cue = phase == "cue" and observation.step >= self.settings.begins_at
+        if kind == "as_shown" or not (in_cue or phase == "delay"):
+            return observation
+        if kind == "first_frame":
+            return self._with_first(observation) if in_cue else observation
+        if in_cue:
+            self._boxes.append(self.locate())
+            return observation if kind == "hidden_later" else _hidden(observation, self._boxes[-1], kind)
+        if kind != "hidden_later" or not self._boxes:
+            return observation
+        index, self._n_delay_steps = self._n_delay_steps, self._n_delay_steps + 1
+        return _hidden(observation, self._boxes[index], kind) if index < len(self._boxes) else observation
+
+    def _with_first(self, observation: Observation) -> Observation:
+        if self._first is None:
+            self._first = observation
+        first = self._first.images  # of all cameras that the policy reads: `needs_images`
+        images = {name: first.get(name, image).copy() for name, image in observation.images.items()}
+        return replace(observation, images=images)
+
+
+def _hidden(observation: Observation, boxes: CueBoxes, kind: CueViewKind) -> Observation:
+    images = {}
+    for name, image in observation.images.items():
+        mask = _mask(image, boxes.get(name, ()))
+        if kind == "hidden_elsewhere":
+            mask = _elsewhere(mask, where=f"{name}, step {observation.step}")
+        images[name] = _painted(image, mask)
+    return replace(observation, images=images)
+
+
+def _mask(image: ImageArray, boxes: tuple[PixelBox, ...]) -> PixelMask:
+    mask = np.zeros(image.shape[:2], dtype=np.bool_)
+    for box in boxes:
+        mask[box.top : box.bottom, box.left : box.right] = True
+    return mask
+
+
+def _elsewhere(mask: PixelMask, *, where: str) -> PixelMask:
+    """Return as many other pixels, in the same form: shifted, as far away as that can be."""
+    height, width = mask.shape
+    shifts = [(y, x) for y in range(0, height, SHIFT_PX) for x in range(0, width, SHIFT_PX)]
+    # In an image whose edges are joined, so that the number of pixels stays the same.
+    shifts.sort(key=lambda s: -min(s[0], height - s[0]) - min(s[1], width - s[1]))
+    for shift in shifts:
+        moved = np.roll(mask, shift, axis=(0, 1))
+        if not (moved & mask).any():
+            return moved
+    raise TaskArgumentError(
+        f"cue_view=hidden_elsewhere: {where}: the cue takes {mask.mean():.0%} of the image, and as much of "
+        "this form is not there beside it. Leave this view out for this task."
+    )
+
+
+def _painted(image: ImageArray, mask: PixelMask) -> ImageArray:
+    painted = image.copy()
+    painted[mask] = GREY
+    return painted
