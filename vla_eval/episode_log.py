@@ -121,6 +121,10 @@ class EpisodeLog:
             target_place=_place(status, status.target),
             first_choice_place=_place(status, status.first_choice),
             tcp_reach_m=self.tcp_reach_m,
+            right_candidates=status.right_candidates if has_candidates else None,
+            touched_candidates=status.touched_candidates if has_candidates else None,
+            candidate_places=status.candidate_places or None,
+            final_turn_rad=status.turned_rad,
         )
 
     def _note_reach(self, result: StepResult) -> None:

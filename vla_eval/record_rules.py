@@ -21,6 +21,10 @@ RESULT_FIELDS = (
         "target_place",
         "first_choice_place",
         "tcp_reach_m",
+        "right_candidates",
+        "touched_candidates",
+        "candidate_places",
+        "final_turn_rad",
     ),
 )
 
@@ -54,6 +58,24 @@ def _goes_with(name: str, other: str) -> Rule:
         return getattr(record, name) is None or getattr(record, other) is not None
 
     return Rule((name, other), f"no {name} where {other} is null", holds)
+
+
+def _are_distinct_candidates(name: str) -> Rule:
+    def holds(record: "EpisodeRecord") -> bool:
+        indices, n_candidates = getattr(record, name), record.n_candidates or 0
+        return indices is None or (
+            len(set(indices)) == len(indices) and all(index < n_candidates for index in indices)
+        )
+
+    return Rule((name, "n_candidates"), f"{name} different from each other, each < n_candidates", holds)
+
+
+def _only(candidate: int | None) -> tuple[int, ...]:
+    return () if candidate is None else (candidate,)
+
+
+def _is_permutation(places: tuple[int, ...], n_candidates: int | None) -> bool:
+    return n_candidates is not None and sorted(places) == list(range(n_candidates))
 
 
 def is_name(text: str) -> bool:
@@ -114,6 +136,22 @@ OF_A_RESULT = (
         ("target", "first_choice", "first_choice_success"),
         "first_choice_success true where the first choice is the target, false where it is not or is null",
         _choice_is_right,
+    ),
+    *(_are_distinct_candidates(name) for name in ("right_candidates", "touched_candidates")),
+    Rule(
+        ("first_choice", "touched_candidates"),
+        "the first choice first among those touched",
+        lambda one: one.touched_candidates is None or one.touched_candidates[:1] == _only(one.first_choice),
+    ),
+    Rule(
+        ("target", "right_candidates"),
+        "the target as the only right candidate",
+        lambda one: None in (one.target, one.right_candidates) or one.right_candidates == _only(one.target),
+    ),
+    Rule(
+        ("n_candidates", "candidate_places"),
+        "a place of its own for each candidate",
+        lambda one: one.candidate_places is None or _is_permutation(one.candidate_places, one.n_candidates),
     ),
 )
 

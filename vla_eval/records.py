@@ -27,7 +27,12 @@ RECORD_VERSION = 1
 
 Outcome = Literal["success", "failure", "error"]
 
-LATER_FIELDS = frozenset({"chance_success", "target_place", "first_choice_place", "tcp_reach_m"})
+LATER_FIELDS = frozenset(
+    {
+        *("chance_success", "target_place", "first_choice_place", "tcp_reach_m"),
+        *("right_candidates", "touched_candidates", "candidate_places", "final_turn_rad"),
+    }
+)
 """Fields that records of earlier versions of this program do not have."""
 
 
@@ -87,6 +92,11 @@ class EpisodeRecord:
             from the robot's right; None as above, and where an environment does not tell.
         tcp_reach_m: how far the tool centre point ever was from where it began, straight; None in records of
             earlier versions.
+        right_candidates, touched_candidates: the right ones, in the order shown, and those touched, in the
+            order of first touch; None as above, and in records of earlier versions.
+        candidate_places: where each candidate lay, counted as above.
+        final_turn_rad: how far the object was turned at the end, counterclockwise seen from above; None in
+            tasks that do not ask for it.
         chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
             episode; None where it has to be measured.
         episode_return: sum of rewards.
@@ -120,6 +130,10 @@ class EpisodeRecord:
     target_place: Count | None = None
     first_choice_place: Count | None = None
     tcp_reach_m: Distance | None = None
+    right_candidates: tuple[Count, ...] | None = None
+    touched_candidates: tuple[Count, ...] | None = None
+    candidate_places: tuple[Count, ...] | None = None
+    final_turn_rad: float | None = None
     error: EpisodeError | None = None
 
     @property

@@ -31,6 +31,9 @@ class TaskStatus:
             environment; None where it has to be measured.
         candidate_places: the place at which each candidate lies when the response phase begins, in candidate
             order: 0 is the rightmost as the robot sees it (-y). Empty where places are not known.
+        right_candidates: the right candidates, in the order shown; None where it is not said.
+        touched_candidates: those touched so far, in the order of first touch; None where it is not said.
+        turned_rad: how far the object of the task is turned from its first orientation; None without one.
     """
 
     phase: Phase
@@ -43,6 +46,9 @@ class TaskStatus:
     right_first_choices: tuple[int, ...] = ()
     chance_success: float | None = None
     candidate_places: tuple[int, ...] = ()
+    right_candidates: tuple[int, ...] | None = None
+    touched_candidates: tuple[int, ...] | None = None
+    turned_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vla_eval.probe.quantities import follows, pair_up, paired_p, swap_quantities, wilson_of_rate
-from vla_eval.probe.retention import Range, half_life, share_left
+from vla_eval.probe.retention import Range, contrast, half_life, share_left
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.tasks.catalog import task_spec
@@ -167,3 +167,17 @@ def test_where_all_draws_are_alike_the_intervals_still_have_a_width() -> None:
     sudden = half_life(followed(12, 12, 0, of=12), chance=0.0)
     assert sudden is not None
     assert (sudden.steps, sudden.interval) == (15.0, Range(10, 20))
+
+
+def test_another_appearance_is_compared_with_the_longest_delay_on_the_same_seeds() -> None:
+    after, other = np.arange(20) < 5, np.arange(20) < 18
+    found = contrast(320, after, other)
+    assert (found.delay_steps, found.difference) == (320, pytest.approx(13 / 20))
+    assert 0 < found.interval.low < 13 / 20 < found.interval.high < 1
+    # All alike: by Wilson's intervals of 0 of 20 and 20 of 20.
+    none, all_of_them = np.zeros(20, dtype=bool), np.ones(20, dtype=bool)
+    least, most = wilson_interval(20, 20), wilson_interval(0, 20)
+    assert least is not None and most is not None
+    sudden = contrast(80, none, all_of_them)
+    assert sudden.difference == 1.0
+    assert sudden.interval == pytest.approx((least.low - most.high, 1.0))

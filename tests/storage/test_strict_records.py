@@ -41,7 +41,17 @@ RECORD = EpisodeRecord(
     target_place=1,
     first_choice_place=1,
     tcp_reach_m=0.25,
+    right_candidates=(2,),
+    touched_candidates=(2, 0),
+    candidate_places=(0, 2, 1),
 )
+ADDED_ALONE = frozenset(
+    {
+        *("tcp_reach_m", "chance_success"),
+        *("right_candidates", "touched_candidates", "candidate_places", "final_turn_rad"),
+    }
+)
+"""Fields that records of earlier versions lack, each independent of the others."""
 VALID: dict[str, Any] = json.loads(RECORD.to_json())
 ERROR = {"kind": "WorkerCrashed", "stage": "step", "message": "gone", "details": None}
 NO_RESULT = {name: None for name in list(VALID)[list(VALID).index("success_once") :]}
@@ -56,6 +66,11 @@ CONFIG = {
     "runs": 2,
 }
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "a touch twice": ({"touched_candidates": [2, 0, 2]}, "touched_candidates different from each other"),
+    "a touch of none": ({"touched_candidates": [2, 3]}, "each < n_candidates"),
+    "another first touch": ({"touched_candidates": [0, 2]}, "the first choice first among those touched"),
+    "another right one": ({"right_candidates": [1]}, "the target as the only right candidate"),
+    "a place twice": ({"candidate_places": [0, 1, 1]}, "a place of its own for each candidate"),
     "an unknown outcome": ({"outcome": "banana"}, "'success', 'failure' or 'error'"),
     "a failure that succeeded": (
         {"outcome": "failure"},
@@ -147,7 +162,7 @@ def test_a_record_that_cannot_be_true_is_refused_with_its_line(
 @pytest.mark.parametrize("name", [n for n in VALID if n not in ("target_place", "first_choice_place")])
 def test_a_missing_field_is_named_unless_older_records_lack_it(tmp_path: Path, name: str) -> None:
     folder = make(tmp_path / "r", without(name))
-    if name in ("tcp_reach_m", "chance_success"):
+    if name in ADDED_ALONE:
         assert getattr(read_run(folder).records[0], name) is None
     else:
         refused(folder, rf"episodes\.jsonl:1: .*no field '{name}'")

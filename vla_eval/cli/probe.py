@@ -133,6 +133,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.probe.interventions import plan_probe
     from vla_eval.probe.probe_text import render_probe
+    from vla_eval.probe.retention_plot import write_retention
     from vla_eval.probe.table import read_probe
 
     if args.grid:
@@ -146,6 +147,8 @@ def run(args: argparse.Namespace) -> int:
     if stopped is not None:
         return stopped
     table = read_probe(probe.worlds, args.out)
+    for path in write_retention(table, args.out):
+        print(f"retention curve: {path}", file=sys.stderr)
     print(render_probe(table, args.format))
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
 

@@ -253,6 +253,8 @@ class FakeEnv:
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=self._chance(),
             candidate_places=places_from_right(episode.candidates_m[:, :2]),
+            right_candidates=episode.targets,
+            touched_candidates=tuple(episode.touched),
             n_candidates=self._n_items,
             first_choice=episode.touched[0] if episode.touched else None,
             n_wrong_choices=n_wrong,

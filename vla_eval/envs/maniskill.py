@@ -322,6 +322,9 @@ def _status(env: Any, info: Any, row: int) -> TaskStatus:
         right_first_choices=env.right_first_choices(row) if is_choice else (),
         chance_success=env.chance_success() if is_choice else None,
         candidate_places=env.candidate_places(row) if is_choice else (),
+        right_candidates=env.right_candidates(row) if is_choice else None,
+        touched_candidates=env.touched_candidates(row) if is_choice else None,
+        turned_rad=float(info["relative_angle"][row]) if "relative_angle" in info else None,
     )
 
 

@@ -4,6 +4,7 @@ No chart distinguishes series by color alone: each has its own marker or dash pa
 This module imports matplotlib, so only code that builds a page imports it.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -14,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from vla_eval.page.svg import PALETTE, inline_svg, own_style, text_width_px
+from vla_eval.page.svg import PALETTE, PNG_DPI, inline_svg, own_style, text_width_px
 
 COLORS = tuple(PALETTE[name] for name in ("c0", "c1", "c2", "c3", "c4", "c5", "ink"))
 MARKERS = (("o", 8), ("s", 7.5), ("^", 9), ("D", 7), ("X", 9), ("v", 9), ("P", 9))  # with their sizes, px
@@ -142,15 +143,47 @@ def curves(
         x_labels: what is written at each tick, if not its number.
     """
     with own_style():
-        figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
-        margin = (x_ticks[-1] - x_ticks[0] or 1) * 0.03
-        axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
-        axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks] if x_labels is None else x_labels)
-        axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
-        axes.grid(visible=False, axis="x")
-        for one in _dodged(series, (x_ticks[-1] - x_ticks[0]) * DODGE):
-            _draw_series(axes, one)
+        figure = _curves(series, x_title=x_title, x_ticks=x_ticks, x_labels=x_labels)
         return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
+
+
+def curves_png(
+    series: Sequence[Series],
+    *,
+    title: str,
+    x_title: str,
+    x_ticks: Sequence[float],
+    x_labels: Sequence[str] | None = None,
+) -> bytes:
+    """Return a PNG file of `curves`, on paper, with the names of the series."""
+    with own_style():
+        figure = _curves(series, x_title=x_title, x_ticks=x_ticks, x_labels=x_labels)
+        figure.set(frameon=True, facecolor=PALETTE["paper"])
+        (axes,) = figure.axes
+        named = [one for one in series if one.kind == "solid"]
+        handles = [
+            Line2D([], [], color=_color(one.color), linestyle=(0, _dashes(one.color)), label=one.name)
+            for one in named
+        ]
+        axes.legend(handles=handles, frameon=False, loc="lower left")
+        axes.set_title(_printable(title))
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=PNG_DPI, bbox_inches="tight", metadata={"Software": None})
+        return file.getvalue()
+
+
+def _curves(
+    series: Sequence[Series], *, x_title: str, x_ticks: Sequence[float], x_labels: Sequence[str] | None
+) -> Figure:
+    figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
+    margin = (x_ticks[-1] - x_ticks[0] or 1) * 0.03
+    axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
+    axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks] if x_labels is None else x_labels)
+    axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
+    axes.grid(visible=False, axis="x")
+    for one in _dodged(series, (x_ticks[-1] - x_ticks[0]) * DODGE):
+        _draw_series(axes, one)
+    return figure
 
 
 def _dodged(series: Sequence[Series], distance: float) -> list[Series]:

@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vla_eval.page.charts import PX, Chart
-from vla_eval.page.svg import PALETTE, inline_svg, own_style
+from vla_eval.page.svg import PALETTE, PNG_DPI, inline_svg, own_style
 from vla_eval.page.tables import DARKEST, UNKNOWN
 
 CELL_PX = (62, 34)
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 10, 8, 44
 TITLE_PX = 24
-PNG_DPI = 144
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

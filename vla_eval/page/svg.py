@@ -36,6 +36,7 @@ PALETTE: Mapping[str, str] = MappingProxyType(
     }
 )
 _VARIABLES = {color: f"var(--{name})" for name, color in PALETTE.items()}
+PNG_DPI = 144  # of drawings that are files
 GROUPS = frozenset({"whisker", "marker", "curve", "chance", "ceiling"})
 """Ids that artists of a figure may have (`gid`); the page has them as classes."""
 FONT_SIZE_PX = 12

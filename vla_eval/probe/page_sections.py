@@ -1,9 +1,8 @@
 """The sections of the report page on probes and grids, from their run folders."""
 
-import math
 from collections.abc import Sequence
 
-from vla_eval.page.charts import Chart, Point, Series, curves, reference_sign, sign
+from vla_eval.page.charts import Chart, curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
 from vla_eval.page.probe_section import PairMatrix, ProbeSection
 from vla_eval.page.rates import Plots, Sign
@@ -16,14 +15,10 @@ from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_heat import heat_maps
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.retention_curves import Retention
+from vla_eval.probe.retention_plot import CURVES, X_TITLE, line_name, retention_lines
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
 from vla_eval.storage.run_folder import StoredRun
-
-CURVES: dict[str, str] = {
-    "follows": "follows the cue",
-    "warranted_choice": "follows the cue in both worlds",
-}
 
 
 def probe_sections(runs: Sequence[StoredRun]) -> list[ProbeSection]:
@@ -77,7 +72,7 @@ def _page_table(
 
 def _retention_plots(table: ProbeTable) -> Plots:
     """Draw the retention curves, one chart per task and kind of curve; delays on a logarithmic axis."""
-    names = {name: number for number, name in enumerate(dict.fromkeys(map(_name, table.retention)))}
+    names = {name: number for number, name in enumerate(dict.fromkeys(map(line_name, table.retention)))}
     charts: list[Chart] = []
     for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
         own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
@@ -92,7 +87,7 @@ def _retention_plots(table: ProbeTable) -> Plots:
 def _half_lives(table: ProbeTable) -> PageTable:
     rows = [
         [
-            f"{curve.task} · {_name(curve)}",
+            f"{curve.task} · {line_name(curve)}",
             CURVES[curve.of],
             UNKNOWN if curve.half_life is None else half_life_text(curve.half_life),
             UNKNOWN if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
@@ -107,47 +102,21 @@ def _half_lives(table: ProbeTable) -> PageTable:
     )
 
 
-def _name(curve: Retention) -> str:
-    return f"{curve.policy} · K={curve.n_action_steps}"
-
-
 def _chart(task: str, of: str, own: Sequence[Retention], names: dict[str, int]) -> Chart:
-    delays = sorted({point.delay_steps for curve in own for point in curve.points})
-    series = [
-        Series(
-            name=_name(curve),
-            color=names[_name(curve)],
-            points=tuple(
-                Point(_x(point.delay_steps), point.share.rate, *point.share.interval)
-                for point in curve.points
-            ),
-        )
-        for curve in own
-    ]
-    chances = {
-        point.delay_steps: point.chance for curve in own for point in curve.points if point.chance is not None
-    }
-    if chances:
-        points = tuple(Point(_x(delay), chances[delay]) for delay in sorted(chances))
-        series.append(Series(name="chance", color=0, points=points, kind="chance"))
-    said = "; ".join(f"{_name(curve)}: {_points_in_words(curve)}" for curve in own)
+    lines = retention_lines(own, names)
+    said = "; ".join(f"{line_name(curve)}: {_points_in_words(curve)}" for curve in own)
     return curves(
-        series,
+        lines.series,
         title=f"{task}: {CURVES[of]}",
         description=said,
-        x_title="delay, steps (logarithmic)",
-        x_ticks=[_x(delay) for delay in delays],
-        x_labels=[str(delay) for delay in delays],
+        x_title=X_TITLE,
+        x_ticks=lines.x_ticks,
+        x_labels=lines.x_labels,
     )
 
 
 def _points_in_words(curve: Retention) -> str:
     return ", ".join(f"{p.share.n} of {p.share.of} after {p.delay_steps}" for p in curve.points)
-
-
-def _x(delay_steps: int) -> float:
-    """Return the place of a delay on a logarithmic axis that has a place for 0."""
-    return math.log2(1 + delay_steps)
 
 
 def _matrix(pairs: ChoicePairs) -> PairMatrix:

@@ -2,6 +2,7 @@
 
 import json
 
+from vla_eval.probe.mistakes import MISTAKES, Mistakes
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife, Range
 from vla_eval.probe.retention_curves import Retention
@@ -20,7 +21,7 @@ from vla_eval.results.estimates import Interval
 PROBE_VERSION = 1
 TITLES = (
     *("task", "policy", "K", "world", "pairs", "sensitivity", "warranted", "value", "reliable", "follows"),
-    *("success once", "chance", "left", "p", "p (Holm)"),
+    *("success once", "chance", "left", "kept", "over delay", "p", "p (Holm)"),
 )
 TEXT_TITLES = ("task", "policy", "world")
 
@@ -80,9 +81,23 @@ def json_row(row: ProbeRow) -> JsonRow:
         "chance": row.chance,
         "left": row.left,
         **_ends("left", row.left_interval),
+        "items_kept": row.kept.n_items if row.kept else None,
+        **_ends("items_kept", row.kept.interval if row.kept else None),
+        **_json_mistakes(row.mistakes),
+        "over_delay": row.over_delay.difference if row.over_delay else None,
+        **_ends("over_delay", row.over_delay.interval if row.over_delay else None),
         "p_value": row.p_value,
         "corrected_p": row.corrected_p,
         "n_errors": row.n_errors,
+    }
+
+
+def _json_mistakes(found: Mistakes | None) -> JsonRow:
+    return {
+        "n_with_touches": found.n_episodes if found else None,
+        **{f"n_{kind}_mistakes": found.count(kind) if found else None for kind in MISTAKES},
+        "expected_place_mistakes": found.expected_place if found else None,
+        "n_incomplete": found.n_incomplete if found else None,
     }
 
 
@@ -141,6 +156,8 @@ def _cells(row: ProbeRow) -> list[str]:
         UNDEFINED
         if row.left is None or row.left_interval is None
         else shown_rate(row.left, row.left_interval),
+        shown_rate(*row.kept) if row.kept else UNDEFINED,
+        shown_rate(*row.over_delay[1:]) if row.over_delay else UNDEFINED,
         _shown_p(row.p_value),
         _shown_p(row.corrected_p),
     ]

@@ -18,7 +18,11 @@ from vla_eval.tasks.spec import TaskSpec
 CUE_IN_STATE = frozenset({"vla_eval.tasks.rotate:RotateEnv"})
 """Tasks whose cue is a number of the state: the digest of a trajectory contains it."""
 
-ChangeOf = Literal["choice", "actions"]
+ChangeOf = Literal["choice", "set", "angle", "actions"]
+
+ANGLE_TOLERANCE_RAD = 0.1
+"""Of Rotate's success rule: angles nearer to each other are one answer. Those of a swap are twice as far
+apart, or more."""
 
 
 class Share(NamedTuple):
@@ -52,8 +56,7 @@ class SwapQuantities:
     """What swapped cues say; `n_follow` and `n_against` are the counts of the sign test.
 
     Attributes:
-        sensitivity: pairs whose choice changes, or whose actions, as `change_of` says; None where neither
-            is known.
+        sensitivity: pairs whose choice changes, or what else `change_of` says; None where none is known.
         actions_changed: pairs whose trajectories differ.
         warranted_choice: pairs in which the cue is followed in both worlds.
         matched_value: mean success over both worlds, each by its own rule, with its interval.
@@ -100,7 +103,13 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
     n_pairs = len(pairs)
     moved = None if spec.entry_point in CUE_IN_STATE else _share(pairs, _acts_differently)
     change_of = _change_of(pairs, spec)
-    by_change = {"choice": _share(pairs, _chooses_differently), "actions": moved, None: None}
+    by_change: dict[ChangeOf | None, Share | None] = {
+        "choice": _share(pairs, _chooses_differently),
+        "set": _share(pairs, _touches_other_items),
+        "angle": _share(pairs, _turns_differently) if change_of == "angle" else None,
+        "actions": moved,
+        None: None,
+    }
     n_successes = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs)
     return SwapQuantities(
         n_pairs=n_pairs,
@@ -116,10 +125,19 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
 
 
 def _change_of(pairs: Sequence[Pair], spec: TaskSpec) -> ChangeOf | None:
-    """Return what a change is counted by: the first touch, if the cue determines it, else the actions."""
+    """Return what a change is counted by, as far as the records know it.
+
+    The first touch, if the cue determines it; else the items touched, as many as are right; the final angle;
+    else the actions.
+    """
     is_determined = pairs[0].drawn.target is not None or spec.memory == "sequential"
     if pairs[0].drawn.n_candidates and is_determined:
         return "choice"
+    records = [record for pair in pairs for record in pair]
+    if all(record.touched_candidates is not None and record.right_candidates for record in records):
+        return "set"
+    if all(record.final_turn_rad is not None for record in records):
+        return "angle"
     return None if spec.entry_point in CUE_IN_STATE else "actions"
 
 
@@ -129,6 +147,20 @@ def _share(pairs: Sequence[Pair], holds: Callable[[Pair], bool]) -> Share:
 
 def _chooses_differently(pair: Pair) -> bool:
     return pair.drawn.first_choice != pair.other.first_choice
+
+
+def _touches_other_items(pair: Pair) -> bool:
+    one, other = (
+        set((record.touched_candidates or ())[: len(record.right_candidates or ())]) for record in pair
+    )
+    return one != other
+
+
+def _turns_differently(pair: Pair) -> bool:
+    one, other = pair.drawn.final_turn_rad, pair.other.final_turn_rad
+    assert one is not None and other is not None  # `_change_of` has looked
+    apart = abs(one - other) % math.tau
+    return min(apart, math.tau - apart) > ANGLE_TOLERANCE_RAD
 
 
 def _acts_differently(pair: Pair) -> bool:

@@ -71,7 +71,7 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
         _halved_at(delays, episodes[:, rng.integers(n_episodes, size=n_episodes)].mean(axis=1), chance)
         for _ in range(N_DRAWS)
     ]
-    low, high = _quantiles(drawn)
+    low, high = quantiles(drawn)
     steps = _halved_at(delays, episodes.mean(axis=1), chance)
     if (
         low == high and steps != BEYOND
@@ -116,7 +116,7 @@ def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
         chosen = rng.integers(n_episodes, size=n_episodes)
         n_before = int(before[chosen].sum())
         drawn.append(int(after[chosen].sum()) / n_before if n_before else BEYOND)
-    low, high = _quantiles(drawn)
+    low, high = quantiles(drawn)
     if low == high:
         least_before, most_before = _wilson(before)
         least_after, most_after = _wilson(after)
@@ -124,13 +124,43 @@ def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
     return float(after.sum() / before.sum()), Range(_known(low), _known(high))
 
 
+class Contrast(NamedTuple):
+    """How much more is followed in another world than after a delay, with its interval at 95 %."""
+
+    delay_steps: int
+    difference: float
+    interval: Interval
+
+
+def contrast(delay_steps: int, after: Followed, other: Followed) -> Contrast:
+    """Return the difference of two worlds with the same episodes.
+
+    The interval is that of the bootstrap over seeds; where all draws are alike, it reaches from the least to
+    the most that both Wilson intervals allow.
+
+    Args:
+        delay_steps: the delay.
+        after: whether the episodes follow the cue after it.
+        other: the same in another world, in the same order.
+    """
+    per_episode = other.astype(float) - after
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    n_episodes = len(per_episode)
+    drawn = [float(per_episode[rng.integers(n_episodes, size=n_episodes)].mean()) for _ in range(N_DRAWS)]
+    low, high = quantiles(drawn)
+    if low == high:
+        (least_after, most_after), (least_other, most_other) = _wilson(after), _wilson(other)
+        low, high = least_other - most_after, most_other - least_after
+    return Contrast(delay_steps, float(per_episode.mean()), Interval(low, high))
+
+
 def _wilson(followed: Followed) -> Interval:
     found = wilson_interval(int(followed.sum()), len(followed))
-    assert found is not None  # there is an episode: the caller has found one that follows the cue
+    assert found is not None  # there is an episode: the caller has looked
     return found
 
 
-def _quantiles(values: Sequence[float]) -> tuple[float, float]:
+def quantiles(values: Sequence[float]) -> tuple[float, float]:
     """Return the ends of the central interval; without interpolation, as values may be infinite."""
     ordered = np.sort(np.asarray(values))
     tail = (1 - CONFIDENCE) / 2

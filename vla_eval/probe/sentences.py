@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 
 from vla_eval.probe.interventions import SWAPS
+from vla_eval.probe.mistakes import MISTAKES
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
 
 ORACLE = "oracle"
+LEAST_MISTAKES = 5  # with fewer, their kinds say nothing
 
 
 def sentences(table: ProbeTable) -> list[str]:
@@ -25,6 +27,8 @@ def _sentence(table: ProbeTable, task: str, policy: str, k: int) -> str:
         for curve in table.retention
         if (curve.task, curve.policy, curve.n_action_steps) == (task, policy, k)
     ]
+    forgotten = _forgotten_first(rows)
+    said += [] if forgotten is None else [forgotten]
     return f"{policy} on {task}, K = {k}: {'; '.join(said) or 'no episode has a result'}."
 
 
@@ -52,7 +56,35 @@ def _clause(row: ProbeRow) -> str | None:
     }[row.intervention]
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
     idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
-    return f"{where} {_of(row.followed)}{chance}{idle}"
+    return f"{where} {_of(row.followed)}{chance}{idle}{_over_delay(row)}"
+
+
+def _over_delay(row: ProbeRow) -> str:
+    if row.over_delay is None:
+        return ""
+    difference, (low, high) = row.over_delay.difference, row.over_delay.interval
+    after = f"after a delay of {row.over_delay.delay_steps} steps"
+    return f", {difference:+.2f} [{low:+.2f}, {high:+.2f}] of the share {after}"
+
+
+def _forgotten_first(rows: Sequence[ProbeRow]) -> str | None:
+    """Return the kinds of mistakes at the shortest delay with enough of them to tell."""
+    known = [
+        (row.delay_steps or 0, row.mistakes)
+        for row in rows
+        if row.intervention in ("none", "delay") and row.mistakes is not None
+    ]
+    for delay_steps, found in sorted(known, key=lambda one: one[0]):
+        if found.n_mistakes >= LEAST_MISTAKES:
+            kinds = sorted(MISTAKES, key=found.count, reverse=True)
+            counts = [f"{kind} in {found.count(kind)}" for kind in kinds if found.count(kind)]
+            by_chance = found.n_place and found.expected_place is not None
+            beside = f" (place in {found.expected_place:.1f} by chance)" if by_chance else ""
+            return (
+                f"what is forgotten first, of {found.n_mistakes} mistakes after a delay of {delay_steps} "
+                f"steps: {', '.join(counts)}{beside}"
+            )
+    return None
 
 
 def _hidden(row: ProbeRow) -> str:
@@ -93,10 +125,13 @@ def _steps(steps: float | None, half: HalfLife) -> str:
 def notes(table: ProbeTable) -> list[str]:
     """Return what a reader of the table has to know, errors and failed controls included."""
     found = [
-        "sensitivity: share of pairs whose choice differs between the two worlds (for sets and tasks without "
-        "candidates: whose trajectories differ); warranted: the cue is followed in both worlds; value: mean "
-        "success of both worlds; reliable: success in both. Intervals at 95 %: Wilson; of shares left and "
-        "half-lives, bootstrap over seeds.",
+        "sensitivity: share of pairs whose choice differs between the two worlds (for sets: the items "
+        "touched; Rotate: the final angle; other tasks without candidates: the trajectory); "
+        "warranted: the cue is followed in both worlds; value: mean success of both worlds; reliable: "
+        "success in both. Intervals at 95 %: Wilson; of shares left, half-lives, items kept and "
+        "differences, bootstrap over seeds.",
+        "kept: items that are remembered, corrected for guessing; over delay: by how much more the cue is "
+        "followed in another appearance than after the longest delay.",
         "p: for swaps, exact sign test of following both cues against choosing each world's candidate in the "
         "other; else exact McNemar test against the world as drawn. Holm's correction over the table.",
         "Scripted controls read the true state and no image: a blank cue and a reset take nothing from them.",

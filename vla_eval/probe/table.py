@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of
+from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
     Pair,
@@ -17,9 +18,9 @@ from vla_eval.probe.quantities import (
     paired_p,
     swap_quantities,
 )
-from vla_eval.probe.retention import Followed, Range, share_left
+from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
-from vla_eval.probe.world_records import Records, by_policy, chance_of, compared_with, results_of
+from vla_eval.probe.world_records import Records, Worlds, by_policy, chance_of, compared_with, results_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names
@@ -42,6 +43,9 @@ class ProbeRow:
         n_without_choice: episodes of this world in which no candidate was touched; None without candidates.
         success: episodes of this world that succeed; None without a result.
         chance: rate of following the cue without memory; None where it is not known.
+        mistakes: the first mistakes of its episodes; None where touches are not known.
+        kept: how many items are kept; None where touches are not known, or one item is right.
+        over_delay: of another appearance: by how much more is followed than after the longest delay.
         left, left_interval: share of following that this world leaves; None for swaps and `none`.
         p_value: exact paired test against that world; corrected_p: after Holm, over the table.
         n_errors: episodes of this world without a result.
@@ -60,6 +64,9 @@ class ProbeRow:
     n_without_choice: int | None
     success: Share | None
     chance: float | None
+    mistakes: Mistakes | None
+    kept: Capacity | None
+    over_delay: Contrast | None
     left: float | None
     left_interval: Range | None
     p_value: float | None
@@ -109,7 +116,8 @@ def probe_table(
     for task in dict.fromkeys(world.task for world in worlds):
         of_task = [(world, found) for world, found in by_world if world.task == task]
         for policy, k in _policies(drawn[task], order):
-            rows += [_row(world, found, compared_with(world, of_task), policy, k) for world, found in of_task]
+            own = [_row(world, found, compared_with(world, of_task), policy, k) for world, found in of_task]
+            rows += with_contrasts(own, of_task)
             retention += retention_curves(of_task, policy, k)
     tested = [row.p_value for row in rows if row.p_value is not None]
     corrected = iter(holm(tested))
@@ -147,12 +155,40 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         n_without_choice=_n_without_choice(results),
         success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
         chance=chance_of(results, found, k),
+        mistakes=mistakes(results, task_spec(world.task)),
+        kept=capacity(results),
+        over_delay=None,
         left=left[0] if left else None,
         left_interval=left[1] if left else None,
         p_value=p_value,
         corrected_p=None,
         n_errors=len(own) - len(results),
     )
+
+
+def with_contrasts(rows: Sequence[ProbeRow], worlds: Worlds) -> list[ProbeRow]:
+    """Return the rows of one policy, those of an appearance compared with the longest delay.
+
+    Args:
+        rows: one per world.
+        worlds: in the same order.
+    """
+    delays = [
+        (row.delay_steps, index)
+        for index, row in enumerate(rows)
+        if row.intervention == "delay" and row.delay_steps is not None and row.followed
+    ]
+    if not delays:
+        return list(rows)
+    longest, index = max(delays)
+    compared = []
+    for row, (_, found) in zip(rows, worlds, strict=True):
+        key = (row.policy, row.n_action_steps)
+        pairs = pair_up(worlds[index][1].get(key, ()), found.get(key, ()))
+        if row.intervention == "appearance" and pairs:
+            row = replace(row, over_delay=contrast(longest, *_followed(pairs)))
+        compared.append(row)
+    return compared
 
 
 def _n_without_choice(results: Sequence[EpisodeRecord]) -> int | None:

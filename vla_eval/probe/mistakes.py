@@ -1,0 +1,170 @@
+"""How many items a policy keeps, and what its mistakes are, from the sequence of its touches.
+
+Pure functions of records. Records of earlier versions lack the touches: then all of it is undefined (None).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.probe.retention import BOOTSTRAP_SEED, N_DRAWS, quantiles
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import Interval
+from vla_eval.tasks.spec import TaskSpec
+
+MistakeKind = Literal["order", "place", "identity"]
+MISTAKES: tuple[MistakeKind, ...] = ("order", "place", "identity")
+TOLERANCE = 1e-6  # of an item, of the search for the number of items kept
+
+
+class _Touches(NamedTuple):
+    """What was right and what was touched, up to as many as are right; places by candidate."""
+
+    right: tuple[int, ...]
+    touched: tuple[int, ...]
+    places: tuple[int, ...]
+    n_candidates: int
+
+
+class _Mistake(NamedTuple):
+    """The first mistake of an episode, and how probable it was that a wrong item lies beside a due one."""
+
+    kind: MistakeKind
+    chance_of_place: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mistakes:
+    """The first mistakes of the episodes of one world.
+
+    Attributes:
+        n_episodes: episodes whose touches are known.
+        n_order: an item that was shown, but out of turn.
+        n_place: an item that was not shown, at a place beside that of one that was due.
+        n_identity: another item that was not shown.
+        expected_place: so many of the last two kinds would be beside a due item if the wrong items were drawn
+            at random; None where the items are places themselves.
+        n_incomplete: no mistake, but fewer touches than are right.
+    """
+
+    n_episodes: int
+    n_order: int
+    n_place: int
+    n_identity: int
+    expected_place: float | None
+    n_incomplete: int
+
+    def count(self, kind: MistakeKind) -> int:
+        """Return the number of mistakes of a kind."""
+        return {"order": self.n_order, "place": self.n_place, "identity": self.n_identity}[kind]
+
+    @property
+    def n_mistakes(self) -> int:
+        """The number of episodes with a mistake."""
+        return sum(map(self.count, MISTAKES))
+
+
+class Capacity(NamedTuple):
+    """How many of the items shown are kept, on average, with its interval at 95 %."""
+
+    n_items: float
+    interval: Interval
+
+
+def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | None:
+    """Return the first mistakes; None if no touches are known."""
+    known = [found for record in records if (found := _touches(record)) is not None]
+    if not known:
+        return None
+    first = [_first_mistake(episode, spec) for episode in known]
+    kinds = [one.kind for one in first if one is not None]
+    chances = [one.chance_of_place for one in first if one is not None and one.kind != "order"]
+    return Mistakes(
+        n_episodes=len(known),
+        n_order=kinds.count("order"),
+        n_place=kinds.count("place"),
+        n_identity=kinds.count("identity"),
+        expected_place=None if spec.cue_marks_place else sum(chance or 0.0 for chance in chances),
+        n_incomplete=sum(
+            one is None and len(episode.touched) < len(episode.right)
+            for one, episode in zip(first, known, strict=True)
+        ),
+    )
+
+
+def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
+    """Return how many items are kept, corrected for guessing.
+
+    Of the first touches, as many as items were shown, some are right. Who keeps k of L items and touches
+    others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The number
+    kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of the
+    bootstrap over episodes.
+
+    Returns:
+        None if touches are not known, one item is right, or all of them are.
+    """
+    known = [found for record in records if (found := _touches(record)) is not None]
+    if not known or any(not 1 < len(one.right) < one.n_candidates for one in known):
+        return None
+    if len({(len(one.right), one.n_candidates) for one in known}) != 1:
+        return None
+    n_shown, n_candidates = len(known[0].right), known[0].n_candidates
+    n_touches = np.array([len(one.touched) for one in known])
+    n_right = np.array([len(set(one.touched) & set(one.right)) for one in known])
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    drawn = []
+    for _ in range(N_DRAWS):
+        chosen = rng.integers(len(known), size=len(known))
+        drawn.append(_kept(n_touches[chosen], float(n_right[chosen].mean()), n_shown, n_candidates))
+    kept = _kept(n_touches, float(n_right.mean()), n_shown, n_candidates)
+    return Capacity(kept, Interval(*quantiles(drawn)))
+
+
+def _kept(n_touches: NDArray[np.int64], mean: float, shown: int, n: int) -> float:
+    """Return the k at which the expected number of right touches, which grows with k, is the mean."""
+
+    def expected(kept: float) -> float:
+        guessed = np.maximum(n_touches - kept, 0) * (shown - kept) / (n - kept)
+        return float((np.minimum(n_touches, kept) + guessed).mean())
+
+    low, high = 0.0, float(shown)
+    if mean <= expected(low):
+        return low
+    while high - low > TOLERANCE:
+        middle = (low + high) / 2
+        low, high = (middle, high) if expected(middle) < mean else (low, middle)
+    return (low + high) / 2
+
+
+def _touches(record: EpisodeRecord) -> _Touches | None:
+    parts = (record.right_candidates, record.touched_candidates, record.candidate_places)
+    if record.outcome == "error" or record.n_candidates is None or not parts[0]:
+        return None
+    right, touched, places = parts
+    if right is None or touched is None or places is None:
+        return None
+    return _Touches(right, touched[: len(right)], places, record.n_candidates)
+
+
+def _first_mistake(episode: _Touches, spec: TaskSpec) -> _Mistake | None:
+    in_order = spec.memory == "sequential"
+    for index, touched in enumerate(episode.touched):
+        earlier = episode.touched[:index]
+        due = [episode.right[index]] if in_order else [i for i in episode.right if i not in earlier]
+        if touched in episode.right:
+            if in_order and touched != due[0]:
+                return _Mistake("order", None)
+            continue
+        if spec.cue_marks_place:
+            return _Mistake("place", None)
+        wrong = [i for i in range(episode.n_candidates) if i not in episode.right]
+        beside = [i for i in wrong if _is_beside(i, due, episode.places)]
+        return _Mistake("place" if touched in beside else "identity", len(beside) / len(wrong))
+    return None
+
+
+def _is_beside(candidate: int, due: Sequence[int], places: tuple[int, ...]) -> bool:
+    return any(abs(places[candidate] - places[other]) == 1 for other in due)
