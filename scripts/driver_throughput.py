@@ -119,6 +119,28 @@ class SleepingBackend(ClusterBackend):
         return pool
 
 
+class Middle:
+    """Notes times over the middle of a run: starting and ending do not count."""
+
+    def __init__(self, n_records: int) -> None:
+        self._marks = {n_records // 10, n_records * 9 // 10}
+        self._n, self.stored = 0, 0.0
+        self.seen: list[tuple[float, float, float]] = []
+
+    def on_start(self, plan: Any, *, n_finished: int, n_workers: int) -> None:
+        """Do nothing."""
+
+    def on_record(self, record: EpisodeRecord) -> None:
+        """Count."""
+        self._n += 1
+        if self._n in self._marks:
+            self.seen.append((time.monotonic(), time.process_time(), self.stored))
+
+    def on_tick(self) -> bool:
+        """Do not stop."""
+        return False
+
+
 def measure(ray: Any, n_workers: int, seconds: float, n_records: int) -> dict[str, float]:
     """Run an evaluation with sleeping workers; return what the driver did."""
     machines = Machines(ray, say=lambda _line: None)
@@ -138,32 +160,32 @@ def measure(ray: Any, n_workers: int, seconds: float, n_records: int) -> dict[st
         simulator="fake",
         workers=n_workers,
     )
-    stored = [0.0]
+    middle = Middle(n_records)
     folder = Path(tempfile.mkdtemp(prefix="mikasa-vla-throughput-"))
     append_all = RunFolder.append_all
 
     def timed(self: RunFolder, episodes: Any) -> None:
         begun = time.monotonic()
         append_all(self, episodes)
-        stored[0] += time.monotonic() - begun
+        middle.stored += time.monotonic() - begun
 
     RunFolder.append_all = timed  # type: ignore[method-assign]
     try:
-        begun, cpu = time.monotonic(), time.process_time()
-        evaluate(config, out=folder / "run", backend=backend)
-        wall, cpu = time.monotonic() - begun, time.process_time() - cpu
+        evaluate(config, out=folder / "run", backend=backend, observer=middle)
     finally:
         RunFolder.append_all = append_all  # type: ignore[method-assign]
         shutil.rmtree(folder)
         for actor in actors:
             ray.kill(actor)
+    wall, cpu, stored = (after - before for before, after in zip(*middle.seen, strict=True))
+    n_records = n_records * 9 // 10 - n_records // 10
     return {
         "workers": n_workers,
         "records_per_second": n_records / wall,
         "workers_busy": n_records * seconds / (wall * n_workers),
         "driver_cpu_share": cpu / wall,
         "driver_cpu_ms_per_record": 1000 * cpu / n_records,
-        "store_share": stored[0] / wall,
+        "store_share": stored / wall,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
 

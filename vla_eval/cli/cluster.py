@@ -22,13 +22,17 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def backend_of(
-    args: argparse.Namespace, *, needs: Callable[[], tuple[Needed, ...]] = tuple
+    args: argparse.Namespace,
+    *,
+    needs: Callable[[], tuple[Needed, ...]] = tuple,
+    notes_kinds: bool = True,
 ) -> Iterator[Backend]:
     """Give what `--cluster` names; without it, this machine.
 
     Args:
         args: of the command line.
         needs: returns the files that each machine of a cluster must have; called if there is a cluster.
+        notes_kinds: whether results say what kind of machine they are from; else there must be one kind.
 
     Raises:
         RecipeError: the flag's value is no cluster.
@@ -42,7 +46,7 @@ def backend_of(
     from vla_eval.workers.cluster.connect import check_address
 
     address = check_address(args.cluster)
-    allowed: bool = getattr(args, "allow_environment_change", False)
+    allowed = notes_kinds and bool(getattr(args, "allow_environment_change", False))
     with cluster(address, say=_say, allow_other_kind=allowed, needs=needs()) as backend:
         yield backend
 

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     whole = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
     out = shard_folder(whole, args.shard)
     needs = (shared_folder(out),)
-    with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
+    with backend_of(args, needs=lambda: needs, notes_kinds=False) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop, json_progress=args.json_progress)
         try:
             summary = record(

@@ -22,6 +22,7 @@ LOCAL_VARIABLES = {
     # Each would take 100 MB, and only the workers that are asked for have something to do.
     "RAY_enable_worker_prestart": "0",
     "RAY_prestart_worker_first_driver": "0",
+    "RAY_worker_niceness": "0",  # workers of the process pool do not stand back either
 }
 
 

@@ -105,8 +105,9 @@ class ClusterPool[J: Job, A]:
             if not any(worker.given for worker in self._workers.values()) and not self._has_next(queue):
                 return
             self._start_workers()
-            for index in self._ready():
-                yield from self._look_at(index)
+            for index, result in self._results():
+                yield from self._look_at(index, result)
+            self._hand_out(queue)  # before the tick: workers need not wait for the disk
             yield None
 
     def _has_next(self, queue: JobSource[J]) -> bool:
@@ -182,8 +183,8 @@ class ClusterPool[J: Job, A]:
             return 1
         return max(1, min(MAX_JOBS_PER_CALL, int(CALL_SECONDS / max(self._seconds_per_job, 1e-6))))
 
-    def _ready(self) -> list[int]:
-        """Return which workers have answered; waits for the first, but not longer than a tick."""
+    def _results(self) -> list[tuple[int, Any]]:
+        """Return which workers have answered what, or died; waits for the first, at most a tick."""
         calls = {worker.call: index for index, worker in self._workers.items() if worker.call is not None}
         if not calls:
             time.sleep(TICK_SECONDS)
@@ -192,16 +193,24 @@ class ClusterPool[J: Job, A]:
         if ready and waiting:
             more, _ = self._ray.wait(waiting, num_returns=len(waiting), timeout=0)
             ready = [*ready, *more]
-        return [calls[call] for call in ready]
+        try:
+            results = self._ray.get(ready)  # at once: each call of Ray has its price
+        except self._losses:
+            results = [self._result(call) for call in ready]
+        return [(calls[call], result) for call, result in zip(ready, results, strict=True)]
 
-    def _look_at(self, index: int) -> Iterator[Event[J, A]]:
+    def _result(self, call: Any) -> Any:
+        try:
+            return self._ray.get(call)
+        except self._losses as exc:
+            return exc
+
+    def _look_at(self, index: int, result: Any) -> Iterator[Event[J, A]]:
         """Take what a worker has answered, or what it leaves behind."""
         worker = self._workers[index]
-        call, worker.call = worker.call, None
-        try:
-            events = self._ray.get(call)
-        except self._losses as exc:
-            yield from self._lose(worker, exc)
+        worker.call = None
+        if isinstance(result, BaseException):
+            yield from self._lose(worker, result)
             return
         if not worker.is_ready:
             worker.is_ready = True
@@ -210,7 +219,7 @@ class ClusterPool[J: Job, A]:
         before = self._seconds_per_job
         self._seconds_per_job = seconds if before is None else 0.9 * before + 0.1 * seconds
         given, worker.given = deque(worker.given), []
-        for event in events:
+        for event in result:
             if isinstance(event, DeviceFound):
                 yield event
                 continue

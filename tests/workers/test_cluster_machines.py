@@ -1,0 +1,177 @@
+"""Which machines of a cluster are used, and what is said of the others; Ray is a stand-in."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
+from vla_eval.workers.cluster import connect, machines
+from vla_eval.workers.cluster.connect import check_address
+from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machines
+from vla_eval.workers.cluster.node_facts import NodeFacts, objections
+from vla_eval.workers.needed import Needed
+
+HERE = NodeFacts(
+    environment={
+        "vla_eval": {"version": "1", "commit": "abc", "changes": None},
+        "packages": {"torch": "2.8.0", "numpy": "2.2.1"},
+        "python": "3.12.1",
+        "platform": "Linux x86_64",
+        "cpu": "A",
+        "mesa": "25",
+        "nvidia_driver": None,
+    },
+    vulkan=("lvp_icd.x86_64",),
+    free_bytes=8 << 30,
+    n_gpus=0,
+)
+
+
+def with_environment(**changes: Any) -> NodeFacts:
+    return dataclasses.replace(HERE, environment={**HERE.environment, **changes})
+
+
+class TestObjections:
+    @pytest.mark.parametrize(
+        ("found", "reason"),
+        [
+            (with_environment(packages={"torch": "2.7.1", "numpy": "2.2.1"}), 'packages.torch: "2.8.0" ->'),
+            (with_environment(vla_eval={"version": "1", "commit": "d", "changes": None}), "vla_eval.commit"),
+            (with_environment(cpu="B"), "another kind of machine"),
+            (dataclasses.replace(HERE, vulkan=()), "no Vulkan driver"),
+            (dataclasses.replace(HERE, free_bytes=1 << 29), "0.5 GB of memory are free"),
+            (dataclasses.replace(HERE, missing=("data: it is not there",)), "data: it is not there"),
+        ],
+    )
+    def test_a_machine_that_would_give_other_results_is_refused(self, found: NodeFacts, reason: str) -> None:
+        (objection,) = objections(found, HERE, allow_other_kind=False)
+        assert reason in objection
+
+    def test_another_kind_can_be_allowed_but_other_versions_cannot(self) -> None:
+        assert objections(with_environment(cpu="B", mesa="26"), HERE, allow_other_kind=True) == ()
+        assert objections(with_environment(python="3.13.0"), HERE, allow_other_kind=True)
+
+    def test_kinds_have_the_same_name_if_they_are_the_same(self) -> None:
+        assert with_environment(python="3.13.0").kind_name == HERE.kind_name
+        assert with_environment(cpu="B").kind_name != HERE.kind_name
+
+
+class TestNeededFiles:
+    def test_a_file_must_be_there_with_its_digest(self, tmp_path: Path) -> None:
+        file = tmp_path / "weights"
+        need = Needed(path=str(file), sha256="right", digest=lambda path: path.read_text())
+        assert "cannot be read" in (need.objection() or "")
+        file.write_text("wrong")
+        assert "another one" in (need.objection() or "")
+        file.write_text("right")
+        assert need.objection() is None
+
+    def test_a_folder_must_be_there(self, tmp_path: Path) -> None:
+        assert Needed(path=str(tmp_path)).objection() is None
+        assert "is the storage shared?" in (Needed(path=str(tmp_path / "x")).objection() or "")
+
+
+class StandIn:
+    """Runs a task at once, where it is called."""
+
+    exceptions = SimpleNamespace(RayError=ZeroDivisionError)
+
+    def __init__(self, facts: dict[str, NodeFacts]) -> None:
+        self.facts = facts
+        self.gone: set[str] = set()
+
+    def nodes(self) -> list[dict[str, Any]]:
+        return [
+            {
+                **{"NodeID": name, "Alive": name not in self.gone, "NodeManagerHostname": name},
+                **{"NodeManagerAddress": f"10.0.0.{index}", "Resources": {"CPU": 2.0}},
+            }
+            for index, name in enumerate(self.facts)
+        ]
+
+    def remote(self, _task: Callable[..., Any]) -> Any:
+        def options(*, scheduling_strategy: str, **_: Any) -> Any:
+            return SimpleNamespace(remote=lambda *_args, **_kwargs: scheduling_strategy)
+
+        return SimpleNamespace(options=options)
+
+    def wait(self, refs: list[str], **_: Any) -> tuple[list[str], list[str]]:
+        return refs, []
+
+    def get(self, ref: str) -> NodeFacts:
+        return self.facts[ref]
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Machines, StandIn, list[str]]]:
+    monkeypatch.setattr(machines, "on_machine", lambda node: node)
+    monkeypatch.setattr(machines, "node_facts", lambda: HERE)
+
+    def make(**facts: NodeFacts) -> tuple[Machines, StandIn, list[str]]:
+        lines: list[str] = []
+        ray = StandIn(facts)
+        return Machines(ray, say=lines.append), ray, lines
+
+    return make
+
+
+class TestMachines:
+    def test_refused_ones_are_named_with_the_reason(self, cluster: Any) -> None:
+        found, _, _ = cluster(good=HERE, old=with_environment(python="3.11.0"))
+        found.survey()
+        assert [machine.name.split("/")[0] for machine in found.usable] == ["good"]
+        assert 'python: "3.12.1" -> "3.11.0"' in found.table()
+
+    def test_without_a_usable_one_there_is_an_error_with_the_table(self, cluster: Any) -> None:
+        found, _, _ = cluster(old=with_environment(python="3.11.0"))
+        with pytest.raises(ClusterError, match=r"3\.11\.0"):
+            found.survey()
+
+    def test_one_that_errs_three_times_in_a_row_is_set_aside_and_named(self, cluster: Any) -> None:
+        found, _, lines = cluster(good=HERE, bad=HERE)
+        found.survey()
+        good, bad = found
+        for _ in range(MAX_ERRORS_IN_A_ROW - 1):
+            found.note_error(bad, "no memory")
+        found.note_answer(bad)
+        found.note_error(bad, "no memory")
+        assert bad.is_usable  # not in a row
+        for _ in range(MAX_ERRORS_IN_A_ROW - 1):
+            found.note_error(bad, "no memory")
+        assert not bad.is_usable
+        assert "bad" in lines[-1] and "no memory" in lines[-1]
+        for _ in range(MAX_ERRORS_IN_A_ROW):
+            found.note_error(good, "no memory")
+        assert good.is_usable  # the last one
+
+    def test_one_that_goes_is_named_and_one_that_comes_is_checked(self, cluster: Any) -> None:
+        found, ray, lines = cluster(a=HERE, b=HERE)
+        found.survey()
+        ray.gone.add("a")
+        ray.facts["c"] = HERE
+        found.look(at_once=True)
+        assert "machine a" in lines[-1] and "is gone" in lines[-1]
+        assert [machine.node for machine in found.usable] == ["b", "c"]
+
+
+class TestAddresses:
+    @pytest.mark.parametrize("text", ["auto", "local", "ray://head:10001", "10.0.0.1:6379"])
+    def test_these_are_clusters(self, text: str) -> None:
+        assert check_address(text) == text
+
+    @pytest.mark.parametrize("text", ["", "autos", "http://head:1", "ray://head"])
+    def test_these_are_not(self, text: str) -> None:
+        with pytest.raises(RecipeError, match="ray://HOST:PORT"):
+            check_address(text)
+
+    def test_without_ray_the_message_says_how_to_install_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def missing(name: str) -> Any:
+            raise ModuleNotFoundError(name, name=name)
+
+        monkeypatch.setattr(connect.importlib, "import_module", missing)
+        with pytest.raises(MissingDependencyError, match=r"mikasa-vla-eval\[cluster\]"):
+            connect.load_ray()
