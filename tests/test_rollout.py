@@ -280,26 +280,8 @@ class TestOutcome:
         ][2]
         assert height == pytest.approx(0.318 + 57 * 0.5 * 0.039, abs=1e-5)
 
-    def test_a_late_first_inference_is_given_its_frame_alone_or_all_before_it(self) -> None:
-        chunking = ChunkingSpec(n_action_steps=4, first_inference_step=3)
-        counts = {}
-        for policy in (Pusher(reads="last", chunk_size=4), Pusher(reads="every", chunk_size=4)):
-            (record,) = rollout(env_for(policy), policy, [start()], RolloutSettings(chunking=chunking))
-            counts[policy.spec.reads] = (record.n_inferences, record.n_frames)
-
-        # Inferences at 3, 7, … 59: fifteen. All frames up to step 59 are sixty.
-        assert counts == {"last": (15, 15), "every": (15, 60)}
-
 
 class TestRefusals:
-    def test_a_first_inference_after_the_end_is_refused(self) -> None:
-        policy = Fixed(ActionChunk(actions=np.zeros((99, 7), dtype=np.float32)), chunk_size=99)
-        chunking = ChunkingSpec(n_action_steps=99, first_inference_step=HORIZON)
-        with pytest.raises(
-            SpecMismatchError, match=r"ends after 60 steps, before the first inference at step 60"
-        ):
-            rollout(env_for(policy), policy, [start()], RolloutSettings(chunking=chunking))
-
     @pytest.mark.parametrize(
         ("answer", "found"),
         [

@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 from tests.page.test_report_page import COLOR, Page, episode, full_run, stored
 from tests.probe.test_probe_report import PROBE_RUNS
 from vla_eval.page.build import write_page
-from vla_eval.probe.page_sections import probe_sections
+from vla_eval.probe.page.sections import probe_sections
 from vla_eval.results.report import build_table
 from vla_eval.results.table_columns import lay_out
 

@@ -12,7 +12,7 @@ from vla_eval.page.build import build_page
 from vla_eval.probe.choice_pairs import choice_pairs
 from vla_eval.probe.found import find_probes
 from vla_eval.probe.interventions import ProbeSettings, plan_probe
-from vla_eval.probe.page_sections import probe_sections
+from vla_eval.probe.page.sections import probe_sections
 from vla_eval.probe.report_text import probe_texts
 from vla_eval.probe.world_records import by_policy
 from vla_eval.records import EpisodeRecord

@@ -38,9 +38,9 @@ def run_grid(args: argparse.Namespace, config: EvalConfig, settings: "GridSettin
         VlaEvalError: as for `probe`.
     """
     from vla_eval.probe.grid import plan_grid
-    from vla_eval.probe.grid_heat import write_heat_maps
     from vla_eval.probe.grid_table import read_grid
     from vla_eval.probe.grid_text import render_grid
+    from vla_eval.probe.page.heat_maps import write_heat_maps
 
     grid = plan_grid(config, settings)
     for task in grid.left_out:

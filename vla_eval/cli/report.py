@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
-        from vla_eval.probe.page_sections import probe_sections
+        from vla_eval.probe.page.sections import probe_sections
 
         if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
             raise ReportError(

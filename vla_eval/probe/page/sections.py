@@ -9,11 +9,11 @@ from vla_eval.page.rates import Plots, Sign
 from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable, page_table
 from vla_eval.probe import grid_text, probe_text
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.films import film_pairs
 from vla_eval.probe.found import FoundGridWorld, FoundProbe, find_probes
 from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
-from vla_eval.probe.grid_heat import heat_maps
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
+from vla_eval.probe.page.films import film_pairs
+from vla_eval.probe.page.heat_maps import heat_maps
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.retention_plot import CURVES, X_TITLE, line_name, retention_lines
 from vla_eval.probe.sentences import half_life_text, notes, sentences
