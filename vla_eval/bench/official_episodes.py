@@ -9,6 +9,9 @@ import sys
 import time
 from typing import Any  # mikasa_robo_suite and gymnasium are untyped
 
+import numpy as np
+
+N_ACTIONS = 7
 CHUNK_SIZE = 8  # the official runner renders each step, whatever the policy reads
 
 
@@ -18,16 +21,11 @@ class RandomChunks:
     chunk_size = CHUNK_SIZE
 
     def __init__(self) -> None:
-        import numpy as np
-
         self._draws = np.random.default_rng(0)
 
     def forward(self, obs: Any) -> Any:
         """Return (K, 7) float32."""
-        return self._draws.uniform(-1, 1, (CHUNK_SIZE, len(ACTION))).astype("float32")
-
-
-ACTION = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+        return self._draws.uniform(-1, 1, (CHUNK_SIZE, N_ACTIONS)).astype("float32")
 
 
 def make_env(task: str, horizon_steps: int) -> Any:

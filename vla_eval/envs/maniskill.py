@@ -299,10 +299,11 @@ def _take_pictures(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
         )
     check_no_environment_map(env.scene)
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    images = {}
-    for name in cameras:
-        sensor = env.scene.sensors[name]
+    sensors = {name: env.scene.sensors[name] for name in cameras}
+    for sensor in sensors.values():  # all are submitted before the first image is waited for
         sensor.capture()
+    images = {}
+    for name, sensor in sensors.items():
         textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
         images[name] = textures["rgb"].cpu().numpy()
     return images
