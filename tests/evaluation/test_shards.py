@@ -10,6 +10,7 @@ from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, RunChangedError
+from vla_eval.evaluation.dry_run import evaluation_effort
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.results.report import build_table
 from vla_eval.storage.merging import merge_runs, write_merged
@@ -116,6 +117,15 @@ def test_more_shards_than_episodes_that_can_be_apart_are_refused(bench: Bench) -
     assert not (bench.folder / "out").exists()
 
 
+def test_what_is_left_of_a_shard_is_its_own_episodes(bench: Bench) -> None:
+    config, shard = bench.config(runs=2), Shard(number=2, count=4)
+
+    effort = evaluation_effort(config, out=bench.folder / "out", shard=shard)
+
+    # Of 6 seeds in blocks of one, shard 2 of 4 has the second and the last: 2 seeds × 2 runs.
+    assert effort.n_episodes == 4
+
+
 class TestCommandLine:
     @pytest.mark.parametrize("text", ["3", "0/4", "5/4", "a/b", "1/0", "1/2/3", "-1/4", "٣/٤"])
     def test_a_mistyped_shard_is_a_mistake(self, text: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,6 +152,25 @@ class TestCommandLine:
         assert capsys.readouterr().out == f"{out}: 4 episodes of 2 shards\n"
         assert main(command) == 0
         assert "all 4 episodes are there" in capsys.readouterr().err
+
+    def test_a_probe_is_merged_world_by_world_and_then_printed(
+        self, bench: Bench, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        command = [
+            *("probe", "--task", TASK, "--policy", "hold", "--no-controls", "--probe", "blank"),
+            *("--episodes", "2", "--workers", "1", "--set", "simulator=fake"),
+            *("--out", str(bench.folder / "probe")),
+        ]
+        for number in (1, 2):
+            assert main([*command, "--shard", f"{number}/2"]) == 0
+            assert capsys.readouterr().out == f"{bench.folder}/probe-shard-{number}-of-2\n"
+
+        shards = [str(bench.folder / f"probe-shard-{number}-of-2") for number in (1, 2)]
+        assert main(["merge", *shards, "--out", str(bench.folder / "probe")]) == 0
+        worlds = [f"{bench.folder}/probe/{TASK}_{name}: 2 episodes of 2 shards" for name in ("blank", "none")]
+        assert sorted(capsys.readouterr().out.splitlines()) == worlds
+        assert main(command) == 0
+        assert "all 2 episodes are there" in capsys.readouterr().err
 
     def test_an_audit_is_merged_evaluation_by_evaluation_and_then_printed(
         self, bench: Bench, capsys: pytest.CaptureFixture[str]
