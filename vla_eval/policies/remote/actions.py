@@ -14,9 +14,11 @@ N_DELTA_POSE = 7  # three of position, three of rotation, the gripper
 POSITION_UNIT_M = 0.1
 ROTATION_UNIT_RAD = -0.1
 """What 1 means in an action of `pd_ee_delta_pose`. ManiSkill multiplies the rotation by its lower bound, so
-that its sign is reversed; a turn is then x, y, z Euler angles about the moving axes. Sources:
-https://github.com/haosulab/ManiSkill/blob/v3.0.1/mani_skill/agents/robots/panda/panda.py,
-https://github.com/haosulab/ManiSkill/blob/v3.0.1/mani_skill/agents/controllers/pd_ee_pose.py"""
+that its sign is reversed; a turn is then x, y, z Euler angles about the moving axes. Sources, the same in
+3.0.1: https://github.com/haosulab/ManiSkill/blob/
+1abb221ab12ce09030d75509313a9641645f4354/mani_skill/agents/robots/panda/panda.py,
+https://github.com/haosulab/ManiSkill/blob/
+628bbe64e2c925d9d543171361a86c4a4965c6e9/mani_skill/agents/controllers/pd_ee_pose.py"""
 
 
 def as_rows(actions: Any) -> Any:

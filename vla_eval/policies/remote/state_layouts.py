@@ -107,12 +107,13 @@ LAYOUTS: Mapping[str, StateLayout] = {
     "joints": StateLayout((POSE, JOINTS, VELOCITIES), 25, lambda state: proprioception(state)["joints"]),
     "eef": StateLayout((POSE, JOINTS, VELOCITIES), 10, lambda state: proprioception(state)["eef"]),
     # Position, axis-angle, two finger joints of opposite signs. Sources: openpi's client (above);
-    # https://github.com/ARISE-Initiative/robosuite/blob/v1.4.1/robosuite/models/grippers/panda_gripper.py
+    # https://github.com/ARISE-Initiative/robosuite/blob/
+    # 8afb646610c50346405bd6c1cf23e528a7b43636/robosuite/models/grippers/panda_gripper.py
     "libero": StateLayout((POSE, JOINTS), 8, _libero),
     "joint_positions": StateLayout(
         (JOINTS,), N_ARM_JOINTS, lambda state: state[JOINTS][:N_ARM_JOINTS].astype(np.float32)
     ),
     # 0 open, 1 closed, as DROID's `gripper_position`. Source:
-    # https://github.com/droid-dataset/droid/blob/main/droid/franka/robot.py
+    # https://github.com/droid-dataset/droid/blob/c43ab6b02b69c5bd1678cd62af3881bd18f27067/droid/franka/robot.py
     "gripper_closedness": StateLayout((JOINTS,), 1, _closedness),
 }

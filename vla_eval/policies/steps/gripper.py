@@ -2,8 +2,8 @@
 
 ManiSkill's `pd_ee_delta_pose`: +1 opens (fingers 4 cm from the middle), -1 closes, and what is between is a
 width, so that 0 leaves a gap of 3 cm: the controller maps [-1, 1] to [-0.01, 0.04] m per finger.
-Source: https://github.com/haosulab/ManiSkill/blob/v3.0.1/mani_skill/agents/robots/panda/panda.py
-(`gripper_pd_joint_pos`).
+Source: `gripper_pd_joint_pos`, the same in 3.0.1, of https://github.com/haosulab/ManiSkill/blob/
+1abb221ab12ce09030d75509313a9641645f4354/mani_skill/agents/robots/panda/panda.py
 """
 
 from collections.abc import Mapping
