@@ -151,7 +151,8 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         return _dry_run(config, args)
     check_table_arguments(args)
-    check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
+    if args.baseline is not None:  # a policy behind a socket is asked for its name
+        check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
     command = typed_command()
 
     def needs() -> tuple[Needed, ...]:

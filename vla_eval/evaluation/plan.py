@@ -167,53 +167,82 @@ def make_plan(config: EvalConfig) -> Plan:
         if policy.value.adapter == REMOTE_ADAPTER
     }
     shared = _shared(config, policies)
-    groups: list[EpisodeGroup] = []
-    left_out: list[str] = []
+    found = _groups_of_all(config, tasks, policies, prompts=prompts, servers=servers, shared=shared)
+    if not found.groups:
+        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(found.left_out)}).")
+    _refuse_too_many(config, found.groups)
+    return Plan(
+        jobs=tuple(job for group in found.groups for job in _jobs(config, group)),
+        recipe_hashes=_recipe_hashes(prompts, policies, servers),
+        normalization=_normalization(policies),
+        servers={name: server.identity() for name, server in servers.items()},
+        task_versions={task.id: task.version for task in tasks},
+        policy_names=tuple(policy.name for policy in policies),
+        shared=shared,
+        left_out=tuple(found.left_out),
+        max_workers=_max_workers(policies, shared),
+    )
+
+
+class _Found(NamedTuple):
+    """The groups of a plan, and which pairs are left out."""
+
+    groups: list[EpisodeGroup]
+    left_out: list[str]
+
+
+def _groups_of_all(
+    config: EvalConfig,
+    tasks: Sequence[TaskSpec],
+    policies: Sequence[PolicyEntry],
+    *,
+    prompts: Recipe[PromptRecipe],
+    servers: Mapping[str, ServerMetadata],
+    shared: Mapping[str, str],
+) -> _Found:
+    """Return the groups of every task and policy that make sense together."""
+    found = _Found([], [])
     for task in tasks:
         check_arguments(task, config.env, TASKS.values())
         instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and task.candidates is None:
-                left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
+                found.left_out.append(
+                    f"{policy.name} on {task.id}: it needs candidates, and this task has none"
+                )
                 continue
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
-            groups.extend(_groups(config, task, policy, instruction, servers.get(policy.name), n_rows=n_rows))
-    if not groups:
-        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
-    _refuse_too_many(config, groups)
-    limits = [
-        policy.value.max_workers
-        for policy in policies
-        if policy.value.max_workers is not None and policy.part(0) not in shared
-    ]
-    return Plan(
-        jobs=tuple(
-            EpisodeJob(
+            server = servers.get(policy.name)
+            found.groups.extend(_groups(config, task, policy, instruction, server, n_rows=n_rows))
+    return found
+
+
+def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:
+    for run in _runs(config, group):
+        for index in range(config.episodes):
+            yield EpisodeJob(
                 group=group,
                 run=run,
                 seed=config.seed_start + index,
                 slot=index % config.slots_per_worker,
                 row=index % group.n_rows,
             )
-            for group in groups
-            for run in _runs(config, group)
-            for index in range(config.episodes)
-        ),
-        recipe_hashes=_recipe_hashes(prompts, policies, servers),
-        normalization={
-            policy.part(index): notes
-            for policy in policies
-            for index, recipe in enumerate(policy.recipes)
-            if (notes := normalization_notes(recipe.value.adapter, recipe.value.args))
-        },
-        servers={name: server.identity() for name, server in servers.items()},
-        task_versions={task.id: task.version for task in tasks},
-        policy_names=tuple(policy.name for policy in policies),
-        shared=shared,
-        left_out=tuple(left_out),
-        max_workers=min(limits, default=None),
-    )
+
+
+def _normalization(policies: Sequence[PolicyEntry]) -> dict[str, Mapping[str, Any]]:  # Any: plain data
+    return {
+        policy.part(index): notes
+        for policy in policies
+        for index, recipe in enumerate(policy.recipes)
+        if (notes := normalization_notes(recipe.value.adapter, recipe.value.args))
+    }
+
+
+def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:
+    """Return the least of the limits of policies that each worker loads."""
+    limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
+    return min((limit for limit in limits if limit is not None), default=None)
 
 
 def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
