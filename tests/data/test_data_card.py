@@ -11,13 +11,13 @@ from PIL import Image
 
 from vla_eval.cli.main import main
 from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
-from vla_eval.data.contact_sheet import LABEL_PX, LEFT_PX, MARGIN_PX, SheetRow, contact_sheet
 from vla_eval.data.convert import convert_to_lerobot, find_source
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.dataset_summary import ActionStatistics
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.testing.synthetic import write_synthetic_dataset
+from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX, MARGIN_PX, SheetRow, contact_sheet
 
 
 def front_matter(text: str) -> dict[str, object]:

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from vla_eval.page.build import write_page
 from vla_eval.probe.page.sections import probe_sections
 from vla_eval.results.report import build_table
 from vla_eval.results.table_columns import lay_out
+from vla_eval.storage.capture_files import rrd_file, video_file
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -154,6 +156,27 @@ def test_arrow_keys_show_the_same_seed_of_all_policies(browser: Browser, tmp_pat
     assert [(row[1], row[2], row[4]) for row in beside] == [
         (policy, k, "1") for policy, k in (("p", "1"), ("p", "4"), ("random", "1"), ("random", "4"))
     ]
+
+
+def test_captures_are_linked_from_the_page_to_where_they_are(browser: Browser, tmp_path: Path) -> None:
+    run = full_run()
+    filmed = run.records[1]
+    run = replace(run, path=tmp_path / "a run")
+    for file in (video_file(run.path, filmed), rrd_file(run.path, filmed)):
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"bytes")
+    browser.open(write_page([run], tmp_path / "page"))
+    browser.set("task", COLOR)
+    browser.set("seed", str(filmed.seed))
+    browser.ask("document.querySelector('#episode-table tbody tr').click()")
+    links = browser.ask(
+        "[...document.querySelectorAll('#episode-beside a')].map(a => [a.textContent, a.href])"
+    )
+    assert links == [
+        ["video", video_file(run.path, filmed).as_uri()],
+        ["rrd", rrd_file(run.path, filmed).as_uri()],
+    ]
+    assert browser.complaints == []
 
 
 def test_a_phone_shows_the_page_without_scrolling_sideways(browser: Browser, tmp_path: Path) -> None:

@@ -61,7 +61,11 @@ def stored(*records: EpisodeRecord, path: Path = Path("runs/a"), name: str = "de
         name=name,
         config={"tasks": [COLOR], "episodes": 4},
         recipes={"policies/p": "f00d"},
-        environment={"python": "3.12.1"},
+        environment={
+            "python": "3.12.1",
+            "packages": {"numpy": "2.2.6", "lerobot": None},
+            "vla_eval": {"version": "0.1.0", "commit": "c0ffee", "changes": "d1ff"},
+        },
         options={},
         command="mikasa-vla eval demo",
     )
@@ -141,6 +145,16 @@ def test_the_json_report_is_in_the_page_for_programs() -> None:
 
 def test_the_same_runs_give_the_same_page() -> None:
     assert full_page() == build_page([full_run()])
+
+
+def test_a_run_is_reproduced_from_its_commit_by_its_commands_with_its_versions_and_digests() -> None:
+    section = re.search(r'<section id="reproduce">(.*?)</section>', full_page(), re.S)
+    assert section is not None
+    commands, lock = re.findall(r"<pre>(.*?)</pre>", section[1], re.S)[:2]
+    assert commands.splitlines()[0] == "git checkout c0ffee"
+    assert commands.splitlines()[-1] == "mikasa-vla eval demo"
+    assert lock.splitlines() == ["# Python 3.12.1", "numpy==2.2.6", "# sha256", "f00d  policies/p"]
+    assert "uncommitted changes" in section[1]
 
 
 def test_every_section_is_there_and_speaks() -> None:

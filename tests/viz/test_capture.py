@@ -22,13 +22,16 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, VlaEvalError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.plan import fingerprint
+from vla_eval.page.filmstrip import write_filmstrips
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
-from vla_eval.storage.capture_files import rrd_file, thumbnail_file, video_file
+from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.viz.arm_figure import arm_points_m
-from vla_eval.viz.frames import PANEL_PX, PHASE_COLORS, VIEW_PX, compose
+from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX
+from vla_eval.viz.frames import FAILURE_COLOR, PANEL_PX, PHASE_COLORS, SUCCESS_COLOR, VIEW_PX, compose
+from vla_eval.viz.moments import STILL_PX, find_moments, read_stills, write_stills
 from vla_eval.viz.rerun_log import events, n_overlapping, write_rrd
 from vla_eval.viz.tape import Tapes
 from vla_eval.viz.video import write_video
@@ -84,6 +87,17 @@ def play(
     return policy, record, tapes
 
 
+def film(tapes: Tapes, record: EpisodeRecord, path: Path, *, frame_rate_hz: float) -> None:
+    write_video(
+        tapes.episodes[0],
+        record,
+        path,
+        thumbnail=path.with_suffix(".jpg"),
+        stills=path.with_name("stills.jpg"),
+        frame_rate_hz=frame_rate_hz,
+    )
+
+
 @pytest.mark.parametrize("reads", ["last", "every"])
 def test_a_policy_sees_the_same_frames_bit_by_bit_whether_or_not_it_is_captured(reads: str) -> None:
     (plain, record, _), (filmed, filmed_record, _) = (
@@ -102,7 +116,7 @@ def test_in_the_simulator_too(tmp_path: Path) -> None:
     assert filmed.frames == plain.frames
     assert filmed_record == record
     assert tapes.episodes[0].steps[0].result.observation.images[HUMAN_CAMERA].shape == (512, 512, 3)
-    write_video(tapes.episodes[0], record, tmp_path / "a.mp4", thumbnail=tmp_path / "a.jpg", frame_rate_hz=10)
+    film(tapes, record, tmp_path / "a.mp4", frame_rate_hz=10)
 
 
 def test_frames_are_captured_at_the_stride_and_at_the_end() -> None:
@@ -116,14 +130,15 @@ def test_frames_are_captured_at_the_stride_and_at_the_end() -> None:
 def test_a_video_opens_and_is_as_long_as_what_was_captured(tmp_path: Path) -> None:
     _, record, tapes = play(captured=True, stride=4)
     path = tmp_path / "videos" / "a.mp4"
-    write_video(tapes.episodes[0], record, path, thumbnail=tmp_path / "videos" / "a.jpg", frame_rate_hz=5)
+    film(tapes, record, path, frame_rate_hz=5)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264" and stream.codec_context.pix_fmt == "yuv420p"
         n_frames = sum(1 for _ in container.decode(stream))
     with Image.open(path.with_suffix(".jpg")) as poster:
-        assert poster.size == (2 * stream.width, stream.height)  # the first and the last frame
-    assert n_frames == 3 + 5  # steps 0, 4, 8, not 3 and 6, where the policy looked; the last one stays
+        assert poster.size == (2 * stream.width, stream.height)  # cue and choice
+    # Steps 0, 4, 8, not 3 and 6, where the policy looked. Cue (step 0) and end are held for a second.
+    assert n_frames == 5 + 1 + (1 + 5)
     assert not list(path.parent.glob("*.part"))
 
 
@@ -142,12 +157,38 @@ def test_facts_are_above_the_images_where_a_player_covers_nothing() -> None:
     assert colors & set(PHASE_COLORS.values())
 
 
+def test_swatches_have_the_colours_of_target_and_choice_and_a_held_cue_is_said() -> None:
+    _, record, tapes = play(captured=True, stride=4)
+    tape = tapes.episodes[0]
+    target = tape.steps[0].result.status.target
+    assert target is not None
+    red_green_blue = ((255, 0, 0), (0, 255, 0), (0, 0, 255))  # the colours of RememberColor3, in their order
+    panel = compose(tape, tape.captured()[0], record)[:PANEL_PX]
+    counts = [int((panel == color).all(axis=2).sum()) for color in red_green_blue]
+    # The outline is of the ink's colour, so one pixel less on each side; nothing was chosen yet.
+    assert [count > 0 for count in counts] == [index == target for index in range(3)]
+    held = compose(tape, tape.captured()[0], record, n_held=5)[:PANEL_PX]
+    assert not np.array_equal(held, panel)
+
+
+def test_the_moments_of_an_episode_are_cue_reveal_and_touch(tmp_path: Path) -> None:
+    _, _, tapes = play(captured=True, stride=1)
+    tape = tapes.episodes[0]
+    moments = find_moments(tape)
+    choices = [one.step for one in tape.steps if one.result.status.first_choice is not None]
+    # cue_steps 2, delay_steps 2: the response begins at step 4.
+    assert [one.step for one in moments] == [0, 4, choices[0] if choices else 8]
+    write_stills(tape, tmp_path / "stills.jpg")
+    stills = read_stills(tmp_path / "stills.jpg")
+    assert [still.shape for still in stills] == [(STILL_PX, STILL_PX, 3)] * 3
+
+
 def test_a_video_that_cannot_be_written_says_where_and_of_what(tmp_path: Path) -> None:
     _, record, tapes = play(captured=True, stride=8)
     (tmp_path / "videos").write_text("a file in the way")
     path = tmp_path / "videos" / "a.mp4"
     with pytest.raises(VlaEvalError, match=r"videos/a\.mp4: the video of looker on \S+, seed 1, could"):
-        write_video(tapes.episodes[0], record, path, thumbnail=path.with_suffix(".jpg"), frame_rate_hz=5)
+        film(tapes, record, path, frame_rate_hz=5)
 
 
 def test_a_rerun_file_holds_what_was_seen_done_and_chosen(tmp_path: Path) -> None:
@@ -242,5 +283,39 @@ def test_a_run_captures_what_it_was_asked_to_and_nothing_else(tmp_path: Path) ->
         assert video_file(folder, record).exists() == (record.key in failures)
         assert thumbnail_file(folder, record).exists() == (record.key in failures)
         assert rrd_file(folder, record).exists() == (record.seed == 1)
+        assert stills_file(folder, record).exists() == (record.key in failures)
     assert "capture" not in run.description.config
     assert run.description.options["capture"] == capture
+
+
+def test_a_filmstrip_shows_the_captured_seeds_of_a_row_with_an_edge_for_the_outcome(tmp_path: Path) -> None:
+    data = {"name": "films", "tasks": [TASK], "policies": ["cue_blind", "hold"], "episodes": 3, "workers": 1}
+    data |= {
+        "env": SHORT | {"horizon_steps": 30},
+        "simulator": "fake",
+        "capture": {"video": 2, "frame_stride": 30},
+    }
+    evaluate(decode(EvalConfig, data, where="test"), out=tmp_path / "run")
+    run = read_run(tmp_path / "run")
+    for path in (tmp_path / "run/videos").glob("*hold*"):
+        path.unlink()
+
+    made = write_filmstrips([run], tmp_path / "strips")
+
+    assert [path.name for path in made.files] == [f"{TASK}_cue_blind_K1.png"]
+    assert made.not_captured == (f"{TASK} hold K1",)
+    sheet = np.asarray(Image.open(made.files[0]))
+    # Two lines of title and one of columns; two seeds, three frames each.
+    assert sheet.shape[:2] == (3 * LABEL_PX + 2 * (STILL_PX + 4) + 4, LEFT_PX + 3 * (STILL_PX + 4) + 4)
+    edges = [tuple(map(int, sheet[3 * LABEL_PX + i * (STILL_PX + 4) + 9, LEFT_PX - 1])) for i in range(2)]
+    outcome = {record.seed: record.outcome for record in run.records if record.policy == "cue_blind"}
+    assert edges == [SUCCESS_COLOR if outcome[seed] == "success" else FAILURE_COLOR for seed in (1, 2)]
+
+
+def test_a_run_without_captures_says_how_to_make_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = {"name": "films", "tasks": [TASK], "policies": ["hold"], "episodes": 1, "simulator": "fake"}
+    evaluate(decode(EvalConfig, data | {"env": SHORT}, where="test"), out=tmp_path / "run")
+    assert main(["report", str(tmp_path / "run"), "--filmstrip", str(tmp_path / "strips")]) == 1
+    assert "--capture-video 10 --out DIR" in capsys.readouterr().err

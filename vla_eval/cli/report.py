@@ -1,18 +1,24 @@
 """`mikasa-vla report`: print the success table of one or more run folders, or write it as a page."""
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.output import add_table_arguments, print_table
+
+if TYPE_CHECKING:
+    from vla_eval.storage.run_folder import StoredRun
 
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
 
 Each RUN is a folder that `mikasa-vla eval` made; a run may still be unfinished. Several runs go into one
 table: rows with the same task, policy, n_action_steps and settings are put together.
 
-With --html, a page with plots, choices, errors and videos is written instead, and its path printed."""
+With --html, a page with plots, choices, errors and videos is written instead, and its path printed. With
+--filmstrip, an image per row of the table: ten seeds, cue | reveal | touch."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -39,6 +45,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
     )
 
+    parser.add_argument(
+        "--filmstrip",
+        type=Path,
+        metavar="DIR",
+        help="write DIR/TASK_POLICY_Kn.png for each row with captured episodes (eval --capture-video)",
+    )
+
 
 def run(args: argparse.Namespace) -> int:
     """Read the runs, and print their table or write their page.
@@ -51,21 +64,44 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.storage.run_folder import read_run
 
     runs = [read_run(path) for path in args.runs]
+    for flag, folder in (("--html", args.html), ("--filmstrip", args.filmstrip)):
+        if folder is not None:
+            _check_alone(flag, args)
     if args.html is not None:
-        from vla_eval.errors import ReportError
         from vla_eval.page.build import write_page
         from vla_eval.probe.page.sections import probe_sections
 
-        if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
-            raise ReportError(
-                "--html writes a page, which has no --format, --preset, --columns, --wide and --paper. "
-                "Remove them."
-            )
         page = write_page(runs, args.html, baseline=args.baseline, probes=probe_sections(runs))
         print(page)
+    if args.filmstrip is not None:
+        _write_filmstrips(runs, args.filmstrip)
+    if args.html is not None or args.filmstrip is not None:
         return 0
     print_table(runs, args, columns=args.columns)
     if args.format == "markdown":
         for text in probe_texts(runs):
             print(f"\n{text}")
     return 0
+
+
+def _check_alone(flag: str, args: argparse.Namespace) -> None:
+    from vla_eval.errors import ReportError
+
+    if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
+        raise ReportError(
+            f"{flag} writes files, which have no --format, --preset, --columns, --wide and --paper. "
+            "Remove them."
+        )
+
+
+def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:
+    from vla_eval.errors import some_of
+    from vla_eval.page.filmstrip import N_EPISODES, write_filmstrips
+
+    made = write_filmstrips(runs, folder)
+    print("\n".join(map(str, made.files)))
+    if made.not_captured:
+        print(
+            f"Not captured (--capture-video {N_EPISODES}): {some_of(made.not_captured)}",
+            file=sys.stderr,
+        )

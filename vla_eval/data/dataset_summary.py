@@ -9,7 +9,6 @@ import numpy as np
 
 from vla_eval.core import FloatArray
 from vla_eval.data.completeness import check_complete
-from vla_eval.data.contact_sheet import SheetRow, contact_sheet
 from vla_eval.data.decoded_frames import frame_layout, read_columns
 from vla_eval.data.frame_cache import decode_camera
 from vla_eval.data.imported import ImportFacts
@@ -24,6 +23,7 @@ from vla_eval.data.manifest import (
 )
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
+from vla_eval.viz.contact_sheet import SheetRow, contact_sheet
 
 N_SHEET_EPISODES = 3
 IDLE_STD = 1e-3  # of actions in [-1, 1]: 0.1 mm or 0.0001 rad per step

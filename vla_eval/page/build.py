@@ -29,7 +29,11 @@ N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
 def build_page(
-    runs: Sequence[StoredRun], *, baseline: str | None = None, probes: Sequence[ProbeSection] = ()
+    runs: Sequence[StoredRun],
+    *,
+    baseline: str | None = None,
+    probes: Sequence[ProbeSection] = (),
+    folder: Path | None = None,
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
@@ -37,6 +41,7 @@ def build_page(
         runs: what the run folders hold. Timings and videos are read from the folders themselves.
         baseline: as for `build_table`.
         probes: those that the run folders are of.
+        folder: where the page will be, for links to captures; None: the current folder.
 
     Raises:
         ReportError: there is no episode yet.
@@ -53,7 +58,7 @@ def build_page(
         material=material,
         probes=probes,
         verdicts=verdicts(material.table),
-        episodes=episode_list(material),
+        episodes=episode_list(material, folder),
         script=Markup(script),
         script_hash=_script_hash(script),
         n_open_matrices=N_OPEN_MATRICES,
@@ -92,7 +97,7 @@ def write_page(
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(runs, baseline=baseline, probes=probes)
+    page = build_page(runs, baseline=baseline, probes=probes, folder=folder)
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,17 +1,20 @@
 """The data of the page's list of episodes, as numbers; the browser draws the rows that are shown."""
 
 import json
+import os
+from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
 from markupsafe import Markup
 
 from vla_eval.page.material import Material, key_of
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.capture_files import video_file
+from vla_eval.storage.capture_files import rrd_file, video_file
 from vla_eval.tasks.item_names import item_names
 
 OUTCOMES = ("success", "failure", "error")
-FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video")
+FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video", "rrd")
 
 
 class EpisodeList(NamedTuple):
@@ -21,13 +24,24 @@ class EpisodeList(NamedTuple):
     data: Markup
 
 
-def episode_list(material: Material) -> EpisodeList:
+class _Files(NamedTuple):
+    """Addresses of an episode's captures; None where there is none."""
+
+    video: str | None = None
+    rrd: str | None = None
+
+
+def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     """Return all episodes of the table's rows.
 
     Each is a list in the order of `FIELDS`; what is undefined is null. Texts are numbers into lists of texts,
     so that 30,000 episodes fit into a file of a few megabytes.
+
+    Args:
+        material: the data of the page.
+        folder: of the page, from which captures are linked; None: the current one.
     """
-    videos = _videos(material)
+    files = _files(material, folder or Path())
     errors: dict[str, int] = {}
     episodes = []
     rows = []
@@ -50,7 +64,7 @@ def episode_list(material: Material) -> EpisodeList:
                     error = errors.setdefault(
                         f"{record.error.kind}: {record.error.message[:200]}", len(errors)
                     )
-                episodes.append(_episode(number, record, error, videos.get(id(record))))
+                episodes.append(_episode(number, record, error, files.get(id(record), _Files())))
     data = {
         "fields": FIELDS,
         "outcomes": OUTCOMES,
@@ -63,7 +77,7 @@ def episode_list(material: Material) -> EpisodeList:
     return EpisodeList(len(episodes), Markup(text.replace("<", "\\u003c")))
 
 
-def _episode(row: int, record: EpisodeRecord, error: int | None, video: str | None) -> list[object]:
+def _episode(row: int, record: EpisodeRecord, error: int | None, files: _Files) -> list[object]:
     return [
         row,
         record.run,
@@ -73,15 +87,20 @@ def _episode(row: int, record: EpisodeRecord, error: int | None, video: str | No
         record.target,
         record.first_choice,
         error,
-        video,
+        *files,
     ]
 
 
-def _videos(material: Material) -> dict[int, str]:
-    """Return the path of the video of each record that has one."""
-    return {
-        id(record): str(path)
-        for run in material.runs
-        for record in run.records
-        if (path := video_file(run.path, record)).is_file()
-    }
+def _files(material: Material, folder: Path) -> dict[int, _Files]:
+    """Return the captures of each record that has any, as addresses relative to the page."""
+    found = {}
+    for run in material.runs:
+        for record in run.records:
+            places = (video_file(run.path, record), rrd_file(run.path, record))
+            if any(place.is_file() for place in places):
+                found[id(record)] = _Files(*(_address(place, folder) for place in places))
+    return found
+
+
+def _address(file: Path, folder: Path) -> str | None:
+    return quote(os.path.relpath(file, folder)) if file.is_file() else None

@@ -3,6 +3,7 @@
 import base64
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from vla_eval.page.material import Material, errors_of
 from vla_eval.page.tables import UNKNOWN, PageTable, page_table
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import thumbnail_file, video_file
-from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.timings import measure_latency
 from vla_eval.tasks.item_names import item_names
@@ -153,10 +154,22 @@ class Listing(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reproduction:
-    """What is needed to reproduce a run."""
+    """What is needed to reproduce a run.
+
+    Attributes:
+        title: folder and name of the run.
+        commands: from the checkout to the last session; empty if none was recorded.
+        lock: versions of packages, and digests of all that the results depend on.
+        warning: why the commands may not be enough; may be empty.
+        listings: recipes, statistics and environment.
+        config: the resolved configuration as JSON.
+        environment_changes: how the machine or the versions changed between sessions.
+    """
 
     title: str
     commands: str
+    lock: str
+    warning: str
     listings: tuple[Listing, ...]
     config: str
     environment_changes: str
@@ -171,7 +184,9 @@ def reproduction(run: StoredRun) -> Reproduction:
     environment = dict(leaves(description.environment, prefix=""))
     return Reproduction(
         title=f"{run.path} ({description.name})",
-        commands="\n".join(commands),
+        commands="\n".join([*_setup_commands(description.environment), *commands]) if any(commands) else "",
+        lock="\n".join(_lock(run)),
+        warning=_warning(description.environment),
         listings=(
             _listing("Recipes, sha256", dict(description.recipes), "No recipe hashes were recorded."),
             _listing("Normalization statistics", statistics, "No policy of this run normalises."),
@@ -180,6 +195,38 @@ def reproduction(run: StoredRun) -> Reproduction:
         config=json.dumps(description.config, indent=2, ensure_ascii=False, default=str),
         environment_changes="; ".join(changes),
     )
+
+
+def _setup_commands(environment: Mapping[str, JsonValue]) -> list[str]:
+    """Return how to get the code and the versions that the run was made with."""
+    source = environment.get("vla_eval")
+    source = source if isinstance(source, Mapping) else {}
+    if isinstance(commit := source.get("commit"), str):
+        return [f"git checkout {commit}", "make setup    # the versions of constraints.txt", ""]
+    if isinstance(version := source.get("version"), str):
+        return [f"# mikasa-vla-eval {version}; its commit was not recorded", ""]
+    return []
+
+
+def _lock(run: StoredRun) -> list[str]:
+    """Return versions as pip takes them, then digests as `sha256sum` prints them."""
+    environment = run.description.environment
+    packages = environment.get("packages")
+    packages = packages if isinstance(packages, Mapping) else {}
+    python = environment.get("python")
+    return [
+        *([f"# Python {python}"] if python is not None else []),
+        *(f"{name}=={version}" for name, version in packages.items() if version is not None),
+        *(["# sha256"] if run.description.recipes else []),
+        *(f"{digest}  {name}" for name, digest in run.description.recipes.items()),
+    ]
+
+
+def _warning(environment: Mapping[str, JsonValue]) -> str:
+    source = environment.get("vla_eval")
+    if isinstance(source, Mapping) and source.get("changes") is not None:
+        return "Made with uncommitted changes to the package, which the commit does not contain."
+    return ""
 
 
 def _listing(title: str, values: dict[str, str], missing: str) -> Listing:

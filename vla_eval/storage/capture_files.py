@@ -20,8 +20,13 @@ def video_file(folder: Path, record: EpisodeRecord) -> Path:
 
 
 def thumbnail_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the image of an episode's last captured step is, or would be."""
+    """Return where the image of an episode's cue and its choice is, or would be."""
     return folder / VIDEOS / f"{capture_stem(record)}.jpg"
+
+
+def stills_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the stills of an episode (cue, reveal, touch) are, or would be."""
+    return folder / VIDEOS / f"{capture_stem(record)}_stills.jpg"
 
 
 def rrd_file(folder: Path, record: EpisodeRecord) -> Path:

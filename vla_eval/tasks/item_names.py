@@ -3,7 +3,19 @@
 In the official order, which is that of the indices in records (`target`, `first_choice`).
 """
 
-COLOR_NAMES = ("red", "green", "blue", "yellow", "magenta", "cyan", "maroon", "orange", "teal")
+# Values and order of the official code, which calls (0, 255, 0) "Lime" and (255, 128, 0) "Olive".
+COLOR_RGB = {
+    "red": (255, 0, 0),
+    "green": (0, 255, 0),
+    "blue": (0, 0, 255),
+    "yellow": (255, 255, 0),
+    "magenta": (255, 0, 255),
+    "cyan": (0, 255, 255),
+    "maroon": (128, 0, 0),
+    "orange": (255, 128, 0),
+    "teal": (0, 128, 128),
+}
+COLOR_NAMES = tuple(COLOR_RGB)
 SHAPE_NAMES = ("cube", "sphere", "cylinder", "cross", "torus", "star", "pyramid", "t_shape", "crescent")
 _NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES}
 
@@ -22,3 +34,8 @@ def item_names(task: str, n_items: int) -> tuple[str, ...]:
     family = task.partition("-")[0].rstrip("0123456789")
     names = _NAMES.get(family, ())
     return names[:n_items] if len(names) >= n_items else tuple(map(str, range(n_items)))
+
+
+def item_rgb(task: str, n_items: int, index: int) -> tuple[int, int, int] | None:
+    """Return the colour of an item that its name gives, 0 to 255; None if the name is no colour."""
+    return COLOR_RGB.get(item_names(task, n_items)[index])

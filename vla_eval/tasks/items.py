@@ -15,6 +15,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor
 
 from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.item_names import COLOR_RGB
 
 S = 0.02  # m, the official scale: half the edge of a cube
 BAR = 0.375 * S
@@ -28,18 +29,7 @@ class NamedColor(NamedTuple):
     rgb: tuple[int, int, int]
 
 
-# Values and order of the official code, which calls (0, 255, 0) "Lime" and (255, 128, 0) "Olive".
-COLORS = (
-    NamedColor("red", (255, 0, 0)),
-    NamedColor("green", (0, 255, 0)),
-    NamedColor("blue", (0, 0, 255)),
-    NamedColor("yellow", (255, 255, 0)),
-    NamedColor("magenta", (255, 0, 255)),
-    NamedColor("cyan", (0, 255, 255)),
-    NamedColor("maroon", (128, 0, 0)),
-    NamedColor("orange", (255, 128, 0)),
-    NamedColor("teal", (0, 128, 128)),
-)
+COLORS = tuple(NamedColor(name, rgb) for name, rgb in COLOR_RGB.items())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.core import Stage
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.capture_files import rrd_file, thumbnail_file, video_file
+from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.viz.tape import Tapes
 
 VIDEO_WRITER = "vla_eval.viz.video:write_video"
@@ -96,6 +96,7 @@ class EpisodeCapture:
                     record,
                     video_file(self.folder, record),
                     thumbnail=thumbnail_file(self.folder, record),
+                    stills=stills_file(self.folder, record),
                     frame_rate_hz=control_hz / self.config.frame_stride,
                 )
             if self._wants(self.config.rrd, job, record):

@@ -3,6 +3,7 @@
 They are above, because the controls of a player cover the lower edge.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,11 @@ from vla_eval.config.environment import HUMAN_CAMERA
 from vla_eval.core import ImageArray
 from vla_eval.records import EpisodeRecord
 from vla_eval.task_state import Phase
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.item_names import item_names, item_rgb
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 VIEW_PX = 512  # the large view; the others are half of it, one below the other
-PANEL_PX = 112
+PANEL_PX = 128
 LINE_PX = 24
 MARGIN_PX = 10
 STRIP_PX = 12
@@ -28,6 +29,18 @@ PHASE_COLORS: dict[Phase, tuple[int, int, int]] = {
     "response": (86, 180, 233),
 }
 SUCCESS_COLOR, FAILURE_COLOR = (47, 196, 154), (255, 138, 61)
+SWATCH_PX = 12
+UNSEEN = "not seen by the policy: strip, facts, labels and the viewer camera"
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A piece of a line of text, and the colour of the thing that it names, if it has one."""
+
+    text: str
+    swatch: Rgb | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,18 +49,19 @@ class Caption:
 
     instruction: str
     episode: str
-    step: str
+    step: tuple[Part, ...]
     outcome: str
-    outcome_color: tuple[int, int, int]
+    outcome_color: Rgb
 
 
-def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> ImageArray:
+def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_held: int = 1) -> ImageArray:
     """Return one frame of an episode, (H, W, 3) uint8 with even sides.
 
     Args:
         tape: the whole episode.
         taped: the step to show; it must have images.
         record: of the episode.
+        n_held: how many frames of the video this one is held for; above 1 it is said.
     """
     images = taped.result.observation.images
     small = [name for name in images if name != HUMAN_CAMERA]
@@ -62,7 +76,7 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Image
         top = PANEL_PX + row * VIEW_PX // 2
         canvas.paste(_scaled(images[name], VIEW_PX // 2), (VIEW_PX, top))
         _label(draw, (VIEW_PX + 6, top + 4), name)
-    _write(draw, _caption(tape, taped, record), width)
+    _write(draw, _caption(tape, taped, record, n_held), width)
     _draw_strip(draw, tape, taped, record, width)
     return np.asarray(canvas, dtype=np.uint8)
 
@@ -79,17 +93,19 @@ def _scaled(image: ImageArray, size_px: int) -> Image.Image:
     return scaled.resize((size_px, size_px), how)
 
 
-def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Caption:
+def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held: int) -> Caption:
     status, start = taped.result.status, tape.start
     n_inferences = sum(chunk.step <= taped.step for chunk in tape.chunks)
     is_new = any(chunk.step == taped.step for chunk in tape.chunks)
-    parts = [f"step {taped.step}/{start.horizon_steps}", status.phase, f"inference {n_inferences}"]
-    parts += ["new chunk"] if is_new else []
+    texts = [f"step {taped.step}/{start.horizon_steps}", status.phase, f"inference {n_inferences}"]
+    texts += ["new chunk"] if is_new else []
+    texts += [f"held {n_held} x"] if n_held > 1 else []
+    parts = [Part(text=text) for text in texts]
     if status.n_candidates:
-        names = item_names(record.task, status.n_candidates)
-        target = "several" if status.target is None else names[status.target]
-        chosen = "none yet" if status.first_choice is None else names[status.first_choice]
-        parts += [f"target {target}", f"chosen {chosen}"]
+        parts += [
+            _item_part("target", "several", status.target, record.task, status.n_candidates),
+            _item_part("chosen", "none yet", status.first_choice, record.task, status.n_candidates),
+        ]
     outcome, color = "", INK
     if record.success_step is not None and taped.step >= record.success_step:
         outcome, color = f"SUCCESS at step {record.success_step}", SUCCESS_COLOR
@@ -99,22 +115,46 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord) -> Capt
         instruction=start.instruction,
         episode=f"{record.task}  {record.policy}  K={record.n_action_steps}  "
         f"run {record.run}  seed {record.seed}",
-        step="  |  ".join(parts),
+        step=tuple(parts),
         outcome=outcome,
         outcome_color=color,
     )
 
 
+def _item_part(kind: str, missing: str, index: int | None, task: str, n_items: int) -> Part:
+    if index is None:
+        return Part(text=f"{kind} {missing}")
+    return Part(text=f"{kind} {item_names(task, n_items)[index]}", swatch=item_rgb(task, n_items, index))
+
+
 def _write(draw: ImageDraw.ImageDraw, caption: Caption, width: int) -> None:
     top = STRIP_PX + 10
     font, bold = _font(17), _font(18)
-    lines = ((caption.instruction, bold, INK), (caption.episode, font, FAINT), (caption.step, font, INK))
-    for index, (text, fitting, color) in enumerate(lines):
+    for index, (text, fitting, color) in enumerate(
+        ((caption.instruction, bold, INK), (caption.episode, font, FAINT))
+    ):
         fitted = _fitted(draw, text, fitting, width - 2 * MARGIN_PX)
         draw.text((MARGIN_PX, top + index * LINE_PX), fitted, font=fitting, fill=color)
+    _write_parts(draw, caption.step, top + 2 * LINE_PX, width)
+    draw.text((MARGIN_PX, top + 3 * LINE_PX + 4), UNSEEN, font=_font(13), fill=FAINT)
     size = draw.textlength(caption.outcome, font=bold)
     place = (width - MARGIN_PX - size, top + LINE_PX)
     draw.text(place, caption.outcome, font=bold, fill=caption.outcome_color)
+
+
+def _write_parts(draw: ImageDraw.ImageDraw, parts: Sequence[Part], top: int, width: int) -> None:
+    """Write the pieces of a line, each followed by its swatch, as large as they fit."""
+    whole = "  |  ".join(part.text for part in parts)
+    left, room = float(MARGIN_PX), width - 2 * (MARGIN_PX + SWATCH_PX + 5)
+    font = next((one for one in map(_font, (17, 15)) if draw.textlength(whole, font=one) <= room), _font(13))
+    for number, part in enumerate(parts):
+        text = f"  |  {part.text}" if number else part.text
+        draw.text((left, top), text, font=font, fill=INK)
+        left += draw.textlength(text, font=font)
+        if part.swatch is not None:
+            place = (left + 5, top + 5, left + 5 + SWATCH_PX, top + 5 + SWATCH_PX)
+            draw.rectangle(place, fill=part.swatch, outline=INK)
+            left += SWATCH_PX + 5
 
 
 def _fitted(

@@ -86,7 +86,15 @@
     for (const other of same) {
       const tr = line(other);
       if (other === one) tr.setAttribute("aria-selected", "true");
-      tr.insertCell().textContent = other[at.video] ?? errorOf(other);
+      const last = tr.insertCell();
+      last.textContent = errorOf(other);
+      for (const kind of ["video", "rrd"]) {
+        if (other[at[kind]] === null) continue;
+        const link = document.createElement("a");
+        link.href = other[at[kind]];
+        link.textContent = kind;
+        last.append(link, " ");
+      }
       table.append(tr);
     }
     beside.replaceChildren(title, table);

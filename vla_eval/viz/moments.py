@@ -1,0 +1,74 @@
+"""The moments of an episode that tell whether it remembered: cue, reveal, touch."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from vla_eval.config.environment import HUMAN_CAMERA
+from vla_eval.core import ImageArray
+from vla_eval.viz.tape import EpisodeTape, TapedStep
+
+STILL_PX = 128
+JPEG_QUALITY = 90
+
+
+class Moments(NamedTuple):
+    """Captured steps of an episode.
+
+    Attributes:
+        cue: the first one.
+        reveal: the first one of the response phase; without phases, the one in the middle.
+        touch: the first one at which a candidate has been touched; else the last one.
+    """
+
+    cue: TapedStep
+    reveal: TapedStep
+    touch: TapedStep
+
+
+def find_moments(tape: EpisodeTape) -> Moments:
+    """Return the moments of an episode of which at least one step has images."""
+    captured = tape.captured()
+    response = [one for one in captured if one.result.status.phase == "response"]
+    has_phases = captured[0].result.status.phase != "response"
+    reveal = response[0] if has_phases and response else captured[len(captured) // 2]
+    # Where several candidates are right, the first touch is not the answer yet.
+    touched = [one for one in captured if _has_one_target(one) and one.result.status.first_choice is not None]
+    return Moments(cue=captured[0], reveal=reveal, touch=touched[0] if touched else captured[-1])
+
+
+def write_stills(tape: EpisodeTape, path: Path) -> None:
+    """Write the moments side by side as a JPEG, each `STILL_PX` wide, without anything drawn over them.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    shown = [_view(one) for one in find_moments(tape)]
+    Image.fromarray(np.concatenate(shown, axis=1)).save(path, format="JPEG", quality=JPEG_QUALITY)
+
+
+def read_stills(path: Path) -> tuple[ImageArray, ...]:
+    """Return the moments that `write_stills` has written, each (STILL_PX, STILL_PX, 3) uint8.
+
+    Raises:
+        OSError: the file cannot be read as an image.
+    """
+    with Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB"), dtype=np.uint8)
+    n_moments = len(Moments._fields)
+    if pixels.shape != (STILL_PX, n_moments * STILL_PX, 3):
+        raise OSError(f"an image of {pixels.shape[1]} × {pixels.shape[0]} pixels")
+    return tuple(np.split(pixels, n_moments, axis=1))
+
+
+def _has_one_target(taped: TapedStep) -> bool:
+    return taped.result.status.target is not None
+
+
+def _view(taped: TapedStep) -> ImageArray:
+    images = taped.result.observation.images
+    name = HUMAN_CAMERA if HUMAN_CAMERA in images else next(iter(images))
+    scaled = Image.fromarray(images[name]).resize((STILL_PX, STILL_PX), Image.Resampling.LANCZOS)
+    return np.asarray(scaled, dtype=np.uint8)
