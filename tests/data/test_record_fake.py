@@ -180,7 +180,7 @@ class TestKill:
         command = [sys.executable, "-m", "vla_eval.cli", "record", "--task", TASK]
         command += ["--episodes", str(N_EPISODES), "--workers", "2", "--out", str(out)]
         command += ["--set", "simulator=fake", "--set", "episodes_per_shard=2", "--set", "name=test"]
-        command += ["--allow-environment-change"]
+        command += ["--allow-environment-change", "--no-replay"]
         return subprocess.Popen(command, stderr=subprocess.DEVNULL)
 
     def kill_when(self, process: subprocess.Popen[bytes], holds: Callable[[], bool]) -> None:

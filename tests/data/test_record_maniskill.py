@@ -41,8 +41,11 @@ def test_recorded_episodes_replay_to_the_bit(tmp_path: Path, capsys: pytest.Capt
 
     assert main(["record", *arguments]) == 0
 
-    assert f"3 episodes, {3 * HORIZON} frames" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"3 episodes, {3 * HORIZON} frames" in out
+    assert "3 of 3 episodes replayed: as recorded" in out  # the check that training asks for
     dataset = tmp_path / "out" / TASK
+    assert require_passed(dataset) is not None
     for episode in read_manifest(dataset):
         assert episode.n_steps == HORIZON
         assert (episode.cue_steps, episode.delay_steps) == (5, 5)

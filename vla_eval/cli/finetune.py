@@ -154,7 +154,7 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
         if name not in data:
             raise RecipeError(
                 f"Name a configuration, or a policy and a dataset; --{name} is missing. Example: mikasa-vla "
-                f"finetune --policy act --dataset demos/RememberColor3-v0 --steps 20000"
+                f"finetune --policy act --dataset data/RememberColor3-v0 --steps 20000"
             )
     return decode(FinetuneConfig, data, where="command line")
 

@@ -3,7 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vla_eval.cli.arguments import (
     add_allow_environment_change,
@@ -16,14 +16,17 @@ from vla_eval.cli.arguments import (
     typed_command,
 )
 from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
+from vla_eval.cli.replaying import replay_each
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
 from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import shard_folder
+from vla_eval.workers.backend import Backend
 
 if TYPE_CHECKING:
-    from vla_eval.data.recording import RecordedDataset
+    from vla_eval.cli.progress import StopRequest
+    from vla_eval.data.recording import RecordedDataset, RecordingSummary
 
 DATA_FOLDER = Path("data")
 FINGERPRINT_DIGITS = 8
@@ -31,9 +34,10 @@ MEGABYTE = 1_000_000
 DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
 
 RECIPE is a file, or the name of one in datasets/. Without it, name at least one --task. Flags go on top of
-the file, --set on top of flags. The same command again resumes where it stopped."""
-EPILOG = """exit codes: 0 all datasets are there; 1 a mistake (see the message); 130, 143 stopped by Ctrl-C,
-SIGTERM (the same command resumes)."""
+the file, --set on top of flags. The same command again resumes where it stopped. At the end the episodes of
+each dataset are replayed, which `finetune` asks for."""
+EPILOG = """exit codes: 0 all datasets are there; 1 a mistake, or a mismatch in a replay (see the message);
+130, 143 stopped by Ctrl-C, SIGTERM (the same command resumes)."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -54,12 +58,17 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
     add_shard(parser)
     add_json_progress(parser)
+    parser.add_argument(
+        "--no-replay",
+        action="store_true",
+        help="leave out the check that `mikasa-vla replay` does",
+    )
     add_overrides(parser, help="change any field of the recipe")
     add_allow_environment_change(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record; the datasets' names go to standard output, everything else to standard error."""
+    """Record and replay; the datasets' names go to standard output, everything else to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for lerobot.
     from vla_eval.cli.output import hint_merge
     from vla_eval.cli.progress import stop_on_signals
@@ -85,18 +94,40 @@ def run(args: argparse.Namespace) -> int:
             )
         finally:
             progress.close()
-    if summary.was_stopped:
-        print(f"Stopped. What was recorded is in {out}. To resume: {command}", file=sys.stderr)
-        return stop.exit_code
-    for dataset in summary.datasets:
-        print(describe(dataset))
-    for part in summary.parts:
-        minutes = part.seconds / 60
-        print(f"{out}: {part.task}: {part.n_episodes} of {part.n_total} episodes, {minutes:.1f} min")
-    if args.shard is not None:
-        sys.stdout.flush()
-        hint_merge(whole, args.shard)
-    return 0
+        if summary.was_stopped:
+            print(f"Stopped. What was recorded is in {out}. To resume: {command}", file=sys.stderr)
+            return stop.exit_code
+        for dataset in summary.datasets:
+            print(describe(dataset), flush=True)
+        for part in summary.parts:
+            minutes = part.seconds / 60
+            print(f"{out}: {part.task}: {part.n_episodes} of {part.n_total} episodes, {minutes:.1f} min")
+        if args.shard is not None:
+            sys.stdout.flush()
+            hint_merge(whole, args.shard)
+        code = _replay_new(summary, args, stop, workers=recipe.workers, backend=backend)
+    if stop.signal_number is not None:
+        print(f"Stopped in the replay check. To resume: {command}", file=sys.stderr)
+    return code
+
+
+def _replay_new(
+    summary: "RecordingSummary",
+    args: argparse.Namespace,
+    stop: "StopRequest",
+    *,
+    workers: int | Literal["auto"],
+    backend: Backend,
+) -> int:
+    """Replay the datasets that no replay has passed yet; return the exit code."""
+    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.data.replay_report import needs_replay
+
+    paths = [one.path for one in summary.datasets if not args.no_replay and needs_replay(one.path)]
+    if not paths:
+        return 0
+    progress = RecordingProgress(stop, json_progress=args.json_progress)
+    return replay_each(paths, stop, progress, workers=workers, backend=backend)
 
 
 def describe(dataset: "RecordedDataset") -> str:

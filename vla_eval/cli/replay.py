@@ -2,18 +2,14 @@
 
 import argparse
 import sys
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vla_eval.cli.arguments import add_json_progress, add_verb, add_workers
 from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
+from vla_eval.cli.replaying import replay_each
 from vla_eval.errors import RecipeError
 
-if TYPE_CHECKING:
-    from vla_eval.data.manifest import ReplayReport
-
-EXIT_MISMATCH = 1
 DESCRIPTION = """Execute the stored actions of a dataset in the simulator; compare states and success, and
 with --pixels images. One line per mismatch. The result of a whole dataset is kept in it, and training
 refuses a dataset whose replay has failed.
@@ -52,42 +48,19 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for progress bars.
     from vla_eval.cli.progress import stop_on_signals
     from vla_eval.cli.recording_progress import RecordingProgress
-    from vla_eval.data.replay import find_datasets, replay
+    from vla_eval.data.replay import find_datasets
 
-    code, needs = 0, (shared_folder(args.dataset),)
+    needs = (shared_folder(args.dataset),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop, json_progress=args.json_progress)
-        try:
-            for dataset in find_datasets(args.dataset):
-                with tempfile.TemporaryDirectory() as logs:
-                    report = replay(
-                        dataset,
-                        logs=Path(logs),
-                        observer=progress,
-                        episodes=args.episodes,
-                        pixels=args.pixels,
-                        workers=args.workers,
-                        backend=backend,
-                    )
-                if report is None:
-                    return stop.exit_code
-                progress.close()
-                print(describe(dataset, report), flush=True)
-                code = code if report.passed else EXIT_MISMATCH
-        finally:
-            progress.close()
-    return code
-
-
-def describe(dataset: Path, report: "ReplayReport") -> str:
-    """Return the outcome of a dataset's replay, in one line."""
-    verdict = "as recorded" if report.passed else f"{len(report.mismatches)} MISMATCHES"
-    quality = "".join(f", {camera} ≥ {psnr:.1f} dB" for camera, psnr in report.lowest_psnr_db.items())
-    images = f"images compared{quality}" if report.pixels else "images not compared (--pixels)"
-    return (
-        f"{dataset}: {report.n_episodes} of {report.n_total} episodes replayed: {verdict}; states "
-        f"{report.states_compared}; {images}"
-    )
+        return replay_each(
+            find_datasets(args.dataset),
+            stop,
+            RecordingProgress(stop, json_progress=args.json_progress),
+            episodes=args.episodes,
+            pixels=args.pixels,
+            workers=args.workers,
+            backend=backend,
+        )
 
 
 def _rebuild(args: argparse.Namespace) -> int:

@@ -51,6 +51,12 @@ def require_passed(dataset: Path) -> ReplayReport | None:
     return report
 
 
+def needs_replay(dataset: Path) -> bool:
+    """Whether no replay of the whole dataset, as it is, has passed."""
+    report = read_replay(dataset)
+    return report is None or not report.passed or report.manifest_sha256 != manifest_sha256(dataset)
+
+
 def manifest_sha256(dataset: Path) -> str:
     """Return the digest of a dataset's manifest."""
     return hashlib.sha256((dataset / MANIFEST_FILE).read_bytes()).hexdigest()
