@@ -48,6 +48,25 @@ def test_no_remaining_time_is_made_up_before_an_episode_has_ended(capsys: pytest
     )
 
 
+def test_a_line_says_what_is_done_before_the_first_episode_ends_then_steps(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = Clock()
+    bar = EpisodeBar(clock=clock)
+    bar.begin(n_done=0, n_total=5)
+    bar.doing("loading simulator and policies")
+    clock.seconds += 30
+    bar.tick()
+    assert capsys.readouterr().err.startswith(
+        "0/5 episodes after 0.5 min, loading simulator and policies, none"
+    )
+    bar.advance(n_done=1, n_steps=60)
+    bar.advance(n_done=2, n_steps=1200)
+    clock.seconds += 60
+    bar.tick()
+    assert "2/5 episodes (1,260 control steps) after 1.5 min" in capsys.readouterr().err
+
+
 def test_the_end_is_told_once_and_nothing_is_left(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     bar = EpisodeBar(clock=clock)

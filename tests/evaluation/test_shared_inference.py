@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,9 @@ def test_with_several_gpus_each_has_a_server_and_records_are_the_same(
 def test_a_server_that_dies_costs_errors_that_a_resume_heals(network: Bench) -> None:
     class Kills:
         def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+            pass
+
+        def on_device(self, device: Mapping[str, str]) -> None:
             pass
 
         def on_record(self, record: EpisodeRecord) -> None:

@@ -1,6 +1,7 @@
 """Our server stops in the middle of a run and comes back: errors that a resume heals, no failure."""
 
 import json
+from collections.abc import Mapping
 
 import pytest
 
@@ -20,6 +21,9 @@ class StopsAfter:
         self._server, self._n_left = server, n_records
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        pass
+
+    def on_device(self, device: Mapping[str, str]) -> None:
         pass
 
     def on_record(self, record: EpisodeRecord) -> None:

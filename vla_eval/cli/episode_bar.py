@@ -23,14 +23,14 @@ class EpisodeBar:
         self._clock = clock
         self._is_quiet = is_quiet
         self._bar: tqdm[Any] | None = None
-        self._title = self._note = ""
-        self._n_done = self._n_before = self._n_total = 0
+        self._title = self._note = self._doing = ""
+        self._n_done = self._n_before = self._n_total = self._n_steps = 0
         self._begun = self._last_line = clock()
 
     def begin(self, *, n_done: int, n_total: int, title: str = "") -> None:
         """Start a new count, of which `n_done` episodes are done already."""
         self.close()
-        self._title, self._note = title, ""
+        self._title, self._note, self._doing, self._n_steps = title, "", "", 0
         self._n_done = self._n_before = n_done
         self._n_total = n_total
         self._begun = self._last_line = self._clock()
@@ -44,8 +44,15 @@ class EpisodeBar:
                 dynamic_ncols=True,
             )
 
-    def advance(self, *, n_done: int, note: str = "") -> None:
-        """Count; `note` says how it goes."""
+    def doing(self, text: str) -> None:
+        """Say what is being done before the first episode ends."""
+        self._doing = text
+        if self._bar is not None and self._n_done == self._n_before:
+            self._bar.set_postfix_str(text)
+
+    def advance(self, *, n_done: int, n_steps: int = 0, note: str = "") -> None:
+        """Count; `n_steps` control steps were executed for it, and `note` says how it goes."""
+        self._n_steps += n_steps
         moved, self._n_done, self._note = n_done - self._n_done, n_done, note
         if self._bar is not None:
             self._bar.update(moved)
@@ -78,14 +85,16 @@ class EpisodeBar:
         minutes = (self._last_line - self._begun) / 60
         per_minute = (self._n_done - self._n_before) / max(minutes, 1e-9)
         n_left = self._n_total - self._n_done
+        steps = f" ({self._n_steps:,} control steps)" if self._n_steps else ""
         parts = [
-            f"{self._n_done}/{self._n_total} episodes after {minutes:.1f} min",
+            f"{self._n_done}/{self._n_total} episodes{steps} after {minutes:.1f} min",
             f"{per_minute:.1f} per minute",
         ]
         if n_left and per_minute > 0:
             parts.append(f"{n_left / per_minute:.1f} min left")
         elif n_left:
-            parts = [parts[0], "none has ended yet, so the remaining time is unknown"]
+            doing = [self._doing] if self._doing else []
+            parts = [parts[0], *doing, "none has ended yet, so the remaining time is unknown"]
         if self._note:
             parts.append(self._note)
         self.write((f"{self._title}: " if self._title else "") + ", ".join(parts))

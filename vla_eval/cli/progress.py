@@ -1,7 +1,7 @@
 """Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 
 from vla_eval.cli.episode_bar import EpisodeBar
 from vla_eval.cli.json_progress import EvaluationLines, JsonLines
+from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
@@ -19,6 +20,7 @@ from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+MEGABYTES_PER_FRAME = 0.9  # 3 × (512² + 2 × 128²) bytes
 
 
 @dataclass(slots=True)
@@ -77,7 +79,7 @@ def evaluate_with_progress(
     Raises:
         VlaEvalError: see `evaluate`.
     """
-    progress = Progress(stop, out=out, json_progress=json_progress)
+    progress = Progress(stop, out=out, capture=config.capture, json_progress=json_progress)
     try:
         return evaluate(
             config,
@@ -92,13 +94,25 @@ def evaluate_with_progress(
         progress.close()
 
 
+def capture_cost(capture: CaptureConfig) -> str:
+    """Return what capturing takes, before it begins."""
+    return (
+        f"capturing: every {capture.frame_stride} control steps an image of 512 × 512 and two of 128 × 128, "
+        f"also for policies that read none; {MEGABYTES_PER_FRAME} MB of memory each until the episode is "
+        "over. On a CPU this is most of an episode's time: a larger capture.frame_stride costs less."
+    )
+
+
 class Progress:
     """Implements `EvaluationObserver` on standard error."""
 
-    def __init__(self, stop: StopRequest, *, out: Path, json_progress: int | None = None) -> None:
-        """Take the request to stop, the run folder, and where lines for other programs go."""
+    def __init__(
+        self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
+    ) -> None:
+        """Take the request to stop, the run folder, what is captured, and where lines for programs go."""
         lines = JsonLines(json_progress)
         self._stop = stop
+        self._capture = capture
         self._out = out
         self._bar = EpisodeBar(is_quiet=lines.is_stderr)
         self._lines = EvaluationLines(lines, out=out)
@@ -117,8 +131,16 @@ class Progress:
         self._bar.write(
             f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before; starting {workers}"
         )
+        if self._capture.is_on:
+            self._bar.write(capture_cost(self._capture))
         self._n_done = n_finished
         self._bar.begin(n_done=n_finished, n_total=n_episodes)
+        self._bar.doing("starting processes, loading simulator and policies")
+
+    def on_device(self, device: Mapping[str, str]) -> None:
+        """Say that the first simulator is there, and what renders its images."""
+        renderer = device.get("render_device")
+        self._bar.doing(f"rendering on {renderer}" if renderer else "simulating")
 
     def on_record(self, record: EpisodeRecord) -> None:
         """Count the record; say at once what went wrong."""
@@ -132,7 +154,8 @@ class Progress:
             self._n_results += 1
             self._n_successes += bool(record.success_once)
         rate = f"success {self._n_successes / self._n_results:.2f}" if self._n_results else "no result yet"
-        self._bar.advance(n_done=self._n_done, note=f"{rate}, errors {self._n_errors}")
+        note = f"{rate}, errors {self._n_errors}"
+        self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)
 
     def on_tick(self) -> bool:
         """Write a line now and then; return whether a signal has asked to stop."""

@@ -22,6 +22,7 @@ from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import shard_folder
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 DATA_FOLDER = Path("data")
 FINGERPRINT_DIGITS = 8
 MEGABYTE = 1_000_000
+STEPS_PER_SECOND = 7  # a core, software rendering; docs/datasets.md: 24.8 steps in 3.4 s
+BYTES_PER_STEP = 11_000  # docs/datasets.md: 70 MB of 6,200 frames
 DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
 
 RECIPE is a file, or the name of one in datasets/. Without it, name at least one --task. Flags go on top of
@@ -82,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     needs = (shared_folder(out),)
     with backend_of(args, needs=lambda: needs, notes_kinds=False) as backend, stop_on_signals() as stop:
         progress = RecordingProgress(stop, json_progress=args.json_progress)
+        progress.say(cost(recipe))
         try:
             summary = record(
                 recipe,
@@ -128,6 +132,20 @@ def _replay_new(
         return 0
     progress = RecordingProgress(stop, json_progress=args.json_progress)
     return replay_each(paths, stop, progress, workers=workers, backend=backend)
+
+
+def cost(recipe: DatasetRecipe) -> str:
+    """Return what the recording takes in all, before it begins."""
+    steps = [
+        int(recipe.env.get("horizon_steps", task_spec(task).horizon_steps)) * recipe.episodes
+        for task in recipe.tasks
+    ]
+    minutes, megabytes = sum(steps) / STEPS_PER_SECOND / 60, sum(steps) * BYTES_PER_STEP / MEGABYTE
+    return (
+        f"Tasks: {len(steps)}, episodes each: {recipe.episodes}. In all at most {sum(steps):,} control steps "
+        f"with two images: {megabytes:,.0f} MB, {minutes:,.0f} min of one worker on a CPU "
+        f"({STEPS_PER_SECOND} steps per second); episodes that end at their success take less."
+    )
 
 
 def describe(dataset: "RecordedDataset") -> str:

@@ -23,6 +23,10 @@ class RecordingProgress:
         self._bar = EpisodeBar(is_quiet=lines.is_stderr)
         self._lines = PhaseLines(lines)
 
+    def say(self, sentence: str) -> None:
+        """Write a sentence to standard error."""
+        self._bar.write(sentence)
+
     def on_phase(
         self, task: str, phase: "Phase | Literal['replaying']", *, n_done: int, n_total: int
     ) -> None:

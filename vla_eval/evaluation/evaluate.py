@@ -7,7 +7,7 @@ means, the same call resumes where it stopped.
 
 import functools
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -57,6 +57,9 @@ class EvaluationObserver(Protocol):
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Called once, before the first episode."""
 
+    def on_device(self, device: Mapping[str, str]) -> None:
+        """Called when a worker's simulator is there, with the facts about its device."""
+
     def on_record(self, record: EpisodeRecord) -> None:
         """Called with each record once it is durable."""
 
@@ -68,6 +71,9 @@ class _Silence:
     """Watches nothing and never stops the run."""
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Do nothing."""
+
+    def on_device(self, device: Mapping[str, str]) -> None:
         """Do nothing."""
 
     def on_record(self, record: EpisodeRecord) -> None:
@@ -241,6 +247,7 @@ def _run(
                 bookkeeper.take(event)
             elif isinstance(event, DeviceFound):
                 bookkeeper.folder.note_device(event.device)
+                bookkeeper.observer.on_device(event.device)
             else:
                 bookkeeper.store()
                 if bookkeeper.observer.on_tick():
