@@ -3,7 +3,7 @@
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,9 @@ class After:
         self.n_left, self.do = n_records, do
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        pass
+
+    def on_device(self, device: Mapping[str, str]) -> None:
         pass
 
     def on_record(self, record: EpisodeRecord) -> None:
