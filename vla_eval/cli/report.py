@@ -64,9 +64,10 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.storage.run_folder import read_run
 
     runs = [read_run(path) for path in args.runs]
-    for flag, folder in (("--html", args.html), ("--filmstrip", args.filmstrip)):
-        if folder is not None:
-            _check_alone(flag, args)
+    if args.html is not None:
+        _check_alone("--html writes a page", args)
+    if args.filmstrip is not None:
+        _check_alone("--filmstrip writes a contact sheet", args)
     if args.html is not None:
         from vla_eval.page.build import write_page
         from vla_eval.probe.page.sections import probe_sections
@@ -84,13 +85,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_alone(flag: str, args: argparse.Namespace) -> None:
+def _check_alone(written: str, args: argparse.Namespace) -> None:
     from vla_eval.errors import ReportError
 
     if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
         raise ReportError(
-            f"{flag} writes files, which have no --format, --preset, --columns, --wide and --paper. "
-            "Remove them."
+            f"{written}, which has no --format, --preset, --columns, --wide and --paper. Remove them."
         )
 
 
