@@ -82,13 +82,17 @@ class StandIn:
 
     def __init__(self, facts: dict[str, NodeFacts]) -> None:
         self.facts = facts
+        self.n_cores = dict.fromkeys(facts, 2.0)
         self.gone: set[str] = set()
 
     def nodes(self) -> list[dict[str, Any]]:
         return [
             {
                 **{"NodeID": name, "Alive": name not in self.gone, "NodeManagerHostname": name},
-                **{"NodeManagerAddress": f"10.0.0.{index}", "Resources": {"CPU": 2.0}},
+                **{
+                    "NodeManagerAddress": f"10.0.0.{index}",
+                    "Resources": {"CPU": self.n_cores.get(name, 2.0)},
+                },
             }
             for index, name in enumerate(self.facts)
         ]
@@ -147,6 +151,15 @@ class TestMachines:
         for _ in range(MAX_ERRORS_IN_A_ROW):
             found.note_error(good, "no memory")
         assert good.is_usable  # the last one
+
+    def test_a_head_without_cores_does_not_count_as_another_machine(self, cluster: Any) -> None:
+        found, ray, _ = cluster(head=HERE, only=HERE)
+        ray.n_cores["head"] = 0.0
+        found.survey()
+        _, only = found
+        for _ in range(MAX_ERRORS_IN_A_ROW):
+            found.note_error(only, "no memory")
+        assert only.is_usable
 
     def test_one_that_goes_is_named_and_one_that_comes_is_checked(self, cluster: Any) -> None:
         found, ray, lines = cluster(a=HERE, b=HERE)

@@ -19,11 +19,11 @@ SMALL = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
 
 class ThreeMachines:
-    """Ray's head without workers, and three machines with one core each."""
+    """Three machines with one core each; the first is Ray's head, which is never killed."""
 
     def __init__(self, cluster: Any) -> None:
         self.cluster = cluster
-        self.nodes = [cluster.add_node(**SMALL, wait=False) for _ in range(3)]
+        self.nodes = [cluster.add_node(**SMALL, wait=False) for _ in range(2)]
         cluster.wait_for_nodes()
         self.lines: list[str] = []
 
@@ -107,7 +107,7 @@ def three_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[
             monkeypatch.setenv(name, value)
     # A loaded machine answers late; a machine that is really gone is noticed by its closed connection.
     system = {"health_check_period_ms": 2000, "health_check_timeout_ms": 5000}
-    head = {"num_cpus": 0, "object_store_memory": 80 << 20, "include_dashboard": False}
+    head = {**SMALL, "include_dashboard": False}
     cluster: Any = Cluster(initialize_head=True, head_node_args={**head, "_system_config": system})
     try:
         machines = ThreeMachines(cluster)

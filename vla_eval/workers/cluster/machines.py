@@ -141,7 +141,7 @@ class Machines:
         machine.n_errors_in_a_row += 1
         if machine.n_errors_in_a_row < MAX_ERRORS_IN_A_ROW or not machine.is_usable:
             return
-        if all(other is machine for other in self.usable):
+        if all(other is machine for other in self.usable if other.n_cores):
             return
         machine.refused = (f"set aside after {machine.n_errors_in_a_row} errors in a row: {what}",)
         self.say(f"machine {machine.name}: {machine.refused[0]}")
