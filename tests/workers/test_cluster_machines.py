@@ -1,6 +1,7 @@
 """Which machines of a cluster are used, and what is said of the others; Ray is a stand-in."""
 
 import dataclasses
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -180,6 +181,14 @@ class TestAddresses:
     def test_these_are_not(self, text: str) -> None:
         with pytest.raises(RecipeError, match="ray://HOST:PORT"):
             check_address(text)
+
+    def test_where_nobody_listens_there_is_no_cluster(self) -> None:
+        pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            address = f"127.0.0.1:{free.getsockname()[1]}"
+        with pytest.raises(ClusterError, match="ray start"), connect.connected(address):
+            pass
 
     def test_without_ray_the_message_says_how_to_install_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def missing(name: str) -> Any:

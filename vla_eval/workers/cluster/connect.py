@@ -7,6 +7,7 @@ import contextlib
 import importlib
 import os
 import re
+import socket
 from collections.abc import Iterator
 from typing import Any  # Ray is optional: not looked at by mypy
 
@@ -14,7 +15,8 @@ from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
 from vla_eval.workers.start import available_cores, visible_gpus
 
 OBJECT_STORE_BYTES = 100 << 20  # jobs and answers have a few kilobytes, and do not go through it
-ADDRESS = re.compile(r"(ray://)?[^\s/:]+:\d+")
+CONNECT_SECONDS = 10.0
+ADDRESS = re.compile(r"(ray://)?[^\s/:]+:\d{1,5}")
 LOCAL_VARIABLES = {
     # Ray's own switch for "this cluster stays on this machine": its ports are bound to the loopback address.
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
@@ -66,10 +68,11 @@ def connected(address: str) -> Iterator[Any]:
             "num_gpus": len(visible_gpus()),
         }
     try:
+        _check_listening(address)
         ray.init(address=address, **quiet)
     except ImportError as exc:
         raise _missing(exc) from exc
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as exc:
+    except (OSError, OverflowError, RuntimeError, ValueError, ray.exceptions.RayError) as exc:
         raise ClusterError(
             f"--cluster {address}: there is no cluster to connect to ({exc}). Start one with `ray start "
             f"--head` (docs/cluster.md), name its address, or use --cluster local."
@@ -78,6 +81,13 @@ def connected(address: str) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _check_listening(address: str) -> None:
+    """Raise `OSError` if nobody listens there: Ray would try for minutes."""
+    if address not in ("auto", "local"):
+        host, _, port = address.removeprefix("ray://").rpartition(":")
+        socket.create_connection((host, int(port)), timeout=CONNECT_SECONDS).close()
 
 
 def on_machine(node: str) -> Any:
