@@ -107,6 +107,15 @@ def test_a_part_that_was_stopped_while_it_tried_seeds_is_named(home: Path) -> No
     assert missing.startswith(f"{home / 'part-2'} (shard 2/2): {TASK}: not all seeds are tried.")
 
 
+def test_a_part_that_had_not_begun_is_merged_to_a_recording_without_attempts(home: Path) -> None:
+    shutil.rmtree(home / "part-1" / STATE_FOLDER / TASK)
+    merged = merge_recordings([home / "part-1"])
+
+    assert write_recording(merged, home / "merged") == ()
+    assert "not all seeds are tried" in merged.missing[1]
+    assert list((home / "merged" / STATE_FOLDER / TASK).iterdir()) == []
+
+
 def test_an_expert_that_acted_differently_is_refused(home: Path) -> None:
     path = home / "part-2" / STATE_FOLDER / TASK / ATTEMPTS_FILE
     first, *others = path.read_text().splitlines()

@@ -116,13 +116,13 @@ def write_recording(merged: MergedRecording, out: Path) -> tuple[DatasetFacts, .
             for task in merged.tasks:
                 attempts = draft / STATE_FOLDER / task.plan.task / ATTEMPTS_FILE
                 attempts.parent.mkdir(parents=True)
-                replace_file(attempts, task.attempts.read_text(encoding="utf-8"))
+                if task.attempts.is_file():  # else the part had not begun with this task
+                    replace_file(attempts, task.attempts.read_text(encoding="utf-8"))
                 for index, shard in task.shards.items():
                     link_tree(shard, shard_path(draft, task.plan.task, index))
             merged.run_file.save(draft / STATE_FOLDER)
-            return (
-                () if merged.missing else tuple(_join(task, merged.run_file, draft) for task in merged.tasks)
-            )
+            whole = () if merged.missing else merged.tasks
+            return tuple(_join(task, merged.run_file, draft) for task in whole)
     except OSError as exc:
         raise storage_full(out, exc) from exc
 
@@ -136,11 +136,7 @@ def _plan(run_file: RunFile, where: Path) -> tuple[TaskPlan, ...]:
     versions = {one.task: one.task_version for one in plan.tasks}
     changes = (
         *find_changes(description.recipes, plan.recipe_files, prefix="recipes"),
-        *find_changes(
-            {"task_versions": description.config["task_versions"]},
-            {"task_versions": versions},
-            prefix="config",
-        ),
+        *find_changes(description.config, {**description.config, "task_versions": versions}, prefix="config"),
     )
     if changes:
         raise MergeError(
