@@ -4,11 +4,13 @@
 #   sbatch --nodes=4 scripts/slurm/ray.sh eval demo --out runs/demo
 #
 # The arguments are what follows `mikasa-vla`; --cluster auto is added. Submit it from the root of the
-# checkout, which all nodes must see under the same path. Not verified on a Slurm cluster.
+# checkout, which all nodes must see under the same path. At the end `ray symmetric-run` stops every Ray
+# process of yours on the nodes, so they are asked for exclusively. Not verified on a Slurm cluster.
 #
 #SBATCH --job-name=mikasa-vla-ray
 #SBATCH --nodes=2
 #SBATCH --ntasks-per-node=1
+#SBATCH --exclusive
 #SBATCH --cpus-per-task=16
 #SBATCH --mem=64G
 #SBATCH --time=04:00:00
@@ -16,7 +18,8 @@
 #SBATCH --open-mode=append
 set -euo pipefail
 
-bin="${MIKASA_VLA_BIN:-.venv/bin}"
+bin="$(cd "${MIKASA_VLA_BIN:-.venv/bin}" && pwd)"
+export PATH="$bin:$PATH" # `ray symmetric-run` calls `ray`
 nodes="${SLURM_JOB_NUM_NODES:?expected an allocation: sbatch --nodes=2 ray.sh …}"
 head="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)"
 address="$(srun --nodes=1 --ntasks=1 --nodelist="$head" hostname --ip-address | cut -d' ' -f1)"
