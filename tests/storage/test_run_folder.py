@@ -10,7 +10,9 @@ import pytest
 
 from tests.storage.run_records import describe, result, writer
 from vla_eval.errors import RunChangedError, RunFolderError
-from vla_eval.storage.run_folder import RunFolder, read_run
+from vla_eval.records import EpisodeTiming
+from vla_eval.storage.run_folder import RunFolder, StoredEpisode, read_run
+from vla_eval.storage.timings import read_timings
 
 # ------------------------------------------------------------------------------- one writer
 
@@ -273,3 +275,41 @@ def test_store_and_records_import_nothing_heavy() -> None:
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert output.stdout.strip() == "[]"
+
+
+class TestMachinesOfAnotherKind:
+    """A cluster's machines may differ; the run then says so, as if it had been resumed on another machine."""
+
+    def test_they_are_refused_unless_changes_are_allowed(self, tmp_path: Path) -> None:
+        description = describe(environment={"cpu": "A"})
+        with RunFolder.open(tmp_path / "r", description) as folder:
+            folder.note_machine("k1", {"cpu": "A"})  # the same
+            with pytest.raises(RunChangedError, match="cpu"):
+                folder.note_machine("k2", {"cpu": "B"})
+
+    def test_the_run_names_them_and_each_timing_its_kind(self, tmp_path: Path) -> None:
+        description = describe(environment={"cpu": "A"})
+        with RunFolder.open(tmp_path / "r", description, allow_environment_change=True) as folder:
+            folder.note_machine("k2", {"cpu": "B"})
+            folder.append(result(1), timing(1, kind="k2"))
+            folder.append(result(2), timing(2, kind=None))
+        (session,) = read_run(tmp_path / "r").sessions
+        assert [(c.old, c.new) for c in session.environment_changes] == [('"A"', '"B"')]
+        kinds = {key.seed: one.kind for key, one in read_timings(tmp_path / "r").items()}
+        assert kinds == {1: "k2", 2: None}
+        assert '"kind"' not in (tmp_path / "r" / "timings.jsonl").read_text().splitlines()[1]
+
+
+def timing(seed: int, *, kind: str | None) -> EpisodeTiming:
+    seconds = {f"{name}_seconds": 1.0 for name in ("total", "reset", "step", "inference")}
+    return EpisodeTiming(key=result(seed).key, kind=kind, **seconds)
+
+
+def test_several_episodes_are_durable_at_once_and_one_that_is_wrong_does_not_cost_those_before_it(
+    tmp_path: Path,
+) -> None:
+    with RunFolder.open(tmp_path / "r", describe()) as folder:
+        with pytest.raises(RunFolderError, match="counted twice"):
+            folder.append_all([StoredEpisode(result(seed), None) for seed in (1, 2, 2, 3)])
+        assert {key.seed for key in folder.finished_keys()} == {1, 2}
+    assert {record.seed for record in read_run(tmp_path / "r").records} == {1, 2}
