@@ -17,6 +17,7 @@ from vla_eval.cli import report as report_verb
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.results.report import FORMATS, Format, Table, build_table, render
 from vla_eval.results.table_formats import PRESETS
+from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import RunFolder
 
 # ------------------------------------------------------------------------------- formats
@@ -220,3 +221,12 @@ def test_help_does_not_wait_for_scipy_and_a_report_needs_no_torch(run_folder: Pa
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     first, *_, last = output.stdout.splitlines()
     assert (first, last) == ("False", "[]")
+
+
+def test_without_a_measured_chance_the_verdict_begins_with_the_best_and_keeps_the_tables_order() -> None:
+    records = [*episodes("bad", "+---"), *episodes("good", "++++", n_action_steps=1)]
+    records += episodes("good", "++++", n_action_steps=8)
+
+    (verdict,) = verdicts(build_table([stored(records)]))
+
+    assert [text.partition(" succeeds")[0] for text in verdict.sentences] == ["good, K=1", "good, K=8", "bad"]

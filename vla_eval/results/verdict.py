@@ -1,5 +1,6 @@
 """Say in sentences what a table shows: which policies beat chance. Computes no number."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,12 +34,17 @@ def verdicts(table: Table) -> list[Verdict]:
         rows = [row for row in table.rows if row.task == task]
         learned = [row for row in rows if row.policy not in CONTROLS]
         told = learned or [row for row in rows if row.policy == "oracle"]
-        # An undefined difference comes last.
-        told = sorted(told, key=lambda row: -2.0 if row.paired_difference is None else row.paired_difference)
-        sentences = [_sentence(row, rows) for row in reversed(told)]
+        sentences = [_sentence(row, rows) for row in sorted(told, key=_rank)]
         if sentences:
             found.append(Verdict(task, tuple(sentences)))
     return found
+
+
+def _rank(row: Row) -> tuple[float, float]:
+    """Sort the best first, what is undefined last; ties stay in the order of the table."""
+    values = (row.paired_difference, row.success_once)
+    difference, success = (math.inf if value is None else -value for value in values)
+    return difference, success
 
 
 def _sentence(row: Row, rows: Sequence[Row]) -> str:
