@@ -214,6 +214,7 @@ def test_mistakes_in_a_grid_are_said_before_anything_is_run(capsys: pytest.Captu
     for arguments, said in (
         (["--grid", "--probe", "swap"], "--probe swap: expected delay or cue"),
         (["--grid", "--swap", "2"], "--grid has no --swap"),
+        (["--grid", "--late", "5", "--mask", "cue"], "--grid has no --mask, --late"),
         (["--first-inference", "2"], "Add --grid"),
         (["--grid", "--set", "chunking.first_inference_step=0", "--first-inference", "-1"], "number ≥ 0"),
     ):

@@ -189,6 +189,9 @@ def _grid_settings(args: argparse.Namespace) -> "GridSettings":
 
 OF_NO_GRID = {
     "swaps": "--swap",
+    "masks": "--mask",
+    "lates": "--late",
+    "appearances": "--appearance",
     "distractors": "--distract",
     "instructions": "--instruction",
     "reset_steps": "--reset-at",
