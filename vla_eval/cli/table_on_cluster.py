@@ -10,7 +10,7 @@ from vla_eval.cli.progress import stop_on_signals
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.errors import FolderInUseError, TrainingError
 from vla_eval.evaluation.grid import Finetuning
-from vla_eval.training.worker import Finetuned, FinetuneJob, finetune_main
+from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob, finetune_main
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered

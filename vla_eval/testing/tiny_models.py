@@ -15,7 +15,7 @@ from unittest.mock import patch
 from vla_eval.evaluation.worker import worker_main
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
-from vla_eval.training.worker import finetune_main
+from vla_eval.training.finetune_jobs import finetune_main
 from vla_eval.workers.inside import SharedStage
 
 Family = Literal["pi0", "pi05", "pi0_fast"]

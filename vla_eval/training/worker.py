@@ -2,45 +2,14 @@
 
 import functools
 import logging
-from collections.abc import Hashable
-from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from pathlib import Path
 
-from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import VlaEvalError
 from vla_eval.training.finetune import finetune
-from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob
+from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import Failed, describe_error
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FinetuneJob:
-    """One fine-tuning.
-
-    Attributes:
-        config: what to train on what.
-        command: what the user typed, for the record.
-        name: what messages call it.
-    """
-
-    config: FinetuneConfig
-    command: str
-    name: str
-
-    @property
-    def setup_key(self) -> Hashable:
-        """See `workers.Job`: each has a process of its own."""
-        return self.config.out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Finetuned:
-    """A fine-tuning is finished; its checkpoint is in the folder of its run."""
-
-    checkpoint: Path
 
 
 class FinetuneRunner:
@@ -64,9 +33,3 @@ class FinetuneRunner:
 
     def close(self) -> None:
         """Keep nothing."""
-
-
-def finetune_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Fine-tune for the parent until it closes the pipe; the entry point of a worker process."""
-    detach(log)
-    serve(connection, FinetuneRunner(Heartbeat(shared)))
