@@ -4,13 +4,20 @@
 states for the published files.
 """
 
+import functools
 import json
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+from tests.testing.published_originals import write_octo, write_openvla, write_spatialvla
+from vla_eval.policies.checkpoint import WEIGHTS_FILE
+from vla_eval.testing.rehearsal import EXTRA_BYTES, EXTRA_SHARE, RehearsalOptions, rehearse
 
 pytestmark = pytest.mark.full_size
 GEMMA_EMBEDDINGS = 257_152 * 2_048  # lerobot's π0 family has them twice, a published file once
@@ -41,3 +48,45 @@ def test_a_policy_of_the_published_size_loads_and_acts_within_its_memory(
     if n_parameters is not None:
         assert found.parameters == n_parameters
     assert found.is_within_limit, "\n".join(found.lines())
+
+
+GRIPPER = ("--gripper", "unit_open")
+CONVERSIONS: tuple[tuple[str, Callable[[Path], None], tuple[str, ...]], ...] = (
+    *(
+        (f"octo-{size}", functools.partial(write_octo, size), ("convert-octo", "--size", size, *GRIPPER))
+        for size in ("small", "base")
+    ),
+    ("spatialvla", write_spatialvla, ("convert-spatialvla",)),
+    ("openvla", write_openvla, ("convert-openvla", "--image-aug", "no", *GRIPPER)),
+)
+MEASURED = """
+import sys
+from vla_eval.cli.main import main
+from vla_eval.testing.rehearsal import peak_rss_bytes
+assert main(["checkpoint", *sys.argv[1:]]) == 0
+print(peak_rss_bytes())
+"""
+
+
+@pytest.mark.parametrize(("name", "write", "arguments"), CONVERSIONS)
+def test_a_published_checkpoint_of_full_size_is_converted_within_its_memory(
+    name: str, write: Callable[[Path], None], arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    """It has the original's names and shapes. The peak is that of a process which only converts."""
+    source, out = tmp_path / "published", tmp_path / "ours"
+    source.mkdir()
+    write(source)
+    tokenizer = ("--tokenizer", "bytes") if name.startswith("octo") else ()
+    action, *flags = arguments
+    command = [sys.executable, "-c", MEASURED, action, str(source), "--out", str(out), *flags, *tokenizer]
+    started = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True)
+    seconds = time.perf_counter() - started
+    assert done.returncode == 0, done.stderr
+    n_bytes = (out / WEIGHTS_FILE).stat().st_size
+    limit, peak = int(EXTRA_SHARE * n_bytes + EXTRA_BYTES), int(done.stdout.splitlines()[-1])
+    if TABLE in os.environ:
+        found = {"converted": name, "bytes": n_bytes, "seconds": seconds, "peak_rss_bytes": peak}
+        with Path(os.environ[TABLE]).open("a", encoding="utf-8") as file:
+            file.write(f"{json.dumps({**found, 'limit_bytes': limit})}\n")
+    assert peak <= limit

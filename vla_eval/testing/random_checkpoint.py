@@ -101,7 +101,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
     # A shared one is written under its first name.
     once = {id(tensor): name for name, tensor in reversed(state.items())}
     described = {name: state[name] for name in state if once[id(state[name])] == name}
-    write_weights(folder / WEIGHTS_FILE, described, functools.partial(_random_parts, described))
+    write_weights(folder / WEIGHTS_FILE, described, functools.partial(random_parts, described))
     config._save_pretrained(folder)
     own = contextlib.nullcontext() if tokenizer is None else tokenizer_from(str(tokenizer), config.type)
     with own, no_foreign_code(config.type):
@@ -128,7 +128,13 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
     )
 
 
-def _random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
+def random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
+    """Yield a tensor's numbers in order, for `write_weights`: random, of a standard deviation of 0.02.
+
+    Args:
+        described: name -> a tensor of the shape and type; one that has memory is yielded as it is.
+        name: which.
+    """
     tensor = described[name]
     if not tensor.is_meta:  # a buffer, whose values the constructor has computed
         yield tensor.detach()
