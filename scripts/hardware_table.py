@@ -1,41 +1,55 @@
 """Print the table of docs/hardware.md: what each recipe takes, estimated from shapes. Loads no weights."""
 
-import tempfile
-from pathlib import Path
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any  # lerobot is untyped
 
-from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.testing.random_checkpoint import stand_in_config
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, LoraRecipe
+from vla_eval.testing.random_checkpoint import published_sizes
 from vla_eval.training.estimate import estimate, unfilled_model
 from vla_eval.training.job import load_finetune_recipe
+from vla_eval.training.lora import check_lora_targets
 
-RECIPES = (
-    "octo_small",
-    "octo_base",
-    "smolvla",
-    "pi0",
-    "pi0_expert",
-    "pi0_lora",
-    "pi05",
-    "pi05_expert",
-    "pi05_lora",
-    "pi0_fast",
-    "spatialvla",
-    "openvla_oft",
+Change = Mapping[str, Any]
+
+LORA = LoraRecipe(rank=16)
+RECIPES: tuple[tuple[str, str, Change], ...] = (
+    ("octo_small", "", {}),
+    ("octo_small", "full", {"policy": {"trained": "all"}}),
+    ("octo_base", "", {}),
+    ("octo_base", "full", {"policy": {"trained": "all"}}),
+    ("smolvla", "", {}),
+    ("smolvla", "LoRA", {"lora": LORA}),
+    ("pi0", "", {}),
+    ("pi0_expert", "", {}),
+    ("pi0_lora", "", {}),
+    ("pi05", "", {}),
+    ("pi05_expert", "", {}),
+    ("pi05_lora", "", {}),
+    ("pi0_fast", "", {}),
+    ("spatialvla", "", {}),
+    ("spatialvla", "full", {"lora": None}),
+    ("openvla_oft", "", {}),
+    ("openvla_oft", "full", {"lora": None}),
 )
+"""Recipe, what is changed in words, and the changed fields of its `finetune` section; empty: as it is."""
 DEVICES_GB = (24, 48, 80)
 SECONDS_PER_DAY = 86_400
 
 
-def row(name: str, folder: Path) -> str:
+def row(name: str, changed: str, change: Change, sizes: Callable[[FinetuneRecipe], Any]) -> str:
     """Return the row of one recipe."""
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
-    config, _ = stand_in_config(recipe, folder, dtype=None, tiny=False)
+    policy = {**recipe.policy, **change.get("policy", {})}
+    recipe = dataclasses.replace(recipe, **{**change, "policy": policy})
+    check_lora_targets(recipe)
+    config = sizes(recipe)
     found = estimate(unfilled_model(config, recipe), config, recipe, device="cuda")
     fits = [str(found.largest_batch(n * 1e9) or "—") for n in DEVICES_GB]
     days = (found.step_seconds or 0) * found.steps / SECONDS_PER_DAY
     assert found.cost is not None
     cells = [
-        f"`{name}`",
+        f"`{name}`" + (f", {changed}" if changed else ""),
         f"{found.model.n_parameters / 1e6:,.0f}",
         f"{found.model.n_trained / 1e6:,.1f}",
         f"{found.fixed_bytes / 1e9:.1f}",
@@ -54,9 +68,9 @@ def main() -> None:
         f"| recipe | parameters (M) | trained (M) | fixed (GB) | per sample (GB) | batch | {devices} | days |"
     )
     print("|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
-    for name in RECIPES:
-        with tempfile.TemporaryDirectory() as folder:
-            print(row(name, Path(folder)), flush=True)
+    with published_sizes() as sizes:
+        for name, changed, change in RECIPES:
+            print(row(name, changed, change, sizes), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """A dry run of an evaluation counts what is left, and changes nothing."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,13 @@ def test_steps_inferences_and_frames_are_those_of_episodes_without_a_result(tmp_
     evaluate(config(), out=out)
     after = evaluation_effort(config(), out=out)
     assert (after.n_episodes, after.n_finished, after.n_steps) == (8, 8, 0)
+
+
+def test_a_policy_that_is_shown_every_frame_has_a_frame_of_each_step() -> None:
+    learned = dataclasses.replace(config(), policies=("memory_color3", "oracle"), n_action_steps=(6,))
+    effort = evaluation_effort(learned, out=Path("nowhere"))
+    assert effort.n_inferences == 4 * 10 and effort.n_learned_inferences == 2 * 10
+    assert effort.n_frames == 2 * (2 * 60 + 2 * 10)  # cameras, episodes, steps or inferences
 
 
 def test_hours_are_those_of_the_stated_rates() -> None:

@@ -9,9 +9,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.weight_file import write_weights
-from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
+from vla_eval.testing.rehearsal import RehearsalOptions, rehearse, rehearse_checkpoint
+from vla_eval.training.job import load_finetune_recipe
 
 pytestmark = pytest.mark.usefixtures("no_network")
 BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
@@ -50,6 +54,22 @@ def test_the_command_prints_json_and_stays_within_the_limit(tmp_path: Path) -> N
     assert printed["is_within_limit"]
     assert {"parameters", "trained", "bytes", "peak_rss_bytes", "seconds"} <= printed.keys()
     assert printed["limit_bytes"] == int(1.15 * printed["bytes"] + 2e9)
+
+
+def test_a_checkpoint_that_is_there_is_loaded_and_stays(tmp_path: Path) -> None:
+    folder, options = tmp_path / "checkpoint", RehearsalOptions(folder=tmp_path / "unused")
+    recipe = load_finetune_recipe(FinetuneConfig(policy="openvla_oft_tiny", dataset="none")).value
+    folder.mkdir()
+    config, tokenizer = stand_in_config(recipe, tmp_path, dtype=None, tiny=False)
+    policy = make_unfilled_policy(config)
+    write_checkpoint(folder, config, policy, tokenizer)
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    found = rehearse_checkpoint(folder, options)
+    assert found.parameters == sum(x.numel() for x in policy.parameters()) and found.trained is None
+    assert set(found.seconds) == {"load", "first_inference", "second_inference"}
+    assert "written" not in "\n".join(found.lines())
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+    assert not options.folder.exists()
 
 
 def test_a_folder_that_is_there_is_left_alone(tmp_path: Path) -> None:

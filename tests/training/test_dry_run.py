@@ -126,6 +126,23 @@ def test_what_is_not_there_is_named_with_the_command_that_gets_it(
     assert list(tmp_path.iterdir()) == []
 
 
+PALIGEMMA, ROWS = 2_923_466_480, 257_216  # paligemma-3b-pt-224 as published, and of its embeddings
+PI0_FAST = PALIGEMMA + (2 * 257_152 - ROWS) * 2_048  # lerobot has the embeddings twice, of 257,152 rows
+
+
+@pytest.mark.parametrize(
+    ("policy", "trained"),
+    [("smolvla", "99,880,992 of 450,046,176"), ("pi0_fast", f"{PI0_FAST:,} of {PI0_FAST:,}")],
+)
+@pytest.mark.usefixtures("no_network")
+def test_a_dry_run_needs_no_base_and_no_network(
+    policy: str, trained: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policy", policy, "--dataset", "demos/RC3", "--device", "cpu"]
+    assert main(["finetune", *arguments, "--dry-run"]) == 0
+    assert f"trained: {trained}" in capsys.readouterr().out
+
+
 def test_a_dry_run_describes_the_real_dataset_and_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     config = tiny_trainings.act(recorded, out)

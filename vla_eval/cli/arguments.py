@@ -1,16 +1,20 @@
 """Shared by several verbs: kinds of arguments, exit codes, the typed command."""
 
 import argparse
+import contextlib
 import math
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import Shard
+
+if TYPE_CHECKING:
+    from vla_eval.training.dry_run import DryRunOptions
 
 EXIT_EPISODE_ERRORS = 3
 """All episodes were run, and some ended in an error."""
@@ -25,6 +29,17 @@ def add_verb(subparsers: "argparse._SubParsersAction[Any]", name: str, **texts: 
 def typed_command() -> str:
     """Return the command that is running, as a shell takes it."""
     return shlex.join(["mikasa-vla", *sys.argv[1:]])
+
+
+@contextlib.contextmanager
+def dry_run_options(args: argparse.Namespace) -> "Iterator[DryRunOptions]":
+    """Give what `finetune --dry-run` assumes; where a base is missing, networks of the published sizes."""
+    # Here and not above: `mikasa-vla --help` need not wait for torch.
+    from vla_eval.testing.random_checkpoint import published_sizes
+    from vla_eval.training.dry_run import DryRunOptions
+
+    with published_sizes() as assume:
+        yield DryRunOptions(device_bytes=args.device_memory, tflops=args.tflops, assume=assume)
 
 
 def workers_argument(text: str) -> int | str:

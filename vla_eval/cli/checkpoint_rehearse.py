@@ -8,7 +8,8 @@ from typing import Any
 REHEARSE = "rehearse"
 DESCRIPTION = """Build a recipe's policy at its published size with random weights, write it as a checkpoint,
 load it strictly, and let it act for 20 control steps on a fake simulator. Prints parameters, bytes,
-seconds and peak memory. The checkpoint is removed afterwards."""
+seconds and peak memory. The checkpoint is removed afterwards. With the folder of a checkpoint or a run, that
+is loaded instead, and nothing is written."""
 
 
 def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -19,7 +20,11 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
         description=DESCRIPTION,
         allow_abbrev=False,
     )
-    sub.add_argument("name", metavar="RECIPE", help="in policies/, with a `finetune` section")
+    sub.add_argument(
+        "name",
+        metavar="RECIPE|DIR",
+        help="in policies/, with a `finetune` section; or a folder of a LeRobot checkpoint",
+    )
     sub.add_argument("--dtype", choices=("float32", "bfloat16"), help="precision (the recipe's)")
     sub.add_argument("--device", default="auto", metavar="D", help="auto, cpu, cuda (auto)")
     sub.add_argument(
@@ -33,10 +38,11 @@ def run(args: argparse.Namespace) -> list[str]:
     """Do it; return lines for standard output."""
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.policies.lerobot_device import choose_device
-    from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+    from vla_eval.testing.rehearsal import RehearsalOptions, rehearse, rehearse_checkpoint
 
     options = RehearsalOptions(
         folder=args.out, dtype=args.dtype, device=choose_device(args.device), tiny=args.tiny
     )
-    found = rehearse(args.name, options)
+    path = Path(args.name)
+    found = rehearse_checkpoint(path, options) if path.is_dir() else rehearse(args.name, options)
     return [json.dumps(found.data(), indent=2)] if args.format == "json" else found.lines()

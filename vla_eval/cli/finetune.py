@@ -10,6 +10,7 @@ from vla_eval.cli.arguments import (
     add_old_flag,
     add_overrides,
     add_verb,
+    dry_run_options,
     memory_argument,
     positive_argument,
     set_flags,
@@ -109,10 +110,9 @@ def run(args: argparse.Namespace) -> int:
             "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
         )
     if args.dry_run:
-        from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
+        from vla_eval.training.dry_run import describe_finetuning
 
-        options = DryRunOptions(device_bytes=args.device_memory, tflops=args.tflops)
-        with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
             lines = describe_finetuning(_config(args), options)
         print("\n".join(lines))
         return 0

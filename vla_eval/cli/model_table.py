@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, typed_command
+from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, dry_run_options, typed_command
 from vla_eval.cli.cluster import backend_of, shared_folder
 from vla_eval.errors import FolderInUseError, RecipeError
 from vla_eval.evaluation.grid import (
@@ -82,20 +82,19 @@ def finetune_table(args: argparse.Namespace) -> int:
 
 def describe_table(args: argparse.Namespace) -> list[str]:
     """Return what fine-tuning the table takes, for a person: all of it, then each row on its first task."""
-    from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
+    from vla_eval.training.dry_run import describe_finetuning
 
     _refuse(args, FINETUNE_FLAGS)
     work = _work(args, rows=args.policy)
     n_finished = len(finetunings(work.table, work.out)) - len(_unfinished(work))
     lines = [describe_effort(work.table, n_finished=n_finished)]
-    options = DryRunOptions(device_bytes=args.device_memory, tflops=args.tflops)
-    seen: set[str] = set()
+    first: dict[str, Finetuning] = {}
     for one in finetunings(work.table, work.out):
-        if one.row.name in seen:
-            continue
-        seen.add(one.row.name)
-        config = replace(one.config, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
-        lines += ["", f"{one.row.name}:", *describe_finetuning(config, options)]
+        first.setdefault(one.row.name, one)
+    with dry_run_options(args) as options:
+        for name, one in first.items():
+            config = replace(one.config, device=args.device or "auto", allow_unreplayed=args.allow_unreplayed)
+            lines += ["", f"{name}:", *describe_finetuning(config, options)]
     return lines
 
 

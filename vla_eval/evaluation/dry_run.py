@@ -44,7 +44,8 @@ class EvaluationEffort:
         n_steps: control steps.
         n_inferences: of all policies.
         n_learned_inferences: of those that load weights.
-        n_frames: images that are rendered, of two cameras, at each inference.
+        n_frames: images that are rendered, of two cameras: at each inference, and at each control step for
+            a policy that has to be shown every frame.
         n_workers: processes.
         copies: learned policies -> bytes of their weights; each worker loads its own copy.
     """
@@ -88,6 +89,12 @@ def evaluation_effort(config: EvalConfig, *, out: Path, shard: Shard | None = No
     queue = JobQueue(plan.jobs, finished=finished)
     steps = [horizon_steps(job) for job in ahead]
     inferences = [_inferences(job) for job in ahead]
+    checkpoints = _checkpoints(plan)
+    watching = {name for name, folder in checkpoints.items() if _is_shown_every_frame(folder)}
+    rendered = [
+        n_steps if job.group.key.policy in watching else n
+        for job, n_steps, n in zip(ahead, steps, inferences, strict=True)
+    ]
     learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
     return EvaluationEffort(
         n_episodes=len(plan.jobs),
@@ -95,9 +102,9 @@ def evaluation_effort(config: EvalConfig, *, out: Path, shard: Shard | None = No
         n_steps=sum(steps),
         n_inferences=sum(inferences),
         n_learned_inferences=sum(learned),
-        n_frames=N_CAMERAS * sum(inferences),
+        n_frames=N_CAMERAS * sum(rendered),
         n_workers=worker_count(config, plan, n_jobs=queue.n_batches),
-        copies=_copies(plan),
+        copies={policy: _n_bytes(folder) for policy, folder in checkpoints.items()},
     )
 
 
@@ -145,14 +152,23 @@ def _inferences(job: EpisodeJob) -> int:
     return math.ceil(horizon_steps(job) / job.group.key.n_action_steps)
 
 
-def _copies(plan: Plan) -> dict[str, int]:
-    """Return the bytes of the weights of each learned policy."""
-    copies: dict[str, int] = {}
-    for job in plan.jobs:
-        checkpoint = job.group.args.get(LEARNED)
-        if checkpoint is None or job.group.key.policy in copies:
-            continue
-        file = weights_file(find_checkpoint(Path(str(checkpoint))))
-        assert file is not None  # `find_checkpoint` looks for it
-        copies[job.group.key.policy] = file.stat().st_size
-    return copies
+def _checkpoints(plan: Plan) -> dict[str, Path]:
+    """Return the folder of the weights of each learned policy."""
+    named = {job.group.key.policy: job.group.args.get(LEARNED) for job in plan.jobs}
+    return {policy: find_checkpoint(Path(str(path))) for policy, path in named.items() if path is not None}
+
+
+def _n_bytes(folder: Path) -> int:
+    file = weights_file(folder)
+    assert file is not None  # `find_checkpoint` looks for it
+    return file.stat().st_size
+
+
+def _is_shown_every_frame(folder: Path) -> bool:
+    # Here and not above: a dry run of scripted policies need not wait for torch.
+    from vla_eval.policies.lerobot_loading import LoadOptions, make_unfilled_policy, read_config
+    from vla_eval.policies.lerobot_memory import remembers
+    from vla_eval.policies.lerobot_types import history
+
+    config = read_config(folder, LoadOptions(device="cpu"))
+    return len(history(config)) > 1 or remembers(make_unfilled_policy(config))

@@ -5,8 +5,9 @@ Weights are made and written part by part. Tokenizers are stand-ins, since the p
 
 import contextlib
 import functools
+import tempfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
@@ -93,6 +94,18 @@ def stand_in_config(
     base = recipe.base_checkpoint
     changed = FinetuneRecipe(type=kind, policy={**recipe.policy, **changes}, base_checkpoint=base)
     return assumed_config(changed), tokenizer
+
+
+@contextlib.contextmanager
+def published_sizes() -> Iterator[Callable[[FinetuneRecipe], Any]]:
+    """Give a function that returns a recipe's configuration at its published sizes, without base or network.
+
+    The files of its stand-ins are there within the context.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        yield lambda recipe: stand_in_config(
+            recipe, Path(tempfile.mkdtemp(dir=folder)), dtype=None, tiny=False
+        )[0]
 
 
 def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | None) -> None:

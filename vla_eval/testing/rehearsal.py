@@ -1,5 +1,7 @@
 """Rehearse a recipe at its true size with random weights: write a checkpoint, load it strictly, act.
 
+Or a checkpoint that is there: load it, act.
+
 What is measured is memory, disk and time; the actions mean nothing. Weights are made part by part, so that
 they are in memory once, when they are loaded.
 """
@@ -24,12 +26,18 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, Policy
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError
 from vla_eval.features import CAMERA_KEYS
-from vla_eval.policies.checkpoint import WEIGHTS_FILE
+from vla_eval.policies.checkpoint import ADAPTER_CONFIG_FILE, WEIGHTS_FILE, find_checkpoint
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint, make_unfilled_policy
+from vla_eval.policies.lerobot_loading import (
+    LoadOptions,
+    load_checkpoint,
+    make_unfilled_policy,
+    read_config,
+)
 from vla_eval.policies.lerobot_types import history
 from vla_eval.policies.verify import random_batch
+from vla_eval.policies.weight_file import WeightFile
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.random_checkpoint import TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.estimate import unfilled_model
@@ -45,12 +53,13 @@ class Rehearsed:
     """What was measured.
 
     Attributes:
-        recipe, kind, dtype, device: what was rehearsed.
-        parameters, trained: of the model; what the recipe trains, adapters included.
+        recipe, kind, dtype, device: what was rehearsed; a folder's path where it was a checkpoint.
+        parameters: of the model.
+        trained: what the recipe trains, adapters included; None for a checkpoint.
         bytes: of the file of weights.
-        peak_rss_bytes: most memory of the process, by stage: `write`, `load`, `act`.
+        peak_rss_bytes: most memory of the process, by stage: `write` (a recipe's only), `load`, `act`.
         peak_device_bytes: most memory on the GPU; None on a CPU.
-        seconds: by stage: `write`, `load`, `first_inference`, `second_inference`.
+        seconds: by stage: `write` (a recipe's only), `load`, `first_inference`, `second_inference`.
         inferences_per_second: episodes in a forward pass -> inferences; empty if it was not asked for.
         before_bytes: memory of the process before anything was made: torch, transformers, lerobot.
         limit_bytes: 1.15 × the weights + 2 GB, which loading and acting must keep.
@@ -61,7 +70,7 @@ class Rehearsed:
     dtype: str
     device: str
     parameters: int
-    trained: int
+    trained: int | None
     bytes: int
     peak_rss_bytes: dict[str, int]
     peak_device_bytes: int | None
@@ -80,12 +89,16 @@ class Rehearsed:
         peak, took = self.peak_rss_bytes, self.seconds
         verdict = "within" if self.is_within_limit else "ABOVE"
         on_device = "" if self.peak_device_bytes is None else f", on the device {_gb(self.peak_device_bytes)}"
+        title = f"{self.recipe} ({self.kind}, {self.dtype}, {self.device})"
+        parameters, on_disk = f"parameters   {self.parameters:,}", f"on disk      {_gb(self.bytes)}"
+        if self.trained is not None:
+            title += ": random weights: the actions mean nothing"
+            parameters += f", of which the recipe trains {self.trained:,}"
+            on_disk += f", written in {took['write']:.1f} s, peak memory {_gb(peak['write'])}"
         return [
-            f"{self.recipe} ({self.kind}, {self.dtype}, {self.device}): random weights: the actions mean "
-            "nothing",
-            f"parameters   {self.parameters:,}, of which the recipe trains {self.trained:,}",
-            f"on disk      {_gb(self.bytes)}, written in {took['write']:.1f} s, peak memory "
-            f"{_gb(peak['write'])}",
+            title,
+            parameters,
+            on_disk,
             f"loading      {took['load']:.1f} s, peak memory {_gb(peak['load'])}{on_device}",
             f"inference    first {took['first_inference']:.2f} s, second {took['second_inference']:.2f} s, "
             f"peak memory {_gb(peak['act'])}",
@@ -103,8 +116,8 @@ class RehearsalOptions:
     """How to rehearse.
 
     Attributes:
-        folder: where the checkpoint is written; it is removed afterwards.
-        dtype: `float32` or `bfloat16`, for policies with such a setting; None: the recipe's.
+        folder: where a recipe's checkpoint is written; it is removed afterwards.
+        dtype: `float32` or `bfloat16`, for policies with such a setting; None: the recipe's or as saved.
         device: `cpu`, `cuda` …
         tiny: build the π0 family and SmolVLA in their tiny form, for tests.
     """
@@ -144,6 +157,29 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
         shutil.rmtree(options.folder)
 
 
+def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
+    """Load a checkpoint that is there, and let it act; its weights are those of its files.
+
+    Args:
+        path: a LeRobot checkpoint, or a run.
+        options: `device` and `dtype` are used.
+        batches: see `rehearse`.
+
+    Raises:
+        CheckpointError: it is incomplete, or memory is too small.
+    """
+    before, folder = peak_rss_bytes(), find_checkpoint(path)
+    if (folder / ADAPTER_CONFIG_FILE).is_file():
+        raise CheckpointError(
+            f"{folder}: expected whole weights, found a LoRA adapter. Merge it first: "
+            f"mikasa-vla checkpoint merge {path} --out DIR"
+        )
+    config = read_config(folder, LoadOptions(device=options.device, dtype=options.dtype))
+    n_parameters = sum(x.numel() for x in WeightFile(folder / WEIGHTS_FILE).described().values())
+    written = _Written(n_parameters=n_parameters, trained=None, peaks={}, seconds={})
+    return _measured(str(path), folder, config, options, written, before, batches)
+
+
 def _rehearse(
     name: str, recipe: FinetuneRecipe, options: RehearsalOptions, before: int, batches: Sequence[int]
 ) -> Rehearsed:
@@ -151,16 +187,39 @@ def _rehearse(
     trained = sum(x.numel() for x in unfilled_model(config, recipe).parameters() if x.requires_grad)
     config.pretrained_path = None
     policy = make_unfilled_policy(config)
-    n_parameters = sum(x.numel() for x in policy.parameters())
     folder = options.folder / "model"
     folder.mkdir()
     reset_peak()
     started = time.perf_counter()
     write_checkpoint(folder, config, policy, tokenizer)
-    seconds = {"write": time.perf_counter() - started}
-    peaks = {"write": peak_rss_bytes()}
-    n_bytes = (folder / WEIGHTS_FILE).stat().st_size
+    written = _Written(
+        n_parameters=sum(x.numel() for x in policy.parameters()),
+        trained=trained,
+        seconds={"write": time.perf_counter() - started},
+        peaks={"write": peak_rss_bytes()},
+    )
     del policy
+    return _measured(name, folder, config, options, written, before, batches)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Written:
+    n_parameters: int
+    trained: int | None
+    peaks: dict[str, int]
+    seconds: dict[str, float]
+
+
+def _measured(
+    name: str,
+    folder: Path,
+    config: Any,
+    options: RehearsalOptions,
+    written: _Written,
+    before: int,
+    batches: Sequence[int],
+) -> Rehearsed:
+    n_bytes = (folder / WEIGHTS_FILE).stat().st_size
     limit = int(EXTRA_SHARE * n_bytes + EXTRA_BYTES)
     _check_memory(limit, options.device)
     acted = _load_and_act(folder, config, options, batches)
@@ -169,12 +228,12 @@ def _rehearse(
         kind=config.type,
         dtype=str(getattr(config, "dtype", "float32")),
         device=options.device,
-        parameters=n_parameters,
-        trained=trained,
+        parameters=written.n_parameters,
+        trained=written.trained,
         bytes=n_bytes,
-        peak_rss_bytes={**peaks, **acted.peaks},
+        peak_rss_bytes={**written.peaks, **acted.peaks},
         peak_device_bytes=torch.cuda.max_memory_allocated() if options.device != "cpu" else None,
-        seconds={**seconds, **acted.seconds},
+        seconds={**written.seconds, **acted.seconds},
         inferences_per_second=acted.inferences_per_second,
         before_bytes=before,
         limit_bytes=limit,
@@ -218,8 +277,9 @@ def _load_and_act(folder: Path, config: Any, options: RehearsalOptions, batches:
     cameras = _cameras(config)
     reset_peak()
     started = time.perf_counter()
+    dtype: Any = options.dtype
     loaded = make_lerobot(
-        context, checkpoint=str(folder), device=options.device, cameras=cameras, batch=False
+        context, checkpoint=str(folder), device=options.device, dtype=dtype, cameras=cameras, batch=False
     )
     seconds = {"load": time.perf_counter() - started}
     peaks = {"load": peak_rss_bytes()}

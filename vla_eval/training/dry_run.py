@@ -1,6 +1,6 @@
 """`finetune --dry-run`: what would run, and what it takes. Writes nothing; loads no weights."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -26,67 +26,6 @@ from vla_eval.training.run_folder import newest_step
 EEF_NUMBERS = 10  # of the state that recordings have
 PUBLISHED_SIZES: Mapping[str, Mapping[str, Any]] = {"octo_base": SIZES["base"]}
 """Base -> fields that its `config.json` will have, where they are not the defaults of the type."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DryRunOptions:
-    """What is assumed of a device.
-
-    Attributes:
-        device_bytes: its memory; None: of the GPU that is here, if any.
-        tflops: its rate; None: a usual one.
-    """
-
-    device_bytes: float | None = None
-    tflops: float | None = None
-
-
-def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[str]:
-    """Return lines for a person.
-
-    Raises:
-        VlaEvalError: a mistake in the configuration, the recipe, or a dataset that is there.
-    """
-    loaded = load_finetune_recipe(config)
-    recipe = loaded.value
-    check_lora_targets(recipe)
-    out = Path(config.out) if config.out is not None else default_out(config)
-    found, missing, frames = _estimate(config, recipe, options.tflops)
-    done = newest_step(out)
-    kind = "full" if recipe.lora is None else f"LoRA of rank {recipe.lora.rank}"
-    lines = [
-        f"fine-tuning: {loaded.name} ({recipe.type}, {kind}) on {config.dataset}, "
-        f"run seed {config.run_seed}, to {out}" + (f", resuming from step {done}" if done else ""),
-        *(f"not there: {line}" for line in missing),
-    ]
-    if frames is not None:
-        passes = recipe.steps * recipe.batch_size / frames
-        lines.append(f"dataset: {frames:,} frames begin a sample; {passes:.1f} passes over them")
-    return [*lines, *estimate_lines(found, device_bytes=options.device_bytes or _memory_here())]
-
-
-def _estimate(
-    config: FinetuneConfig, recipe: FinetuneRecipe, tflops: float | None
-) -> tuple[Estimate, list[str], int | None]:
-    """Return the estimate, what is missing for the real run, and the number of frames, if it is known."""
-    device = choose_device(config.device)
-    missing, dataset = [], None
-    if Path(config.dataset).is_dir():
-        dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
-    else:
-        missing.append(f"the dataset {config.dataset}; its fields are taken to be those of recordings")
-    base = recipe.base_checkpoint
-    if base is not None and not _is_there(base):
-        missing.append(
-            f"the base {base}; its sizes are taken to be the defaults of '{recipe.type}'.{how_to_get(base)}"
-        )
-    if dataset is not None and (base is None or _is_there(base)):
-        policy = policy_config(recipe, dataset, device="cpu")
-        frames: int | None = used_frames(policy, dataset).n_used
-    else:
-        policy, frames = assumed_config(recipe), None
-    model = unfilled_model(policy, recipe)
-    return estimate(model, policy, recipe, device=device, tflops=tflops), missing, frames
 
 
 def assumed_config(recipe: FinetuneRecipe) -> Any:
@@ -116,6 +55,69 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     if hasattr(policy, "fit_to_actions"):
         policy.fit_to_actions(None, {})  # a uniform grid needs neither
     return policy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DryRunOptions:
+    """What is assumed of a device.
+
+    Attributes:
+        device_bytes: its memory; None: of the GPU that is here, if any.
+        tflops: its rate; None: a usual one.
+        assume: returns the policy's configuration where the base or the dataset is missing.
+    """
+
+    device_bytes: float | None = None
+    tflops: float | None = None
+    assume: Callable[[FinetuneRecipe], Any] = assumed_config
+
+
+def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[str]:
+    """Return lines for a person.
+
+    Raises:
+        VlaEvalError: a mistake in the configuration, the recipe, or a dataset that is there.
+    """
+    loaded = load_finetune_recipe(config)
+    recipe = loaded.value
+    check_lora_targets(recipe)
+    out = Path(config.out) if config.out is not None else default_out(config)
+    found, missing, frames = _estimate(config, recipe, options)
+    done = newest_step(out)
+    kind = "full" if recipe.lora is None else f"LoRA of rank {recipe.lora.rank}"
+    lines = [
+        f"fine-tuning: {loaded.name} ({recipe.type}, {kind}) on {config.dataset}, "
+        f"run seed {config.run_seed}, to {out}" + (f", resuming from step {done}" if done else ""),
+        *(f"not there: {line}" for line in missing),
+    ]
+    if frames is not None:
+        passes = recipe.steps * recipe.batch_size / frames
+        lines.append(f"dataset: {frames:,} frames begin a sample; {passes:.1f} passes over them")
+    return [*lines, *estimate_lines(found, device_bytes=options.device_bytes or _memory_here())]
+
+
+def _estimate(
+    config: FinetuneConfig, recipe: FinetuneRecipe, options: DryRunOptions
+) -> tuple[Estimate, list[str], int | None]:
+    """Return the estimate, what is missing for the real run, and the number of frames, if it is known."""
+    device = choose_device(config.device)
+    missing, dataset = [], None
+    if Path(config.dataset).is_dir():
+        dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    else:
+        missing.append(f"the dataset {config.dataset}; its fields are taken to be those of recordings")
+    base = recipe.base_checkpoint
+    if base is not None and not _is_there(base):
+        missing.append(
+            f"the base {base}; its sizes are taken to be the defaults of '{recipe.type}'.{how_to_get(base)}"
+        )
+    if dataset is not None and (base is None or _is_there(base)):
+        policy = policy_config(recipe, dataset, device="cpu")
+        frames: int | None = used_frames(policy, dataset).n_used
+    else:
+        policy, frames = options.assume(recipe), None
+    model = unfilled_model(policy, recipe)
+    return estimate(model, policy, recipe, device=device, tflops=options.tflops), missing, frames
 
 
 def _is_there(base: str) -> bool:
