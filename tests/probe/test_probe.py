@@ -131,7 +131,11 @@ def test_a_probe_of_all_kinds_has_a_row_each_and_resumes(
     assert "half-life more than 12 steps" in found["sentences"][0]
     assert [row["items_kept"] for row in found["rows"]] == pytest.approx([3.0] * 14, abs=1e-5)
     assert {row["n_order_mistakes"] for row in found["rows"]} == {0}
-    assert (tmp_path / "ChainOfColors3-v0_follows.png").read_bytes().startswith(b"\x89PNG")
+    assert (
+        (tmp_path.parent / f"{tmp_path.name}_ChainOfColors3-v0_follows.png")
+        .read_bytes()
+        .startswith(b"\x89PNG")
+    )
 
     again = ["probe", *arguments, *FAKE, "--episodes", str(N), "--out", str(tmp_path), "--format"]
     shown = {}

@@ -132,8 +132,8 @@ def run(args: argparse.Namespace) -> int:
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.probe.interventions import plan_probe
+    from vla_eval.probe.page.retention_plot import write_retention
     from vla_eval.probe.probe_text import render_probe
-    from vla_eval.probe.retention_plot import write_retention
     from vla_eval.probe.table import read_probe
 
     if args.grid:

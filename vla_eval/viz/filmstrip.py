@@ -1,5 +1,6 @@
 """Read some frames of a captured episode back from its video. Knows nothing of results."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from vla_eval.core import ImageArray
 from vla_eval.errors import ViewingError
 from vla_eval.viz.frames import PANEL_PX
-from vla_eval.viz.video import HOLD_SECONDS
+from vla_eval.viz.video import CUE_SECONDS, HOLD_SECONDS
 
 
 class StripFrame(NamedTuple):
@@ -41,10 +42,34 @@ def read_strip(path: Path, *, n_frames: int, n_steps: int, control_hz: float) ->
         ) from exc
     if rate is None or not frames:
         raise ViewingError(f"{path}: the video has no frames. Remove it, or capture it again.")
-    n_captured = max(1, len(frames) - round(HOLD_SECONDS * float(rate)))
     stride = round(control_hz / float(rate))
-    chosen = np.unique(np.linspace(0, n_captured - 1, min(n_frames, n_captured)).round().astype(int))
+    n_captured = -(-n_steps // stride) + 1
+    # The first frames, those of the cue, are repeated, and so is the last one: see `write_video`.
+    n_repeats = len(frames) - round(HOLD_SECONDS * float(rate)) - n_captured
+    if n_repeats < 0:
+        raise ViewingError(
+            f"{path}: the video is too short for {n_steps} steps. Remove it, or capture again."
+        )
+    n_cue = _most_cue_frames(n_repeats, n_captured, float(rate))
+    spaced = np.unique(np.linspace(0, n_captured - 1, min(n_frames, n_captured)).round().astype(int))
+    # Between the first frame of the cue and its end, no frame of the video is known by its step.
+    chosen = [int(i) for i in spaced if i == 0 or i >= n_cue]
     return [
-        StripFrame(min(int(i) * stride, n_steps), np.ascontiguousarray(frames[i][PANEL_PX:], dtype=np.uint8))
+        StripFrame(
+            min(i * stride, n_steps),
+            np.ascontiguousarray(frames[i + n_repeats if i else 0][PANEL_PX:], dtype=np.uint8),
+        )
         for i in chosen
     ]
+
+
+def _most_cue_frames(n_repeats: int, n_captured: int, rate_hz: float) -> int:
+    """Return the most captured frames of the cue that would be repeated so often in all; 0 for no repeats."""
+    if n_repeats == 0:
+        return 0
+    fitting = (
+        n
+        for n in range(n_captured, 0, -1)
+        if n * (max(1, math.ceil(CUE_SECONDS * rate_hz / n)) - 1) == n_repeats
+    )
+    return next(fitting, n_captured - 1)

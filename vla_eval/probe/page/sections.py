@@ -14,8 +14,8 @@ from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.page.films import film_pairs
 from vla_eval.probe.page.heat_maps import heat_maps
+from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, retention_lines
 from vla_eval.probe.retention_curves import Retention
-from vla_eval.probe.retention_plot import CURVES, X_TITLE, line_name, retention_lines
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
 from vla_eval.storage.run_folder import StoredRun

@@ -27,7 +27,9 @@ class RetentionLines:
 
 
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
-    """Write a PNG file per task and kind of curve, such as `TASK_follows.png`, and return their paths.
+    """Write a PNG file per task and kind of curve, such as `OUT_TASK_follows.png`, and return their paths.
+
+    They are beside the folder and not in it, so that all it holds are run folders.
 
     Raises:
         ReportError: a file cannot be written.
@@ -35,7 +37,7 @@ def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     written = []
     for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
         own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
-        path = folder / f"{task}_{of}.png"
+        path = folder.parent / f"{folder.resolve().name}_{task}_{of}.png"
         try:
             path.write_bytes(retention_png(own))
         except OSError as exc:
