@@ -51,9 +51,9 @@ def read_strip(path: Path, *, n_frames: int, n_steps: int, control_hz: float) ->
             f"{path}: the video is too short for {n_steps} steps. Remove it, or capture again."
         )
     n_cue = _most_cue_frames(n_repeats, n_captured, float(rate))
-    spaced = np.unique(np.linspace(0, n_captured - 1, min(n_frames, n_captured)).round().astype(int))
     # Between the first frame of the cue and its end, no frame of the video is known by its step.
-    chosen = [int(i) for i in spaced if i == 0 or i >= n_cue]
+    after = np.linspace(min(max(n_cue, 1), n_captured - 1), n_captured - 1, n_frames - 1)
+    chosen = [int(i) for i in np.unique([0, *after.round().astype(int)])]
     return [
         StripFrame(
             min(i * stride, n_steps),
