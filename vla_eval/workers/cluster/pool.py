@@ -262,7 +262,7 @@ class ClusterPool[J: Job, A]:
         if machine.is_usable:
             raise ClusterError(
                 f"{machine.n_errors_in_a_row} workers in a row did not start on {machine.name}, the only "
-                f"machine that is left: {cause} Look into Ray's logs there (/tmp/ray/session_latest/logs)."
+                f"machine that is left: {cause} Look into Ray's logs there (session_latest/logs)."
             )
 
     def _end(self, index: int) -> None:
