@@ -41,6 +41,9 @@ USED = {
     "eval": {
         "out",
         "workers",
+        "shard",
+        "cluster",
+        "json_progress",
         "allow_environment_change",
         "format",
         "baseline",
@@ -53,7 +56,7 @@ USED = {
         "tasks",
         "policies",
     },
-    "finetune": {"out", "device", "allow_unreplayed", "help", "tasks", "policy", *DRY_RUN},
+    "finetune": {"out", "device", "cluster", "allow_unreplayed", "help", "tasks", "policy", *DRY_RUN},
 }
 
 
