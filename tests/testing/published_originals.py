@@ -30,6 +30,7 @@ from vla_eval.testing.random_checkpoint import random_parts
 
 SHARD_BYTES = 5_000_000_000  # of a file of a published checkpoint, at most
 SEVEN = {name: [value] * 7 for name, value in (("q01", -1.0), ("q99", 1.0), ("mean", 0.0), ("std", 1.0))}
+MASK = [True] * 6 + [False]  # the gripper is not normalised
 NEWLINE = 108  # of Gemma's vocabulary
 WORDS = (
     "<s>",
@@ -48,7 +49,10 @@ def write_openvla(folder: Path) -> None:
     config = openvla._config(folder, openvla.ConvertOptions(gripper="unit_open", image_augmentation=False))
     policy = make_unfilled_policy(config)
     _write_shards(folder, openvla_names(_own(policy)))
-    _write_json(folder / "config.json", {"model_type": "openvla", "norm_stats": {"one": {"action": SEVEN}}})
+    _write_json(
+        folder / "config.json",
+        {"model_type": "openvla", "norm_stats": {"one": {"action": {**SEVEN, "mask": MASK}}}},
+    )
     _write_words(
         folder,
         {"<unk>": 0, "</s>": 2, **dict(zip(WORDS, openvla.KNOWN_IDS, strict=True))},
