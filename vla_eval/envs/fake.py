@@ -274,7 +274,7 @@ class FakeEnv:
         self.n_renders += render
         return Observation(
             step=episode.step,
-            images={name: self._picture(episode, name) for name in self._shown(episode)} if render else {},
+            images={name: self._image(episode, name) for name in self._shown(episode)} if render else {},
             state={name: np.array(values, dtype=np.float32) for name, values in state.items()},
             privileged=self._privileged(episode) if self._settings.privileged else None,
         )
@@ -285,20 +285,20 @@ class FakeEnv:
             return self._settings.cameras
         return (*self._settings.cameras, HUMAN_CAMERA)
 
-    def _picture(self, episode: _Episode, camera: str) -> ImageArray:
+    def _image(self, episode: _Episode, camera: str) -> ImageArray:
         """Return an image that shows the cue in its first rows and otherwise depends only on the state."""
         view = [*(known.name for known in CAMERAS), HUMAN_CAMERA].index(camera)
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
-        picture = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
+        image = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
         in_view = self._is_in_view(episode) and episode.targets
         shown = episode.targets[1 if self._shuffles_cue else 0] if in_view else 0
-        picture[:CUE_ROWS] = 20 * (shown + 1) if in_view else 0
+        image[:CUE_ROWS] = 20 * (shown + 1) if in_view else 0
         first = self._cue_steps + (self._response_step - self._cue_steps - self._distract_steps) // 2
         if first <= episode.step < first + self._distract_steps:
-            picture[:CUE_ROWS] = DISTRACTOR_LEVEL
-        return picture
+            image[:CUE_ROWS] = DISTRACTOR_LEVEL
+        return image
 
     def _privileged(self, episode: _Episode) -> PrivilegedState:
         bodies = {}
