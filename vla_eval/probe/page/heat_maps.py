@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from vla_eval.errors import ReportError
 from vla_eval.page.heat import HeatMap, heat_png
 from vla_eval.probe.grid_table import GridCell, GridTable
+from vla_eval.probe.page.png_files import write_beside
 
 Group = tuple[str, str]
 """Task and phase."""
@@ -33,17 +33,10 @@ def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
     Raises:
         ReportError: a file cannot be written.
     """
-    written = []
-    for (task, axis), maps in heat_maps(table).items():
-        path = folder.parent / f"{folder.resolve().name}_{task}_{axis}.png"
-        try:
-            path.write_bytes(heat_png(maps))
-        except OSError as exc:
-            raise ReportError(
-                f"{path}: cannot be written ({exc.strerror or exc}). Name another --out."
-            ) from exc
-        written.append(path)
-    return written
+    return [
+        write_beside(folder, f"{task}_{axis}", heat_png(maps))
+        for (task, axis), maps in heat_maps(table).items()
+    ]
 
 
 def _heat_map(policy: str, cells: list[GridCell]) -> HeatMap:

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.errors import ReportError
 from vla_eval.page.charts import Point, Series, curves_png
+from vla_eval.probe.page.png_files import write_beside
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeTable
 
@@ -37,14 +37,7 @@ def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     written = []
     for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
         own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
-        path = folder.parent / f"{folder.resolve().name}_{task}_{of}.png"
-        try:
-            path.write_bytes(retention_png(own))
-        except OSError as exc:
-            raise ReportError(
-                f"{path}: cannot be written ({exc.strerror or exc}). Name another --out."
-            ) from exc
-        written.append(path)
+        written.append(write_beside(folder, f"{task}_{of}", retention_png(own)))
     return written
 
 
