@@ -123,8 +123,12 @@ def _lengths(dataset: TrainingDataset) -> list[int]:
 def masks_padding(config: Any) -> bool:
     """Whether the policy leaves actions beyond the episode's end out of its loss.
 
-    Its code shows it: one that never reads `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
+    `masks_padding` of its configuration says it. Without that, its code shows it: one that never reads
+    `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
     """
+    said = getattr(config, "masks_padding", None)
+    if said is not None:
+        return bool(said)
     name = type(config).__module__.replace("configuration_", "modeling_")
     code = inspect.getsource(importlib.import_module(name))
     if not any(key in code for key in PADDING_KEYS):

@@ -16,6 +16,7 @@ from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, UnknownNameError
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.episode_samples import episodes_of
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone, goals_missed
 from vla_eval.policies.memory.network import Answer
@@ -178,11 +179,14 @@ class TestTraining:
         policy = tiny_policy(recorded, waiting_share=1e-6).train()
         batch = self.batch(policy, n_real=5)
         batch["action"][:] = 0.5
-        episodes = policy._episodes(batch)
+        episodes = episodes_of(batch, policy.config, training=True)
         n_steps = policy.config.n_window_steps
         assert episodes.state.shape[1] == 2
         torch.testing.assert_close(episodes.state[:, 0], batch["observation.state"][:, n_steps - 5])
         torch.testing.assert_close(episodes.state[:, 1], batch["observation.state"][:, n_steps - 1])
+
+    def test_chunks_that_reach_beyond_the_end_of_an_episode_are_trained_on(self, recorded: Path) -> None:
+        assert getattr(tiny_policy(recorded).config, "drop_n_last_frames", 0) == 0
 
     def test_each_camera_is_taught_to_tell_by_itself(self, recorded: Path) -> None:
         policy = tiny_policy(recorded)

@@ -1,39 +1,21 @@
 """The positive control as a LeRobot policy: loss over whole episodes, memory from frame to frame."""
 
 from collections import deque
-from typing import Any, NamedTuple  # lerobot is untyped
+from typing import Any  # lerobot is untyped
 
 import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.features import STATE_KEY
+from vla_eval.policies.episode_samples import Episodes, episodes_of, stacked_images, weighted_mean
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.policies.memory.goal_layer import by_camera
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
-from vla_eval.policies.memory.sizes import SPACE, NetworkSizes
+from vla_eval.policies.memory.sizes import NetworkSizes
 
-SAME_ACTION = 1e-3  # actions that differ by less are waiting
 LEAST_VARIANCE = 1e-6
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
-
-
-class Episodes(NamedTuple):
-    """A batch of B episodes of T steps, from their beginning; padding comes last.
-
-    Attributes:
-        images: (B, T, cameras, 3, H, W) in [0, 1].
-        state: (B, T, state).
-        actions: (B, T, chunk, action).
-        counts: (B, T, chunk) float, 0 for what is beyond the episode.
-        goal_m: (B, 3) the tool centre point at the episode's end.
-    """
-
-    images: Tensor
-    state: Tensor
-    actions: Tensor
-    counts: Tensor
-    goal_m: Tensor
 
 
 class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -67,17 +49,18 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
-        config, episodes = self.config, self._episodes(batch)
+        config = self.config
+        episodes = episodes_of(batch, config, training=self.training)
         answer = self.network(episodes.images, episodes.state)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
-        imitation = _weighted_mean(errors, episodes.counts)
+        imitation = weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
         goal, goals = goals_missed(answer, episodes.goal_m, real)
         if self.training:
             self._note_errors(answer, episodes, real > 0)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
-        surprise = _weighted_mean(surprises, episodes.counts)
+        surprise = weighted_mean(surprises, episodes.counts)
         loss = imitation + config.goal_weight * goals + config.doubt_weight * surprise
         parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
@@ -91,7 +74,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: Memory | None) -> Memory:
         """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
-        images, state = self._images(batch), batch[STATE_KEY]
+        images, state = stacked_images(batch, self.config), batch[STATE_KEY]
         shape = state.shape[:2]
         sight = self.network.see(images.flatten(0, 1), state.flatten(0, 1))
         before = self.network.begin(shape[0]) if memory is None else memory
@@ -109,7 +92,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         self.eval()
         if self.config.remembers and memory is None:
             raise ValueError(f"'{TYPE}' with a memory needs what `remember` returned for this frame")
-        images, state = self._images(batch), batch[STATE_KEY]
+        images, state = stacked_images(batch, self.config), batch[STATE_KEY]
         sight = self.network.see(images, state)
         if memory is None:
             after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
@@ -126,44 +109,6 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             chunk = self.predict_action_chunk(batch, self._shown)
             self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
         return self._queue.popleft()
-
-    def _images(self, batch: dict[str, Tensor]) -> Tensor:
-        return torch.stack([batch[key] for key in self.config.image_features], dim=-4)
-
-    def _episodes(self, batch: dict[str, Tensor]) -> Episodes:
-        """Return the steps to train on, moved together: those of the episode, most waiting left out."""
-        config, n_steps = self.config, self.config.n_window_steps
-        real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
-        actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
-        counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
-        change = _change(actions[:, :, 0], real)
-        kept = real
-        if self.training:
-            waits = (change < SAME_ACTION) & (torch.rand_like(change) > config.waiting_share)
-            waits[:, -1] = False  # the frame that was sampled
-            kept = real & ~waits
-        order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
-
-        rows = torch.arange(len(order), device=order.device)[:, None]
-
-        def taken(values: Tensor) -> Tensor:
-            return values[rows, order]
-
-        weights = torch.full((config.chunk_size,), 1.0, device=actions.device)
-        if config.chunk_size > 1:
-            weights = weights * (1 - config.first_action_weight) / (config.chunk_size - 1)
-            weights[0] = config.first_action_weight
-        counts = counts * weights * (1 + config.change_weight * change)[..., None] * kept[..., None]
-        images = taken(self._images({key: batch[key][:, :n_steps] for key in config.image_features}))
-        if self.training and config.mix_colors:
-            images = _mixed(images)
-        return Episodes(
-            images=images,
-            state=taken(batch[STATE_KEY][:, :n_steps]),
-            actions=taken(actions),
-            counts=taken(counts),
-            goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
-        )
 
 
 def foreseen_alone(answer: Answer) -> Tensor:
@@ -198,9 +143,9 @@ def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor,
     of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)
     by_all = (answer.camera_shares * of_cameras).sum(dim=-1)
-    loss = _weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / variance
+    loss = weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / variance
     missed = (answer.goal_m - right_m[:, None]).square().mean(dim=-1)
-    return _weighted_mean(missed, real) / variance, loss
+    return weighted_mean(missed, real) / variance, loss
 
 
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
@@ -220,24 +165,3 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         longest_span_steps=config.longest_span_steps,
         free_translation=config.free_translation,
     )
-
-
-def _change(actions: Tensor, real: Tensor) -> Tensor:
-    """Return (B, T): by how much at most an action (B, T, action) differs from the one before.
-
-    The first of an episode has none before it: 1, a full change.
-    """
-    change = torch.ones_like(actions[..., 0])
-    difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
-    change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
-    return change.clamp(max=1.0)
-
-
-def _mixed(images: Tensor) -> Tensor:
-    """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
-    orders = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
-    return images.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
-
-
-def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    return (values * weights).sum() / weights.sum()

@@ -1,0 +1,104 @@
+"""What lerobot's configurations of our own policies from scratch share.
+
+A training sample is an episode. Knows no network.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar  # lerobot is untyped
+
+from vla_eval.features import STATE_NAMES
+from vla_eval.policies.ported_config import PortedConfig
+
+
+@dataclass
+class EpisodeConfig(PortedConfig):
+    """A policy that is trained on episodes from their beginning.
+
+    A training sample is an episode from its beginning to a frame: `observation.*` at the `window_steps`
+    frames up to it and, for the goal, at the episode's last frame; `action` at all of them and one chunk
+    further. So any loop that follows `*_delta_indices` trains it.
+
+    Nothing is normalised by statistics: positions in metres and actions in [-1, 1] need none, and rotation
+    and gripper hardly vary in scripted demonstrations, where a deviation would scale up noise.
+
+    Attributes:
+        whole_episodes: `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it.
+        masks_padding: actions beyond an episode's end count nothing, see `episode_samples`.
+        window_steps: frames of history in a training sample; at least the longest episode, so that no
+            memory begins in its middle. None: our `finetune` takes the dataset's longest.
+        first_action_weight: share of a chunk's first action in the loss; the others share the rest.
+        change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
+            which raises the moment of decision.
+        waiting_share: a step whose action is that of the step before is used with this probability.
+        goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
+        mix_colors: the three colours of an episode's images change places at random in training.
+        scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
+    """
+
+    whole_episodes: ClassVar[bool] = True
+    masks_padding: ClassVar[bool] = True
+
+    window_steps: int | None = None
+
+    first_action_weight: float = 0.5
+    change_weight: float = 3.0
+    waiting_share: float = 0.3
+    goal_weight: float = 1.0
+    mix_colors: bool = False
+
+    optimizer_lr: float = 2e-3
+    optimizer_weight_decay: float = 1e-4
+    scheduler_warmup_steps: int = 50
+    scheduler_decay_steps: int = 2000
+    scheduler_decay_lr: float = 4e-5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window_steps is not None and self.window_steps < 1:
+            raise ValueError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
+        for name in ("first_action_weight", "waiting_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
+            raise ValueError(f"'{self.type}' needs images, observation.state and action")
+        n_numbers = len(STATE_NAMES["eef"])
+        if self.robot_state_feature.shape != (n_numbers,):
+            raise ValueError(
+                f"'{self.type}' needs the state 'eef' of {n_numbers} numbers, found "
+                f"{self.robot_state_feature.shape}: record with state: eef"
+            )
+        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
+        if len(shapes) != 1:
+            raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
+
+    @property
+    def n_window_steps(self) -> int:
+        """`window_steps`, once it is known."""
+        if self.window_steps is None:
+            raise ValueError(
+                f"'{self.type}': window_steps is not set: give it the length in frames of the dataset's "
+                "longest episode (`mikasa-vla finetune` does)"
+            )
+        return self.window_steps
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The window up to the frame, and a frame beyond every episode's end: lerobot takes its last one."""
+        return [*range(1 - self.n_window_steps, 1), self.n_window_steps]
+
+    @property
+    def inference_delta_indices(self) -> None:
+        """Only the frame itself: the policy keeps its own history."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """A chunk for each frame of the window."""
+        return list(range(1 - self.n_window_steps, self.chunk_size))
+
+    def get_scheduler_preset(self) -> Any:
+        """Return lerobot's configuration of the schedule."""
+        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)

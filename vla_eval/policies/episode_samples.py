@@ -1,0 +1,99 @@
+"""Episodes to train on from a batch of lerobot's loader: the steps moved together, and how each counts."""
+
+from typing import NamedTuple  # lerobot is untyped
+
+import torch
+from torch import Tensor
+
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.policies.episode_config import EpisodeConfig
+
+SAME_ACTION = 1e-3  # actions that differ by less are waiting
+SPACE = 3  # numbers of a position, the first of the state
+
+
+class Episodes(NamedTuple):
+    """A batch of B episodes of T steps, from their beginning; padding comes last.
+
+    Attributes:
+        images: (B, T, cameras, 3, H, W) in [0, 1].
+        state: (B, T, state).
+        actions: (B, T, chunk, action).
+        counts: (B, T, chunk) float, 0 for what is beyond the episode.
+        goal_m: (B, 3) the tool centre point at the episode's end.
+    """
+
+    images: Tensor
+    state: Tensor
+    actions: Tensor
+    counts: Tensor
+    goal_m: Tensor
+
+
+def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
+    """Return the images (…, cameras, 3, H, W), in the order of the configuration."""
+    return torch.stack([batch[key] for key in config.image_features], dim=-4)
+
+
+def episodes_of(batch: dict[str, Tensor], config: EpisodeConfig, *, training: bool) -> Episodes:
+    """Return the steps to train on, moved together: those of the episode, most waiting left out.
+
+    Args:
+        batch: as `config` asks for it by its delta indices.
+        config: of the policy.
+        training: leave waiting out and mix colours, at random by torch's generator; else take every step.
+    """
+    n_steps = config.n_window_steps
+    real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
+    actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
+    counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
+    change = _change(actions[:, :, 0], real)
+    kept = real
+    if training:
+        waits = (change < SAME_ACTION) & (torch.rand_like(change) > config.waiting_share)
+        waits[:, -1] = False  # the frame that was sampled
+        kept = real & ~waits
+    order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
+
+    rows = torch.arange(len(order), device=order.device)[:, None]
+
+    def taken(values: Tensor) -> Tensor:
+        return values[rows, order]
+
+    weights = torch.full((config.chunk_size,), 1.0, device=actions.device)
+    if config.chunk_size > 1:
+        weights = weights * (1 - config.first_action_weight) / (config.chunk_size - 1)
+        weights[0] = config.first_action_weight
+    counts = counts * weights * (1 + config.change_weight * change)[..., None] * kept[..., None]
+    images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
+    if training and config.mix_colors:
+        images = _mixed(images)
+    return Episodes(
+        images=images,
+        state=taken(batch[STATE_KEY][:, :n_steps]),
+        actions=taken(actions),
+        counts=taken(counts),
+        goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
+    )
+
+
+def _change(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): by how much at most an action (B, T, action) differs from the one before.
+
+    The first of an episode has none before it: 1, a full change.
+    """
+    change = torch.ones_like(actions[..., 0])
+    difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
+    change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
+    return change.clamp(max=1.0)
+
+
+def _mixed(images: Tensor) -> Tensor:
+    """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
+    orders = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
+    return images.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
+
+
+def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the mean of values with these weights, of the same shape."""
+    return (values * weights).sum() / weights.sum()
