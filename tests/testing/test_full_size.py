@@ -21,6 +21,7 @@ from vla_eval.testing.rehearsal import EXTRA_BYTES, EXTRA_SHARE, RehearsalOption
 
 pytestmark = pytest.mark.full_size
 GEMMA_EMBEDDINGS = 257_152 * 2_048  # lerobot's π0 family has them twice, a published file once
+PALIGEMMA = 2_923_466_480 - (257_216 - 257_152) * 2_048  # of the published one, whose embeddings are padded
 SMOLVLA, OCTO_SMALL, OCTO_BASE = 450_046_176, 136_670_604, 92_830_092 + 109_628_544
 TABLE = "REHEARSAL_TABLE"
 """Environment variable: a file to which each result is appended as a line of JSON."""
@@ -34,6 +35,7 @@ TABLE = "REHEARSAL_TABLE"
         ("smolvla", SMOLVLA),
         ("pi0", 3_501_372_176 + GEMMA_EMBEDDINGS),
         ("pi05", 3_616_757_520 + GEMMA_EMBEDDINGS),
+        ("pi0_fast", PALIGEMMA + GEMMA_EMBEDDINGS),
         ("spatialvla", 4_027_854_731),
         ("openvla_oft", None),
     ],

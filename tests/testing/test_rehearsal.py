@@ -4,13 +4,18 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from scipy.fft import idct
+from transformers import AutoTokenizer
 
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.fast_tokens import load_fast_tokenizer
 from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.weight_file import write_weights
 from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
@@ -29,6 +34,7 @@ BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
         pytest.param("octo_tiny", False, marks=pytest.mark.slow),
         ("pi0_expert", True),
         ("pi05_lora", True),
+        ("pi0_fast", True),
         ("smolvla", True),
     ],
 )
@@ -77,9 +83,22 @@ def test_a_folder_that_is_there_is_left_alone(tmp_path: Path) -> None:
         rehearse("octo_tiny", RehearsalOptions(folder=tmp_path))
 
 
-def test_a_policy_whose_tokenizer_has_no_stand_in_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no stand-in"):
-        rehearse("pi0_fast", RehearsalOptions(folder=tmp_path / "r", tiny=True))
+def test_stand_ins_for_the_tokenizers_of_pi0_fast_name_every_token_that_it_can_predict(
+    tmp_path: Path,
+) -> None:
+    recipe = load_finetune_recipe(FinetuneConfig(policy="pi0_fast", dataset="none")).value
+    config, folder = stand_in_config(recipe, tmp_path, dtype=None, tiny=False)
+    read: Any = AutoTokenizer
+    text = read.from_pretrained(str(folder))
+    actions = load_fast_tokenizer(config.action_tokenizer_name)
+    assert (text.vocab_size, len(actions.bpe_tokenizer), actions.min_token) == (257_152, 2_048, -354)
+    last = text.convert_ids_to_tokens([257_151])
+    assert text.convert_tokens_to_ids(last) == [257_151]
+    chunk = np.linspace(-1, 1, 28).reshape(1, 4, 7)
+    (ids,) = actions(chunk)
+    characters = np.array([ord(x) for x in actions.bpe_tokenizer.decode(ids)]) + actions.min_token
+    # Rounded coefficients are off by at most 0.05, and a cosine transform is orthonormal.
+    np.testing.assert_allclose(idct(characters.reshape(4, 7) / 10, axis=0, norm="ortho"), chunk[0], atol=0.1)
 
 
 def test_what_is_written_in_parts_is_what_safetensors_reads(tmp_path: Path) -> None:

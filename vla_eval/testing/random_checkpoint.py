@@ -35,6 +35,15 @@ BYTE_TOKENIZER_SIZES: Mapping[str, dict[str, int]] = {
     "mikasa_spatialvla": {"pad_token": 0, "bos_token": 1, "stop_token": 2, "newline_token": 201},
 }
 """Numbers of tokens of the tokenizer of bytes, which stands in for the published one. They set no shape."""
+PALIGEMMA_TOKENS, FAST_TOKENS, FAST_MIN_TOKEN = 257_152, 2_048, -354
+"""Vocabularies of PaliGemma and of the FAST action tokenizer, and its lowest coefficient.
+
+Source: lerobot's `modeling_pi0_fast.py`; `processor_config.json` of physical-intelligence/fast as public
+code quotes it.
+"""
+DECODING_STEPS, TINY_DECODING_STEPS = 48, 6
+"""Tokens of π0-FAST per inference: those of 4 steps, prefix and end. Random weights do not write an end, and
+the 256 of its recipe would take minutes on a CPU. The cache of all 256 takes 5 MB."""
 PUBLISHED_SMOLVLM: Mapping[str, Mapping[str, Any]] = {
     "vision": {
         "hidden_size": 768,
@@ -63,7 +72,8 @@ def stand_in_config(
 ) -> tuple[Any, Path | None]:
     """Return the policy's configuration, and the folder of a tokenizer where its processors need one.
 
-    Tokenizers are stand-ins: a token per byte, or a few hundred. Nothing is downloaded.
+    Tokenizers are stand-ins: a token per byte, or a few hundred; those of π0-FAST, which has to name whatever
+    token its network predicts, have the published number of tokens. Nothing is downloaded.
 
     Args:
         recipe: see there.
@@ -83,17 +93,31 @@ def stand_in_config(
         sizes = None if tiny else PUBLISHED_SMOLVLM
         vlm = tiny_models.write_tiny_smolvlm(folder / "vlm", sizes=sizes)
         changes |= {"vlm_model_name": str(vlm)}
-    elif kind in PI0_FAMILY:
+    elif kind in ("pi0", "pi05"):
         tokenizer = tiny_models.write_tiny_tokenizer(folder / "tokenizer")
         changes |= tiny_models.TINY_POLICY if tiny else {}
-    if kind == "pi0_fast":
-        actions = tiny_models.write_tiny_fast_tokenizer(folder / "action_tokenizer")
-        changes |= {"text_tokenizer_name": str(tokenizer), "action_tokenizer_name": str(actions)}
-        changes |= {"validate_action_token_prefix": False}  # random weights do not write `Action:`
-        changes.pop("num_inference_steps", None)
+    elif kind == "pi0_fast":
+        tokenizer, own = _fast_tokenizers(folder, tiny=tiny)
+        changes |= own
     base = recipe.base_checkpoint
     changed = FinetuneRecipe(type=kind, policy={**recipe.policy, **changes}, base_checkpoint=base)
     return assumed_config(changed), tokenizer
+
+
+def _fast_tokenizers(folder: Path, *, tiny: bool) -> tuple[Path, dict[str, Any]]:
+    """Write the two tokenizers of π0-FAST; return the text's, and the fields of the configuration."""
+    n_text, n_actions = (tiny_models.VOCABULARY, None) if tiny else (PALIGEMMA_TOKENS, FAST_TOKENS)
+    text = tiny_models.write_tiny_tokenizer(folder / "tokenizer", n_tokens=n_text)
+    actions = tiny_models.write_tiny_fast_tokenizer(
+        folder / "action_tokenizer", n_tokens=n_actions, min_token=FAST_MIN_TOKEN
+    )
+    changes: dict[str, Any] = {"text_tokenizer_name": str(text), "action_tokenizer_name": str(actions)}
+    changes["validate_action_token_prefix"] = False  # random weights do not write `Action:`
+    changes["max_decoding_steps"] = TINY_DECODING_STEPS if tiny else DECODING_STEPS
+    if tiny:
+        changes |= tiny_models.TINY_POLICY
+        del changes["num_inference_steps"]  # it denoises nothing
+    return text, changes
 
 
 @contextlib.contextmanager

@@ -137,17 +137,12 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
         batches: also measure inferences per second of so many episodes in one forward pass.
 
     Raises:
-        CheckpointError: the folder exists, memory is too small, or there is no stand-in for a tokenizer.
+        CheckpointError: the folder exists, or memory is too small.
         RecipeError: the recipe has nothing to train.
     """
     if options.folder.exists():
         raise CheckpointError(f"{options.folder} exists already. Name another folder with --out.")
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
-    if recipe.type == "pi0_fast":
-        raise CheckpointError(
-            f"{name}: π0-FAST turns tokens into actions with the published tokenizers, for which there is "
-            "no stand-in of that size. Fetch the base, and run `mikasa-vla checkpoint verify` on it."
-        )
     before = peak_rss_bytes()
     options.folder.mkdir(parents=True)
     try:

@@ -6,6 +6,7 @@ is being made. Nothing on disk is changed. The results of such a model say nothi
 
 import contextlib
 import importlib
+import json
 from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -93,18 +94,30 @@ def tiny_resnet() -> Iterator[None]:
         yield
 
 
-def write_tiny_tokenizer(folder: Path) -> Path:
-    """Train a tokenizer on three sentences, save it, and return its folder."""
-    _tokenizer({}).save_pretrained(str(folder))
+def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
+    """Train a tokenizer on three sentences, save it, and return its folder.
+
+    Args:
+        folder: where.
+        n_tokens: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
+    """
+    _tokenizer({}, n_tokens=n_tokens).save_pretrained(str(folder))
     return folder
 
 
-def write_tiny_fast_tokenizer(folder: Path) -> Path:
-    """Make an action tokenizer in which each byte is a token, save it, and return its folder."""
+def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_token: int = -60) -> Path:
+    """Make an action tokenizer in which each byte is a token, save it, and return its folder.
+
+    Args:
+        folder: where.
+        n_tokens: as for `write_tiny_tokenizer`.
+        min_token: the coefficient whose character is 0.
+    """
     from vla_eval.policies.fast_tokens import FastActionTokenizer
 
     folder.mkdir()
-    FastActionTokenizer(_tokenizer({}), scale=10.0, min_token=-60).save_pretrained(folder)
+    made = FastActionTokenizer(_tokenizer({}, n_tokens=n_tokens), scale=10.0, min_token=min_token)
+    made.save_pretrained(folder)
     return folder
 
 
@@ -142,7 +155,7 @@ def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] |
     return folder
 
 
-def _tokenizer(named: Mapping[str, str]) -> Any:
+def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast
 
@@ -156,6 +169,8 @@ def _tokenizer(named: Mapping[str, str]) -> Any:
         show_progress=False,
     )
     tokenizer.train_from_iterator(CORPUS, trainer)
+    if n_tokens is not None:
+        tokenizer.model = _with_more_tokens(tokenizer, n_tokens)
     make_fast: Any = PreTrainedTokenizerFast
     extra = {"extra_special_tokens": dict(named)} if named else {}
     return make_fast(
@@ -167,6 +182,20 @@ def _tokenizer(named: Mapping[str, str]) -> Any:
         padding_side="right",
         **extra,
     )
+
+
+def _with_more_tokens(tokenizer: Any, n_tokens: int) -> Any:
+    """Return the model of a tokenizer with so many tokens in its vocabulary.
+
+    Not by `add_tokens`: a search over 250,000 added tokens takes minutes to build.
+    """
+    from tokenizers import models
+
+    model = json.loads(tokenizer.to_str())["model"]
+    vocabulary = model["vocab"] | {f"<{index}>": index for index in range(len(model["vocab"]), n_tokens)}
+    merges = [tuple(pair) for pair in model["merges"]]
+    make_model: Any = models.BPE
+    return make_model(vocab=vocabulary, merges=merges, unk_token=model["unk_token"])
 
 
 def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any) -> LeRobotPolicy:
