@@ -23,7 +23,7 @@ from vla_eval.config.prompts import DEFAULT_PROMPT_SET
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 ROOT = Path(__file__).parents[1]
-RECIPE_FOLDERS = ("configs", "policies", "datasets", "prompts")
+RECIPE_FOLDERS = ("configs", "policies", "datasets", "prompts", "protocols")
 HELP_COLUMNS = "82"  # what the column of a page shows without scrolling
 
 

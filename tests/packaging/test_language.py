@@ -17,7 +17,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
-RECIPES = ("configs", "datasets", "policies", "prompts")
+RECIPES = ("configs", "datasets", "policies", "prompts", "protocols")
 """Their YAML files are not read: a digest of their bytes stands in every `run.json`, comments included."""
 
 SAY_INSTEAD = {

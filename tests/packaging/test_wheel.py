@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("configs", "policies", "prompts", "datasets")
+FOLDERS = ("configs", "policies", "prompts", "datasets", "protocols")
 
 LIST_RECIPES = """
 import json, vla_eval, vla_eval.config.files as recipes

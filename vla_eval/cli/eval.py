@@ -24,6 +24,7 @@ from vla_eval.cli.output import add_table_arguments
 from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
+from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
 from vla_eval.policies.recipe import policy_name
@@ -33,11 +34,13 @@ from vla_eval.workers.needed import Needed
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
 CONFIG is a file, or the name of one in configs/ (`mikasa-vla list configs`). Without it, name at least
-one --task and one --policy. Flags go on top of the file, --set on top of flags. The same command again
-resumes where it stopped, and retries episodes that ended in an error."""
+one --task (or a --protocol) and one --policy. Flags go on top of the file, --set on top of flags. The same
+command again resumes where it stopped, and retries episodes that ended in an error."""
 EPILOG = """exit codes: 0 every episode has a result; 1 a mistake (see the message); 3 some episodes ended in
 an error (the same command retries them); 130, 143 stopped by Ctrl-C, SIGTERM."""
-RECIPE_FLAGS = ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "runs", "workers")
+RECIPE_FLAGS = (
+    *("tasks", "policies", "protocol", "n_action_steps", "episodes", "seed_start", "runs", "workers"),
+)
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -50,6 +53,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         epilog=EPILOG,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
+    parser.add_argument(
+        "--protocol",
+        metavar="NAME",
+        help="a published protocol (`mikasa-vla list protocols`): its tasks, seeds and runs, unless the file "
+        "or a flag sets others, and its summary figure below the table",
+    )
     _add_run_arguments(parser)
     _add_capture_arguments(parser)
     _add_table_arguments(parser)
@@ -226,15 +235,17 @@ def _config(args: argparse.Namespace) -> EvalConfig:
                 flag = f"--capture-{kind}"
                 set_field(EvalConfig, data, f"capture.{kind}", _which(which, flag=flag), where=flag)
         apply_overrides(data, args.overrides, cls=EvalConfig)
+        fill_from_protocol(data)
 
     if args.config is not None:
         return load_recipe("configs", args.config, EvalConfig, edit=edit).value
-    data: dict[str, Any] = {"name": "eval"}
+    data: dict[str, Any] = {"name": args.protocol or "eval"}
     edit(data)
     for flag, field in (("--task", "tasks"), ("--policy", "policies")):
         if field not in data:
             raise RecipeError(
-                f"Name a configuration (`mikasa-vla list configs`), or at least one --task and one --policy; "
-                f"{flag} is missing. Example: mikasa-vla eval --task RememberColor3-v0 --policy oracle"
+                "Name a configuration (`mikasa-vla list configs`), or at least one --task (or a --protocol) "
+                f"and one --policy; {flag} is missing. Example: mikasa-vla eval --task RememberColor3-v0 "
+                "--policy oracle"
             )
     return decode(EvalConfig, data, where="command line")

@@ -1,4 +1,4 @@
-"""`mikasa-vla list`: which tasks, families of tasks, policies, configs, prompts, datasets there are."""
+"""`mikasa-vla list`: which tasks, families, policies, configs, prompts, datasets, protocols there are."""
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,6 +9,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import instruction_for, load_prompts
+from vla_eval.config.protocol import Protocol
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
@@ -28,13 +29,15 @@ READY, TO_TRAIN, FROM_BASE = (
 REMOTE = "behind a socket: needs a server"
 FOR_TESTS, ADAPTERS = "for tests: tiny, with random weights", "adapters without a recipe of their own"
 TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
-RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe]
+RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe] | type[Protocol]
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
-        "list", help="list tasks, families, policies, configs, prompts, datasets", allow_abbrev=False
+        "list",
+        help="list tasks, families, policies, configs, prompts, datasets, protocols",
+        allow_abbrev=False,
     )
     parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
 
@@ -128,6 +131,10 @@ def _datasets() -> Groups:
     return _recipes("datasets", lambda _name: DatasetRecipe)
 
 
+def _protocols() -> Groups:
+    return _recipes("protocols", lambda _name: Protocol)
+
+
 def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> Groups:
     rows: list[Row] = []
     for name in list_recipes(folder):
@@ -150,4 +157,5 @@ _LISTS: dict[str, Callable[[], Groups]] = {
     "configs": _configs,
     "prompts": _prompts,
     "datasets": _datasets,
+    "protocols": _protocols,
 }

@@ -38,6 +38,7 @@ FINETUNE_FLAGS = {
     "overrides": "--set",
 }
 EVAL_FLAGS = {
+    "protocol": "--protocol",
     "dry_run": "--dry-run",
     "steps_per_second": "--steps-per-second",
     "inference_seconds": "--inference-seconds",

@@ -43,7 +43,7 @@ def print_table(
     """Print the table of all runs in the format that was asked for."""
     from vla_eval.results.report import build_table, render
 
-    table = build_table(runs, baseline=args.baseline)
+    table = build_table(runs, baseline=args.baseline, protocols=getattr(args, "protocols", ()))
     text = render(table, args.format, paper=args.paper, columns=columns, wide=args.wide, preset=args.preset)
     print(text)
     if args.format == "csv":  # has no place for them

@@ -33,6 +33,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
     add_table_arguments(parser)
     parser.add_argument(
+        "--protocol",
+        action="append",
+        default=[],
+        dest="protocols",
+        metavar="NAME",
+        help="also print the summary figure of this protocol (`mikasa-vla list protocols`); those that the "
+        "runs name are always printed",
+    )
+    parser.add_argument(
         "--columns",
         nargs="+",
         default=[],
@@ -72,7 +81,13 @@ def run(args: argparse.Namespace) -> int:
         from vla_eval.page.build import write_page
         from vla_eval.probe.page.sections import probe_sections
 
-        page = write_page(runs, args.html, baseline=args.baseline, probes=probe_sections(runs))
+        page = write_page(
+            runs,
+            args.html,
+            baseline=args.baseline,
+            probes=probe_sections(runs),
+            protocols=args.protocols,
+        )
         print(page)
     if args.filmstrip is not None:
         _write_filmstrips(runs, args.filmstrip)

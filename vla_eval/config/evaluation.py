@@ -50,6 +50,7 @@ class EvalConfig:
     tasks: tuple[str, ...]
     policies: tuple[str, ...]
     description: str = ""
+    protocol: str | None = None
     n_action_steps: tuple[int, ...] | None = None
     episodes: int = 100
     seed_start: int = 1
@@ -96,5 +97,7 @@ class EvalConfig:
             self.chunking.at(n_action_steps)  # checks the ranges
 
 
-OPTION_FIELDS = ("name", "description", "workers", "timeouts", "max_consecutive_errors", "capture")
+OPTION_FIELDS = (
+    *("name", "description", "protocol", "workers", "timeouts", "max_consecutive_errors", "capture"),
+)
 """Fields of `EvalConfig` that move no result: they may differ when a run is resumed."""

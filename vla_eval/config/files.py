@@ -1,7 +1,7 @@
 """Find, read strictly and hash the YAML recipes; turn them into frozen dataclasses.
 
-A recipe is a file in one of four folders: `configs/`, `policies/`, `prompts/`, `datasets/`. It is
-found by a given path, then in the working directory's folder, then among the ones that come with the
+A recipe is a file in one of five folders: `configs/`, `policies/`, `prompts/`, `datasets/`, `protocols/`. It
+is found by a given path, then in the working directory's folder, then among the ones that come with the
 package. Knows nothing of what the recipes mean.
 """
 
@@ -21,7 +21,7 @@ from vla_eval.config.yaml_data import MAX_CHARACTERS, load_yaml
 from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, unknown_name
 from vla_eval.record_rules import is_name
 
-Folder = Literal["configs", "policies", "prompts", "datasets"]
+Folder = Literal["configs", "policies", "prompts", "datasets", "protocols"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

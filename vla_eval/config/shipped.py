@@ -11,7 +11,7 @@ def search_folders(kind: str) -> tuple[Path, ...]:
     """Return the folders in which files of a kind are looked for, in this order: the user's, the package's.
 
     Args:
-        kind: name of the folder: `configs`, `policies`, `prompts`, `datasets` or `checkpoints`.
+        kind: name of the folder: `configs`, `policies`, `prompts`, `datasets`, `protocols` or `checkpoints`.
     """
     packaged = PACKAGE_ROOT / "recipes_data" / kind
     # An editable checkout has no recipes_data: these folders are beside the package.

@@ -107,6 +107,7 @@ class ModelTable:
         run_seeds: one fine-tuning each; the SEM is over them.
         episodes, seed_start: of each evaluation.
         controls: scripted policies beside the rows of a task, at each of their numbers of action steps.
+        protocol: the published protocol whose summary figure is printed below the table; None: none.
         simulator: what the evaluations run on.
         render, stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
@@ -123,6 +124,7 @@ class ModelTable:
     episodes: int = 100
     seed_start: int = 1
     controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
+    protocol: str | None = None
     simulator: Simulator = "maniskill"
     render: RenderSettings = field(default_factory=RenderSettings)
     stop_at_success: bool = False
@@ -288,6 +290,7 @@ def _evaluation(
         n_action_steps=n_action_steps,
         episodes=table.episodes,
         seed_start=table.seed_start,
+        protocol=table.protocol,
         simulator=table.simulator,
         render=table.render,
         stop_at_success=table.stop_at_success,

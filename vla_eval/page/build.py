@@ -33,6 +33,7 @@ def build_page(
     *,
     baseline: str | None = None,
     probes: Sequence[ProbeSection] = (),
+    protocols: Sequence[str] = (),
     folder: Path | None = None,
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
@@ -41,13 +42,14 @@ def build_page(
         runs: what the run folders hold. Timings and videos are read from the folders themselves.
         baseline: as for `build_table`.
         probes: those that the run folders are of.
+        protocols: as for `build_table`.
         folder: where the page will be, for links to captures; None: the current folder.
 
     Raises:
         ReportError: there is no episode yet.
-        UnknownNameError: there is no such baseline.
+        UnknownNameError: there is no such baseline or protocol.
     """
-    material = gather(runs, baseline=baseline)
+    material = gather(runs, baseline=baseline, protocols=protocols)
     chunks = rates.chunk_plots(material)
     templates = _templates()
     script = templates.get_template(SCRIPT).render()
@@ -63,6 +65,7 @@ def build_page(
         script_hash=_script_hash(script),
         n_open_matrices=N_OPEN_MATRICES,
         results=rates.results(material),
+        sides=rates.side_sections(material.table),
         success=rates.success_plots(material),
         chunks=chunks,
         sweep=rates.chunk_sweep(material) if chunks.charts else None,
@@ -84,6 +87,7 @@ def write_page(
     *,
     baseline: str | None = None,
     probes: Sequence[ProbeSection] = (),
+    protocols: Sequence[str] = (),
 ) -> Path:
     """Write the page and return its path.
 
@@ -92,12 +96,13 @@ def write_page(
         folder: created if it does not exist.
         baseline: as for `build_page`.
         probes: as for `build_page`.
+        protocols: as for `build_table`.
 
     Raises:
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(runs, baseline=baseline, probes=probes, folder=folder)
+    page = build_page(runs, baseline=baseline, probes=probes, protocols=protocols, folder=folder)
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)

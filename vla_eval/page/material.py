@@ -60,19 +60,20 @@ def key_of(row: Row) -> RowKey:
     return RowKey(row.task, row.policy, row.n_action_steps, row.variant)
 
 
-def gather(runs: Sequence[StoredRun], *, baseline: str | None) -> Material:
+def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequence[str] = ()) -> Material:
     """Read and compute everything that the page shows.
 
     Args:
         runs: what the run folders hold; a folder given twice counts once.
         baseline: as for `build_table`.
+        protocols: as for `build_table`.
 
     Raises:
         ReportError: there is no episode yet.
-        UnknownNameError: there is no such baseline.
+        UnknownNameError: there is no such baseline or protocol.
     """
     runs = tuple({run.path.resolve(): run for run in runs}.values())
-    table = build_table(runs, baseline=baseline)
+    table = build_table(runs, baseline=baseline, protocols=protocols)
     grouping = group_runs(runs)
     compared = compare_with_baselines(grouping.groups, table.baselines)
     groups = grouping.groups

@@ -21,7 +21,8 @@ from vla_eval.page.charts import (
 )
 from vla_eval.page.material import Material, key_of
 from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
-from vla_eval.results.success_table import Row
+from vla_eval.results.side_tables import SideTable, side_tables
+from vla_eval.results.success_table import Row, Table
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of
@@ -73,6 +74,29 @@ def results(material: Material) -> Results:
         ),
         wide=_layout_table(lay_out(material.table, wide=True), "Every column"),
     )
+
+
+class SideSection(NamedTuple):
+    """A table below the results: not of measured rows. Without rows it has notes only."""
+
+    title: str
+    table: PageTable | None
+    notes: tuple[str, ...]
+
+
+def side_sections(table: Table) -> tuple[SideSection, ...]:
+    """Return the tables that `mikasa-vla report` prints below the success table."""
+    return tuple(_side_section(side) for side in side_tables(table))
+
+
+def _side_section(side: SideTable) -> SideSection:
+    columns = (
+        Column(title, "number" if is_number else "text")
+        for title, is_number in zip(side.titles, side.is_number, strict=True)
+    )
+    rows = tuple(tuple(row) for row in side.rows)
+    table = PageTable(columns=tuple(columns), rows=rows, caption=side.title) if rows else None
+    return SideSection(side.title, table, tuple(side.notes))
 
 
 def _layout_table(layout: Layout, caption: str) -> PageTable:

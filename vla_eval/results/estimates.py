@@ -90,6 +90,25 @@ def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
     return Interval(float(found.low), float(found.high))
 
 
+def mean_interval(counts: Sequence[tuple[int, int]]) -> Interval:
+    """Return the interval of the mean of several independent proportions, at 95 %.
+
+    The squares of the distances from each rate to the end of its Wilson interval add up, as variances do.
+    The proportions are those asked for and no sample of others: the interval is over episodes alone.
+
+    Args:
+        counts: successes and episodes of each, at least one episode.
+
+    Source: Zou & Donner 2008, "Construction of confidence limits about effect measures: a general approach",
+    Statistics in Medicine 27(10):1693-1702, for a sum of two, here of any number of rates.
+    """
+    reaches = [_below_and_above(n_success, n_episodes) for n_success, n_episodes in counts]
+    mean = math.fsum(n_success / n_episodes for n_success, n_episodes in counts) / len(counts)
+    below = math.sqrt(math.fsum(reach.below**2 for reach in reaches)) / len(counts)
+    above = math.sqrt(math.fsum(reach.above**2 for reach in reaches)) / len(counts)
+    return Interval(max(0.0, mean - below), min(1.0, mean + above))
+
+
 def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
     """Return mean, SEM and 95 % t interval over independent runs.
 

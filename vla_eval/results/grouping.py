@@ -48,11 +48,13 @@ class Run:
         copy: 0, or 1, 2 … if further run folders hold the same episodes with other trajectories or other
             weights.
         records: seed -> record.
+        weights: digests of the policy's weights; none for a policy without weights.
     """
 
     index: int
     copy: int
     records: Mapping[int, EpisodeRecord]
+    weights: frozenset[str] = frozenset()
 
     @property
     def results(self) -> dict[int, EpisodeRecord]:
@@ -86,11 +88,13 @@ class Grouping:
         groups: by key.
         n_doubles: run folder -> number of its episodes that an earlier folder already had.
         further: run folders that hold the episodes of another folder with other trajectories or weights.
+        folders: by key: the run folders that hold episodes of the row.
     """
 
     groups: Mapping[RowKey, RowEpisodes]
     n_doubles: Mapping[str, int]
     further: tuple[str, ...]
+    folders: Mapping[RowKey, tuple[StoredRun, ...]]
 
 
 class _Copy(NamedTuple):
@@ -113,9 +117,12 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
     found: dict[RowKey, dict[int, list[_Copy]]] = defaultdict(lambda: defaultdict(list))
     n_doubles: dict[str, int] = defaultdict(int)
     further: dict[str, None] = {}
+    folders: dict[RowKey, list[StoredRun]] = defaultdict(list)
     for stored, label_of in zip(runs, labels, strict=True):
         for (key, index), records in _by_run(stored, label_of).items():
             copies = found[key][index]
+            if stored not in folders[key]:
+                folders[key].append(stored)
             n_copies = len(copies)
             n_new = _place(copies, _Copy(_weights(stored, key.policy, index), records))
             if n_new < len(records):
@@ -127,6 +134,7 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
         groups={group.key: group for group in _in_order(groups, runs)},
         n_doubles=dict(n_doubles),
         further=tuple(further),
+        folders={key: tuple(of_row) for key, of_row in folders.items()},
     )
 
 
@@ -156,7 +164,7 @@ def _weights(stored: StoredRun, policy: str, index: int) -> frozenset[str]:
 
 def _runs(by_index: Mapping[int, Sequence[_Copy]]) -> tuple[Run, ...]:
     return tuple(
-        Run(index=index, copy=number, records=copy.records)
+        Run(index=index, copy=number, records=copy.records, weights=copy.weights)
         for index, copies in sorted(by_index.items())
         for number, copy in enumerate(copies)
     )

@@ -23,6 +23,7 @@ from vla_eval.results.comparison import (
 )
 from vla_eval.results.estimates import chance_corrected
 from vla_eval.results.grouping import RowEpisodes, group_runs
+from vla_eval.results.protocol_summary import protocol_summaries
 from vla_eval.results.success_table import Row, RunRow, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
 from vla_eval.storage.run_folder import StoredRun
@@ -32,17 +33,20 @@ __all__ = ["DEFAULT_BASELINES", "FORMATS", "Format", "Row", "Table", "build_tabl
 DEFAULT_BASELINES = (CHANCE_POLICY, RANDOM_POLICY)
 
 
-def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Table:
+def build_table(
+    runs: Sequence[StoredRun], *, baseline: str | None = None, protocols: Sequence[str] = ()
+) -> Table:
     """Build one table of all episodes of the given runs.
 
     Args:
         runs: what the run folders hold; a folder given twice counts once.
         baseline: the policy with which all others are compared. By default `cue_blind` and `random`, as
             far as they were run.
+        protocols: names of protocols whose summary figures are added to those that the runs name.
 
     Raises:
         ReportError: there is no episode yet.
-        UnknownNameError: the requested baseline is not in the runs.
+        UnknownNameError: the requested baseline is not in the runs, or a requested protocol does not exist.
     """
     runs = list({run.path.resolve(): run for run in runs}.values())
     if not any(run.records for run in runs):
@@ -63,11 +67,13 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
         Row(**_cells(group, measured[key], around[key], [compared[name].get(key) for name in baselines]))
         for key, group in grouping.groups.items()
     ]
+    summaries = protocol_summaries(runs, grouping, names=protocols)
     table_notes = (
         *audit_notes(runs),
         *notes.row_notes(rows, chances),
         *notes.comparison_notes(rows, compared),
         *notes.run_notes(runs, grouping),
+        *summaries.notes,
     )
     return Table(
         rows=tuple(rows),
@@ -82,6 +88,7 @@ def build_table(runs: Sequence[StoredRun], *, baseline: str | None = None) -> Ta
         baselines=baselines,
         n_comparisons=sum(len(found) for found in compared.values()),
         runs={str(run.path): run.description.name for run in runs},
+        protocols=summaries.rows,
     )
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 IntervalKind = Literal["wilson", "t_over_runs"]
 ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
+SummaryInterval = Literal["wilson_over_tasks", "t_over_runs"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +101,41 @@ class RunRow(Row):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ProtocolRow:
+    """The summary figure of one policy at one K.
+
+    Attributes:
+        protocol, version: which protocol.
+        group: the part of its tasks that the figure is over; None: all.
+        policy, n_action_steps, variant: as in the success table.
+        n_tasks, n_runs: over how many tasks and runs the figure is.
+        mean: mean over the tasks of success once; over several runs the mean of the run means. None where
+            something departs from the protocol.
+        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
+        sem: standard error over the runs.
+        lowest, highest: of the tasks' rates.
+        departures: what is not as the protocol says.
+    """
+
+    protocol: str
+    version: int
+    group: str | None
+    policy: str
+    n_action_steps: int
+    variant: str | None
+    n_tasks: int
+    n_runs: int
+    mean: float | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    interval: SummaryInterval | None = None
+    sem: float | None = None
+    lowest: float | None = None
+    highest: float | None = None
+    departures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """Rows and their notes.
 
@@ -110,6 +146,7 @@ class Table:
         baselines: the policies with which the others are compared: one, two or none.
         n_comparisons: how many p values were corrected together.
         runs: run folder -> name of its configuration.
+        protocols: the summary figures of published protocols, as far as the runs name any.
     """
 
     rows: tuple[Row, ...]
@@ -118,6 +155,7 @@ class Table:
     baselines: tuple[str, ...]
     n_comparisons: int
     runs: Mapping[str, str]
+    protocols: tuple[ProtocolRow, ...] = ()
 
     def with_runs(self) -> tuple[Row, ...]:
         """Return the rows, each followed by its runs."""

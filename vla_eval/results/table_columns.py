@@ -119,14 +119,14 @@ def _columns(table: Table) -> list[Column]:
             lambda row: _difference(row.second_difference, row.second_p),
             rank=1,
         ),
-        Column("first_choice", "1st choice", lambda row: _rate(row.first_choice_success), rank=2),
+        Column("first_choice", "1st choice", lambda row: rate(row.first_choice_success), rank=2),
         Column("chose", "chose", lambda row: _number(row.n_chose), is_extra=True),
         Column("right_if_chose", "right if chose", _right_if_chose, is_extra=True),
         Column("chance", "chance", _chance, rank=3, folds=True),
-        Column("ceiling", "ceiling", lambda row: _rate(row.ceiling), rank=4, folds=True),
-        Column("corrected", "corrected", lambda row: _rate(row.chance_corrected), rank=5),
+        Column("ceiling", "ceiling", lambda row: rate(row.ceiling), rank=4, folds=True),
+        Column("corrected", "corrected", lambda row: rate(row.chance_corrected), rank=5),
         Column("steps", "steps", lambda row: _count(row.mean_success_step), rank=6),
-        Column("at_end", "at end", lambda row: _rate(row.success_at_end), rank=7),
+        Column("at_end", "at end", lambda row: rate(row.success_at_end), rank=7),
         Column("inferences", "infer.", lambda row: _count(row.inferences_per_episode), rank=8),
         Column("episodes", "episodes", _episodes, folds=True),
         Column("errors", "errors", lambda row: str(row.n_errors), folds=True),
@@ -140,7 +140,8 @@ def _policy(row: Row) -> str:
     return f"{row.policy}, run {row.run}{copy}"
 
 
-def _rate(value: float | None) -> str:
+def rate(value: float | None) -> str:
+    """Return a rate with two digits, or a dash."""
     return UNDEFINED if value is None else f"{value + 0.0:.2f}".replace("-0.00", "0.00")
 
 
@@ -154,7 +155,7 @@ def _number(value: int | None) -> str:
 
 def _right_if_chose(row: Row) -> str:
     share, low, high = row.right_if_chose, row.right_if_chose_low, row.right_if_chose_high
-    return _rate(share) if low is None else f"{_rate(share)} [{_rate(low)}, {_rate(high)}]"
+    return rate(share) if low is None else f"{rate(share)} [{rate(low)}, {rate(high)}]"
 
 
 def _episodes(row: Row) -> str:
@@ -165,7 +166,7 @@ def _success_once(row: Row) -> str:
     if row.success_once is None:
         return UNDEFINED
     sem = "" if row.sem is None else f" ± {row.sem:.2f}"
-    return f"{row.success_once:.2f}{sem} [{_rate(row.ci_low)}, {_rate(row.ci_high)}]"
+    return f"{row.success_once:.2f}{sem} [{rate(row.ci_low)}, {rate(row.ci_high)}]"
 
 
 def _difference(difference: float | None, p_value: float | None) -> str:
@@ -176,4 +177,4 @@ def _difference(difference: float | None, p_value: float | None) -> str:
 
 
 def _chance(row: Row) -> str:
-    return _rate(row.chance) + ("†" if row.chance_source in ("1/N", "catalogue") else "")
+    return rate(row.chance) + ("†" if row.chance_source in ("1/N", "catalogue") else "")

@@ -3,17 +3,16 @@
 import csv
 import io
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Literal, get_args
 
 from vla_eval.errors import ReportError, some_of
-from vla_eval.results import paper_table
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.latex import latex_table, latex_text
 from vla_eval.results.latex_preset import paper_preset
-from vla_eval.results.paper_table import PAPER_TABLE, PaperFigure
+from vla_eval.results.side_tables import SideTable, side_tables
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of
 
@@ -24,7 +23,6 @@ PRESETS: tuple[str, ...] = get_args(Preset)
 FOR_READING = ("markdown", "latex", "html-table")
 
 JSON_VERSION = 1
-PAPER_TITLE = f"The paper's figures, not measured here ({paper_table.PROTOCOL})"
 
 
 def render(
@@ -55,15 +53,15 @@ def render(
         ReportError: columns are selected for a format that has all of them, or a preset that it has not.
     """
     check_format(fmt, columns=columns, wide=wide, preset=preset, paper=paper)
-    figures = _paper_figures(table) if paper else None
+    sides = side_tables(table, paper=paper)
     if preset is not None:
         return paper_preset(table)
     if fmt == "csv":
-        return _csv(table, figures)
+        return _csv(table, sides)
     if fmt == "json":
-        return _json(table, figures)
+        return _json(table, sides)
     layout = lay_out(table, names=columns, wide=wide)
-    return {"markdown": _markdown, "latex": _latex, "html-table": _html}[fmt](table, layout, figures)
+    return {"markdown": _markdown, "latex": _latex, "html-table": _html}[fmt](table, layout, sides)
 
 
 def check_format(
@@ -84,25 +82,6 @@ def check_format(
         raise ReportError(f"{flag}: {fmt} has every column. Remove {flag}, or use {', '.join(FOR_READING)}.")
 
 
-def _paper_figures(table: Table) -> list[PaperFigure]:
-    tasks = dict.fromkeys(row.task for row in table.rows)
-    return [figure for task in tasks for figure in PAPER_TABLE if figure.task == task]
-
-
-def _paper_cells(figure: PaperFigure) -> list[str]:
-    return [
-        figure.task,
-        figure.model,
-        str(figure.n_action_steps),
-        f"{figure.success_once:.2f} ± {figure.sem:.2f}",
-    ]
-
-
-PAPER_TITLES = ["task", "model (paper)", "K", "success once (paper)"]
-PAPER_IS_NUMBER = [False, False, True, True]
-NOT_IN_PAPER = "The paper's table of VLA models has none of these tasks."
-
-
 def _notes(table: Table, layout: Layout) -> list[str]:
     """Return the notes of the table, and which columns it lacks."""
     if not layout.left_out:
@@ -121,19 +100,18 @@ def _is_number(layout: Layout) -> list[bool]:
 # ------------------------------------------------------------------------------------------ formats
 
 
-def _markdown(table: Table, layout: Layout, figures: Sequence[PaperFigure] | None) -> str:
+def _markdown(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     parts = []
     if layout.same:
         parts.append(sentence_of([(title, markdown_cell(cell)) for title, cell in layout.same]))
     parts.append(markdown_table(_titles(layout), layout.cells, _is_number(layout)))
     if notes := _notes(table, layout):
         parts.append("\n".join(f"- {markdown_text(note)}" for note in notes))
-    if figures:
-        parts.append(f"**{PAPER_TITLE}**")
-        parts.append(markdown_table(PAPER_TITLES, [_paper_cells(f) for f in figures], PAPER_IS_NUMBER))
-        parts.append(f"- Source: {paper_table.SOURCE}.")
-    elif figures is not None:
-        parts.append(NOT_IN_PAPER)
+    for side in sides:
+        if side.rows:
+            parts.append(f"**{markdown_text(side.title)}**")
+            parts.append(markdown_table(side.titles, side.rows, side.is_number))
+        parts.append("\n".join(f"- {markdown_text(note)}" for note in side.notes))
     return "\n\n".join(parts)
 
 
@@ -155,21 +133,26 @@ def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_numb
     return "\n".join(line(cells) for cells in (escaped[0], rule, *escaped[1:]))
 
 
-def _csv(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+def _csv(table: Table, sides: Sequence[SideTable]) -> str:
     names = [field.name for field in fields(Row)]
-    source = ["source"] if figures is not None else []  # a column, so that the two are never confused
+    source = ["source"] if sides else []  # a column, so that they are never confused
+    added = dict.fromkeys(name for side in sides for name in side.csv_columns)
     text = io.StringIO()
-    writer = csv.DictWriter(text, [*source, *names], restval="", extrasaction="ignore", lineterminator="\n")
+    columns = [*source, *names, *(name for name in added if name not in names)]
+    writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in table.rows:
-        cells = {name: csv_cell(value) for name, value in row.to_dict().items()}
-        writer.writerow({"source": "measured", **cells})
-    for figure in figures or ():
-        writer.writerow({"source": "paper", "policy": figure.model, **asdict(figure)})
+        writer.writerow({"source": "measured", **_csv_cells(row.to_dict())})
+    for side in sides:
+        writer.writerows(_csv_cells(line) for line in side.csv_rows)
     return text.getvalue().rstrip("\n")
 
 
-def _json(table: Table, figures: Sequence[PaperFigure] | None) -> str:
+def _csv_cells(values: Mapping[str, object]) -> dict[str, object]:
+    return {name: csv_cell(value) for name, value in values.items()}
+
+
+def _json(table: Table, sides: Sequence[SideTable]) -> str:
     data: dict[str, object] = {
         "format_version": JSON_VERSION,
         "confidence": CONFIDENCE,
@@ -181,42 +164,35 @@ def _json(table: Table, figures: Sequence[PaperFigure] | None) -> str:
         "run_rows": [row.to_dict() for row in table.run_rows],
         "notes": list(table.notes),
     }
-    if figures is not None:
-        data["paper"] = {
-            "source": paper_table.SOURCE,
-            "protocol": paper_table.PROTOCOL,
-            "rows": [asdict(figure) for figure in figures],
-        }
+    data |= {side.json_name: side.json_value for side in sides}
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
 
 
-def _latex(table: Table, layout: Layout, figures: Sequence[PaperFigure] | None) -> str:
+def _latex(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     lines = ["% needs \\usepackage{booktabs}"]
     if layout.same:
         lines.append(f"{{\\footnotesize {latex_text(sentence_of(layout.same))}\\par}}\\smallskip")
     by_task = layout.columns[0].name == "task"
     lines += latex_table(_titles(layout), layout.cells, _is_number(layout), ruled_by_first=by_task)
     lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in _notes(table, layout)]
-    if figures:
-        lines += ["", f"\\par\\medskip\\textbf{{{latex_text(PAPER_TITLE)}}}\\par\\smallskip"]
-        rows = [_paper_cells(figure) for figure in figures]
-        lines += latex_table(PAPER_TITLES, rows, PAPER_IS_NUMBER, ruled_by_first=True)
-        lines.append(f"\\par\\smallskip{{\\footnotesize Source: {latex_text(paper_table.SOURCE)}.\\par}}")
-    elif figures is not None:
-        lines.append(f"\\par\\smallskip{{\\footnotesize {NOT_IN_PAPER}\\par}}")
+    for side in sides:
+        if side.rows:
+            lines += ["", f"\\par\\medskip\\textbf{{{latex_text(side.title)}}}\\par\\smallskip"]
+            lines += latex_table(side.titles, side.rows, side.is_number, ruled_by_first=side.ruled_by_first)
+        lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in side.notes]
     return "\n".join(lines)
 
 
-def _html(table: Table, layout: Layout, figures: Sequence[PaperFigure] | None) -> str:
+def _html(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     parts = [f"<p>{html_text(sentence_of(layout.same))}</p>"] if layout.same else []
     parts.append(html_table(_titles(layout), layout.cells, _is_number(layout)))
-    notes = _notes(table, layout)
-    if figures:
-        rows = [_paper_cells(figure) for figure in figures]
-        parts += [f"<p>{html_text(PAPER_TITLE)}</p>", html_table(PAPER_TITLES, rows, PAPER_IS_NUMBER)]
-        notes.append(f"Source: {paper_table.SOURCE}.")
-    elif figures is not None:
-        notes.append(NOT_IN_PAPER)
-    if notes:
-        parts.append("\n".join(["<ul>", *(f"<li>{html_text(note)}</li>" for note in notes), "</ul>"]))
+    parts += _html_notes(_notes(table, layout))
+    for side in sides:
+        if side.rows:
+            parts += [f"<p>{html_text(side.title)}</p>", html_table(side.titles, side.rows, side.is_number)]
+        parts += _html_notes(side.notes)
     return "\n".join(parts)
+
+
+def _html_notes(notes: Sequence[str]) -> list[str]:
+    return ["\n".join(["<ul>", *(f"<li>{html_text(note)}</li>" for note in notes), "</ul>"])] if notes else []

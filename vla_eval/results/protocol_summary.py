@@ -1,0 +1,229 @@
+"""The summary figure of a published protocol, for each policy, and what departs from the protocol.
+
+A figure is given only where nothing departs. Reads and returns; changes nothing.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import to_data
+from vla_eval.config.protocol import Protocol, load_protocol
+from vla_eval.errors import RecipeError, UnknownNameError, some_of
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import Interval, estimate_runs, mean_interval
+from vla_eval.results.grouping import TASK_VERSIONS, VARIANT_FIELDS, Grouping, RowEpisodes, Run
+from vla_eval.results.success_table import ProtocolRow, SummaryInterval
+from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_folder import StoredRun
+
+RunKey = tuple[int, int]
+"""Index and copy of a run."""
+
+
+class _Label(NamedTuple):
+    """The key that rows of one policy on several tasks share."""
+
+    policy: str
+    n_action_steps: int
+    variant: str | None
+
+
+class Summaries(NamedTuple):
+    """Summary figures of one or more protocols, and notes on them."""
+
+    rows: tuple[ProtocolRow, ...]
+    notes: tuple[str, ...]
+
+
+def protocol_summaries(runs: Sequence[StoredRun], grouping: Grouping, *, names: Sequence[str]) -> Summaries:
+    """Return the summary figures of the protocols that are asked for, and of those that the runs name.
+
+    Raises:
+        UnknownNameError, RecipeError: a protocol that is asked for does not exist, or cannot be read.
+    """
+    wanted = {name: load_protocol(name).value for name in names}
+    notes = []
+    for name in dict.fromkeys(name for run in runs if (name := named_protocol(run)) is not None):
+        if name in wanted:
+            continue
+        try:
+            wanted[name] = load_protocol(name).value
+        except (UnknownNameError, RecipeError) as exc:  # the table itself needs no protocol
+            notes.append(f"no summary figure of the protocol {name}, which the runs name: {exc}")
+    rows = tuple(row for protocol in wanted.values() for row in summarize(protocol, grouping))
+    return Summaries(rows, tuple(notes))
+
+
+def named_protocol(run: StoredRun) -> str | None:
+    """Return the protocol that a run was started or last resumed under; None without one."""
+    options = run.sessions[-1].options if run.sessions else run.description.options
+    name = options.get("protocol")
+    return name if isinstance(name, str) else None
+
+
+def summarize(protocol: Protocol, grouping: Grouping) -> tuple[ProtocolRow, ...]:
+    """Return the summary figures of a protocol for all policies that were run on any of its tasks.
+
+    Args:
+        protocol: whose figure.
+        grouping: all episodes of the table.
+    """
+    by_label: dict[_Label, dict[str, RowEpisodes]] = {}
+    for key, group in grouping.groups.items():
+        if key.task in protocol.tasks:
+            label = _Label(key.policy, key.n_action_steps, key.variant)
+            by_label.setdefault(label, {})[key.task] = group
+    parts: list[tuple[str | None, tuple[str, ...]]] = [*protocol.groups.items()]
+    parts = parts or [(None, tuple(protocol.tasks))]
+    return tuple(
+        _row(protocol, part, label, {task: found[task] for task in tasks if task in found}, tasks, grouping)
+        for label, found in by_label.items()
+        for part, tasks in parts
+        if any(task in found for task in tasks)
+    )
+
+
+def _row(
+    protocol: Protocol,
+    part: str | None,
+    label: _Label,
+    found: Mapping[str, RowEpisodes],
+    tasks: Sequence[str],
+    grouping: Grouping,
+) -> ProtocolRow:
+    departures = (
+        *_departures(protocol, label, found, tasks),
+        *_setting_departures(protocol, found, grouping),
+    )
+    row = ProtocolRow(
+        protocol=protocol.name,
+        version=protocol.version,
+        group=part,
+        **label._asdict(),
+        n_tasks=len(found),
+        n_runs=max(len(group.runs) for group in found.values()),
+        departures=departures,
+    )
+    return row if departures else _with_figure(row, list(found.values()))
+
+
+def _with_figure(row: ProtocolRow, groups: Sequence[RowEpisodes]) -> ProtocolRow:
+    """Return the row with its figure; every task has the same runs and seeds."""
+    keys = [_key(run) for run in groups[0].runs]
+    rates = [{_key(run): _rate(run) for run in group.runs} for group in groups]
+    means = [math.fsum(rate[key] for rate in rates) / len(rates) for key in keys]
+    estimate = estimate_runs(means)
+    assert estimate is not None  # no departure: each task has a run
+    kind: SummaryInterval = "t_over_runs" if estimate.sem else "wilson_over_tasks"
+    interval = estimate.interval if kind == "t_over_runs" else _over_tasks(groups)
+    assert interval is not None
+    of_tasks = [math.fsum(rate.values()) / len(rate) for rate in rates]
+    return replace(
+        row,
+        mean=estimate.mean,
+        ci_low=interval.low,
+        ci_high=interval.high,
+        interval=kind,
+        sem=estimate.sem,
+        lowest=min(of_tasks),
+        highest=max(of_tasks),
+    )
+
+
+def _over_tasks(groups: Sequence[RowEpisodes]) -> Interval:
+    """Return the interval from the episodes of one run of each task."""
+    counts = []
+    for group in groups:
+        records = group.runs[0].results.values()
+        counts.append((sum(_once(record) for record in records), len(records)))
+    return mean_interval(counts)
+
+
+def _departures(
+    protocol: Protocol, label: _Label, found: Mapping[str, RowEpisodes], tasks: Sequence[str]
+) -> Iterator[str]:
+    """Yield what is missing or too much of tasks, K, runs and seeds."""
+    absent = [task for task in tasks if task not in found]
+    if absent:
+        yield f"{len(found)} of {len(tasks)} tasks, without {some_of(absent)}"
+    allowed = protocol.n_action_steps
+    if allowed is not None and label.n_action_steps not in allowed:
+        yield f"K={label.n_action_steps} instead of {some_of(allowed)}"
+    yield from _run_departures(protocol, found)
+    seeds: dict[str, list[str]] = {}
+    for task, group in found.items():
+        for text in _seed_departures(protocol, group):
+            seeds.setdefault(text, []).append(task)
+    for text, places in seeds.items():
+        yield text if len(places) == len(found) else f"{text} in {some_of(places)}"
+
+
+def _run_departures(protocol: Protocol, found: Mapping[str, RowEpisodes]) -> Iterator[str]:
+    runs_of = {task: {_key(run) for run in group.runs} for task, group in found.items()}
+    counts = sorted({len(runs) for runs in runs_of.values()})
+    if protocol.runs is not None and counts != [protocol.runs]:
+        yield f"{some_of(counts)} of {protocol.runs} runs"
+    elif len({frozenset(runs) for runs in runs_of.values()}) > 1:
+        yield "other runs in one task than in another"
+    if protocol.runs is not None and any(_shares_weights(group) for group in found.values()):
+        yield f"the same weights in several runs instead of {protocol.runs} training runs"
+
+
+def _shares_weights(group: RowEpisodes) -> bool:
+    weights = [run.weights for run in group.runs if run.weights]
+    return len(set(weights)) < len(weights)
+
+
+def _seed_departures(protocol: Protocol, group: RowEpisodes) -> Iterator[str]:
+    wanted = set(protocol.seeds)
+    n_errors, fewest, n_others = group.n_errors, len(wanted), 0
+    for run in group.runs:
+        fewest = min(fewest, len(wanted & run.results.keys()))
+        n_others = max(n_others, len(run.results.keys() - wanted))
+    if fewest < len(wanted):
+        errors = f" ({n_errors} errors)" if n_errors else ""
+        yield f"{fewest} of {len(wanted)} seeds{errors}"
+    if n_others:
+        yield f"{n_others} seeds outside of {protocol.seeds[0]} to {protocol.seeds[-1]}"
+
+
+def _setting_departures(
+    protocol: Protocol, found: Mapping[str, RowEpisodes], grouping: Grouping
+) -> Iterator[str]:
+    """Yield the settings and task versions that are not the protocol's, as the run folders have them."""
+    texts: dict[str, None] = {}
+    for task, group in found.items():
+        for run in grouping.folders[group.key]:
+            texts.update(dict.fromkeys(_settings(protocol, run)))
+            versions = run.description.config.get(TASK_VERSIONS)
+            version = versions.get(task) if isinstance(versions, Mapping) else None
+            if version != protocol.tasks[task]:
+                known = "unknown version" if version is None else f"version {version}"
+                texts[f"{task} of {known} instead of {protocol.tasks[task]}"] = None
+    yield from texts
+
+
+def _settings(protocol: Protocol, run: StoredRun) -> Iterator[str]:
+    defaults = to_data(EvalConfig(name="defaults", tasks=("any",), policies=("any",)))
+    config = run.description.config
+    expected = dict(leaves({name: defaults[name] for name in VARIANT_FIELDS}, prefix=""))
+    # A field that a run does not name had its default in the version that wrote it.
+    own = dict(leaves({name: config[name] for name in VARIANT_FIELDS if name in config}, prefix=""))
+    for path, text in own.items():
+        if text != expected.get(path) and not protocol.is_free(path):
+            yield f"{path}={text.strip('"')}"
+
+
+def _key(run: Run) -> RunKey:
+    return run.index, run.copy
+
+
+def _rate(run: Run) -> float:
+    return sum(_once(record) for record in run.results.values()) / len(run.results)
+
+
+def _once(record: EpisodeRecord) -> bool:
+    return record.outcome == "success"
