@@ -14,6 +14,9 @@ Change = Mapping[str, Any]
 
 LORA = LoraRecipe(rank=16)
 RECIPES: tuple[tuple[str, str, Change], ...] = (
+    ("act", "", {}),
+    ("diffusion", "", {}),
+    ("memory", "", {}),
     ("octo_small", "", {}),
     ("octo_small", "full", {"policy": {"trained": "all"}}),
     ("octo_base", "", {}),

@@ -17,7 +17,8 @@ import pytest
 
 from tests.testing.published_originals import write_octo, write_openvla, write_spatialvla
 from vla_eval.policies.checkpoint import WEIGHTS_FILE
-from vla_eval.testing.rehearsal import EXTRA_BYTES, EXTRA_SHARE, RehearsalOptions, rehearse
+from vla_eval.testing.rehearsal import RehearsalOptions, rehearse
+from vla_eval.testing.rehearsed import limit_bytes
 
 pytestmark = pytest.mark.full_size
 GEMMA_EMBEDDINGS = 257_152 * 2_048  # lerobot's π0 family has them twice, a published file once
@@ -64,7 +65,7 @@ CONVERSIONS: tuple[tuple[str, Callable[[Path], None], tuple[str, ...]], ...] = (
 MEASURED = """
 import sys
 from vla_eval.cli.main import main
-from vla_eval.testing.rehearsal import peak_rss_bytes
+from vla_eval.testing.process_memory import peak_rss_bytes
 assert main(["checkpoint", *sys.argv[1:]]) == 0
 print(peak_rss_bytes())
 """
@@ -86,7 +87,7 @@ def test_a_published_checkpoint_of_full_size_is_converted_within_its_memory(
     seconds = time.perf_counter() - started
     assert done.returncode == 0, done.stderr
     n_bytes = (out / WEIGHTS_FILE).stat().st_size
-    limit, peak = int(EXTRA_SHARE * n_bytes + EXTRA_BYTES), int(done.stdout.splitlines()[-1])
+    limit, peak = limit_bytes(n_bytes), int(done.stdout.splitlines()[-1])
     if TABLE in os.environ:
         found = {"converted": name, "bytes": n_bytes, "seconds": seconds, "peak_rss_bytes": peak}
         with Path(os.environ[TABLE]).open("a", encoding="utf-8") as file:

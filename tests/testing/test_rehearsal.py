@@ -47,6 +47,12 @@ def test_a_tiny_recipe_is_written_loaded_and_acts(recipe: str, tiny: bool, tmp_p
     assert found.parameters * BYTES_PER_NUMBER <= found.bytes + header
     assert found.bytes <= found.parameters * BYTES_PER_NUMBER + header
     assert set(found.peak_rss_bytes) == {"write", "load", "act"} and min(found.peak_rss_bytes.values()) > 0
+    before = found.estimated  # by a network without memory, with adapters where the recipe has them
+    assert (before.parameters, before.trained) == (found.parameters, found.trained)
+    assert 0 <= found.bytes - before.bytes <= header
+    assert before.peak_rss_bytes["load"] == found.before_bytes + before.bytes
+    assert before.peak_rss_bytes["load"] < before.peak_rss_bytes["act"] < 2 * before.peak_rss_bytes["load"]
+    assert f"of which the recipe trains {found.trained:,} (estimated {found.trained:,})" in found.lines()[1]
     assert set(found.seconds) == {"write", "load", "first_inference", "second_inference"}
 
 
@@ -73,6 +79,10 @@ def test_a_checkpoint_that_is_there_is_loaded_and_stays(tmp_path: Path) -> None:
     found = rehearse_checkpoint(folder, options)
     assert found.parameters == sum(x.numel() for x in policy.parameters()) and found.trained is None
     assert set(found.seconds) == {"load", "first_inference", "second_inference"}
+    assert found.estimated.parameters == found.parameters and set(found.estimated.peak_rss_bytes) == {
+        "load",
+        "act",
+    }
     assert "written" not in "\n".join(found.lines())
     assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
     assert not options.folder.exists()

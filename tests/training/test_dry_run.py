@@ -16,7 +16,7 @@ from vla_eval.training.dry_run import DryRunOptions, assumed_config, describe_fi
 from vla_eval.training.estimate import ASSUMED_STEPS, RateWatch, estimate, unfilled_model
 from vla_eval.training.finetune import finetune
 from vla_eval.training.job import load_finetune_recipe
-from vla_eval.training.sample_cost import SAVED_PER_LINEAR, sample_cost
+from vla_eval.training.sample_cost import SAVED_PER_LINEAR, count, sample_cost
 
 offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own
 GEMMA_EMBEDDINGS = 257_152 * 2_048
@@ -73,7 +73,33 @@ def test_operations_and_activations_are_those_of_the_layers_that_gradients_reach
     assert cost.step_operations == trunk + 3 * head  # forward; by weights and by inputs for the head alone
     kept, working = SAVED_PER_LINEAR * 2 * (20 + 30 + 30 + 7), tokens * (10 + 20)
     assert cost.saved_bytes == pytest.approx(4 * (kept + working))
-    assert sample_cost(Network(), SimpleNamespace(type="act")) is None
+    assert cost.inference_bytes == 4 * tokens * (10 + 20)  # no layer has more than one of these matrices
+    assert sample_cost(Network(), SimpleNamespace(type="groot")) is None
+
+
+def test_convolutions_and_attention_of_an_act_count_like_linear_layers() -> None:
+    images = {name: SimpleNamespace(shape=(3, 64, 96)) for name in ("base", "wrist")}
+    config: Any = SimpleNamespace(type="act", image_features=images, chunk_size=5)
+    resnet = nn.ModuleDict({"conv1": nn.Conv2d(3, 8, 7, stride=2), "layer2": nn.Conv2d(8, 16, 3, stride=2)})
+    encoder = nn.ModuleDict({"self_attn": nn.MultiheadAttention(16, 2), "linear1": nn.Linear(16, 32)})
+    counted = count(nn.ModuleDict({"model": nn.ModuleDict({"backbone": resnet, "encoder": encoder})}), config)
+    # Two images; the first convolution halves their edges, a second layer of ResNet has an eighth.
+    first, second = 2 * 32 * 48, 2 * 8 * 12
+    tokens = 2 * 2 * 3 + 2  # of a 32nd of the edges; the latent and the state
+    assert counted.forward == 2 * (
+        first * 3 * 8 * 7 * 7 + second * 8 * 16 * 3 * 3 + tokens * (16 * 48 + 16 * 16 + 16 * 32)
+    )
+    read_and_written = first * (4 * 3 + 8) + second * (4 * 8 + 16) + tokens * ((16 + 48) + 2 * 16 + (16 + 32))
+    assert counted.saved == read_and_written
+
+
+@pytest.mark.parametrize("policy", ["act", "diffusion", "memory"])
+def test_a_dry_run_estimates_the_batch_of_a_policy_from_scratch(
+    policy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policy", policy, "--dataset", "demos/RC3", "--device", "cpu", "--device-memory", "24GB"]
+    assert main(["finetune", *arguments, "--dry-run"]) == 0
+    assert "largest batch in 24 GB, estimated: " in capsys.readouterr().out
 
 
 def test_the_largest_batch_is_what_fits_beside_weights_gradients_and_optimizer() -> None:

@@ -142,7 +142,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
     config._save_pretrained(folder)
     own = contextlib.nullcontext() if tokenizer is None else tokenizer_from(str(tokenizer), config.type)
     with own, no_foreign_code(config.type):
-        processors = make_pre_post_processors(config, dataset_stats=_statistics(config))
+        processors = make_pre_post_processors(config, dataset_stats=plain_statistics(config))
     for processor in processors:
         processor.save_pretrained(folder)
     save_tokenizers(processors[0], folder)
@@ -182,7 +182,7 @@ def random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]
         yield torch.empty(n).normal_(0.0, SPREAD, generator=draws).to(tensor.dtype)
 
 
-def _statistics(config: Any) -> dict[str, dict[str, Any]]:
+def plain_statistics(config: Any) -> dict[str, dict[str, Any]]:
     """Return statistics that leave numbers about as they are."""
     values = {"mean": 0.0, "std": 1.0, "min": -1.0, "max": 1.0, "q01": -1.0, "q99": 1.0}
     shapes = {key: tuple(x.shape) for key, x in {**config.input_features, **config.output_features}.items()}

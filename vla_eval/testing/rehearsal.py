@@ -6,13 +6,10 @@ What is measured is memory, disk and time; the actions mean nothing. Weights are
 they are in memory once, when they are loaded.
 """
 
-import contextlib
-import math
-import resource
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
@@ -37,78 +34,17 @@ from vla_eval.policies.lerobot_loading import (
 )
 from vla_eval.policies.lerobot_types import history
 from vla_eval.policies.verify import random_batch
-from vla_eval.policies.weight_file import WeightFile
 from vla_eval.rollout import RolloutSettings, rollout
-from vla_eval.testing.random_checkpoint import TASK, built_tiny, stand_in_config, write_checkpoint
-from vla_eval.training.estimate import unfilled_model
+from vla_eval.testing.process_memory import available_bytes, peak_rss_bytes, reset_peak
+from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
+from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
+from vla_eval.training.description import describe_model
+from vla_eval.training.estimate import unfilled_model, with_adapters
 from vla_eval.training.job import load_finetune_recipe
+from vla_eval.training.sample_cost import sample_cost
 
 N_STEPS = 20
-EXTRA_SHARE, EXTRA_BYTES = 1.15, 2e9
-MEMINFO, CLEAR_REFS, STATUS = (Path("/proc") / name for name in ("meminfo", "self/clear_refs", "self/status"))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rehearsed:
-    """What was measured.
-
-    Attributes:
-        recipe, kind, dtype, device: what was rehearsed; a folder's path where it was a checkpoint.
-        parameters: of the model.
-        trained: what the recipe trains, adapters included; None for a checkpoint.
-        bytes: of the file of weights.
-        peak_rss_bytes: most memory of the process, by stage: `write` (a recipe's only), `load`, `act`.
-        peak_device_bytes: most memory on the GPU; None on a CPU.
-        seconds: by stage: `write` (a recipe's only), `load`, `first_inference`, `second_inference`.
-        inferences_per_second: episodes in a forward pass -> inferences; empty if it was not asked for.
-        before_bytes: memory of the process before anything was made: torch, transformers, lerobot.
-        limit_bytes: 1.15 × the weights + 2 GB, which loading and acting must keep.
-    """
-
-    recipe: str
-    kind: str
-    dtype: str
-    device: str
-    parameters: int
-    trained: int | None
-    bytes: int
-    peak_rss_bytes: dict[str, int]
-    peak_device_bytes: int | None
-    seconds: dict[str, float]
-    inferences_per_second: dict[int, float]
-    before_bytes: int
-    limit_bytes: int
-
-    @property
-    def is_within_limit(self) -> bool:
-        """Whether loading and acting took no more memory than allowed."""
-        return max(self.peak_rss_bytes["load"], self.peak_rss_bytes["act"]) <= self.limit_bytes
-
-    def lines(self) -> list[str]:
-        """Return lines for a person."""
-        peak, took = self.peak_rss_bytes, self.seconds
-        verdict = "within" if self.is_within_limit else "ABOVE"
-        on_device = "" if self.peak_device_bytes is None else f", on the device {_gb(self.peak_device_bytes)}"
-        title = f"{self.recipe} ({self.kind}, {self.dtype}, {self.device})"
-        parameters, on_disk = f"parameters   {self.parameters:,}", f"on disk      {_gb(self.bytes)}"
-        if self.trained is not None:
-            title += ": random weights: the actions mean nothing"
-            parameters += f", of which the recipe trains {self.trained:,}"
-            on_disk += f", written in {took['write']:.1f} s, peak memory {_gb(peak['write'])}"
-        return [
-            title,
-            parameters,
-            on_disk,
-            f"loading      {took['load']:.1f} s, peak memory {_gb(peak['load'])}{on_device}",
-            f"inference    first {took['first_inference']:.2f} s, second {took['second_inference']:.2f} s, "
-            f"peak memory {_gb(peak['act'])}",
-            f"limit        {_gb(self.limit_bytes)} = {EXTRA_SHARE} × weights + {_gb(EXTRA_BYTES)}: {verdict} "
-            f"it; {_gb(self.before_bytes)} were taken before anything was made",
-        ]
-
-    def data(self) -> dict[str, Any]:  # Any: plain data
-        """Return it as JSON holds it."""
-        return {**asdict(self), "is_within_limit": self.is_within_limit}
+GB = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,8 +106,8 @@ def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Seque
             f"mikasa-vla checkpoint merge {path} --out DIR"
         )
     config = read_config(folder, LoadOptions(device=options.device, dtype=options.dtype))
-    n_parameters = sum(x.numel() for x in WeightFile(folder / WEIGHTS_FILE).described().values())
-    written = _Written(n_parameters=n_parameters, trained=None, peaks={}, seconds={})
+    estimated = _estimate(make_unfilled_policy(config), config, before, trained=None)
+    written = _Written(recipe=None, peaks={}, seconds={}, estimated=estimated)
     return _measured(str(path), folder, config, options, written, before, batches)
 
 
@@ -179,19 +115,20 @@ def _rehearse(
     name: str, recipe: FinetuneRecipe, options: RehearsalOptions, before: int, batches: Sequence[int]
 ) -> Rehearsed:
     config, tokenizer = stand_in_config(recipe, options.folder, dtype=options.dtype, tiny=options.tiny)
-    trained = sum(x.numel() for x in unfilled_model(config, recipe).parameters() if x.requires_grad)
+    trained = describe_model(unfilled_model(config, recipe)).n_trained
     config.pretrained_path = None
     policy = make_unfilled_policy(config)
+    estimated = _estimate(policy, config, before, trained=trained)
     folder = options.folder / "model"
     folder.mkdir()
     reset_peak()
     started = time.perf_counter()
     write_checkpoint(folder, config, policy, tokenizer)
     written = _Written(
-        n_parameters=sum(x.numel() for x in policy.parameters()),
-        trained=trained,
+        recipe=recipe,
         seconds={"write": time.perf_counter() - started},
         peaks={"write": peak_rss_bytes()},
+        estimated=estimated,
     )
     del policy
     return _measured(name, folder, config, options, written, before, batches)
@@ -199,10 +136,10 @@ def _rehearse(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Written:
-    n_parameters: int
-    trained: int | None
+    recipe: FinetuneRecipe | None
     peaks: dict[str, int]
     seconds: dict[str, float]
+    estimated: Estimated
 
 
 def _measured(
@@ -215,16 +152,16 @@ def _measured(
     batches: Sequence[int],
 ) -> Rehearsed:
     n_bytes = (folder / WEIGHTS_FILE).stat().st_size
-    limit = int(EXTRA_SHARE * n_bytes + EXTRA_BYTES)
+    limit = limit_bytes(n_bytes)
     _check_memory(limit, options.device)
-    acted = _load_and_act(folder, config, options, batches)
+    acted = _load_and_act(folder, config, options, written.recipe, batches)
     return Rehearsed(
         recipe=name,
         kind=config.type,
         dtype=str(getattr(config, "dtype", "float32")),
         device=options.device,
-        parameters=written.n_parameters,
-        trained=written.trained,
+        parameters=acted.parameters,
+        trained=acted.trained,
         bytes=n_bytes,
         peak_rss_bytes={**written.peaks, **acted.peaks},
         peak_device_bytes=torch.cuda.max_memory_allocated() if options.device != "cpu" else None,
@@ -232,11 +169,43 @@ def _measured(
         inferences_per_second=acted.inferences_per_second,
         before_bytes=before,
         limit_bytes=limit,
+        estimated=written.estimated,
+    )
+
+
+def _estimate(policy: Any, config: Any, before: int, *, trained: int | None) -> Estimated:
+    """Estimate from shapes what is about to be measured.
+
+    While it writes, a process holds a part of the numbers, in float32 and in the file's type. Loaded, it
+    holds the weights. An inference adds what the largest layer reads and writes for one sample.
+
+    Args:
+        policy: its weights need no memory.
+        config: of the policy.
+        before: see `Rehearsed`.
+        trained: what the recipe trains; None: nothing is written.
+    """
+    weights = {id(x): x for x in policy.state_dict(keep_vars=True).values()}.values()
+    n_bytes = sum(x.numel() * x.element_size() for x in weights)
+    cost = sample_cost(policy, config)
+    acting = {} if cost is None else {"act": n_bytes + round(cost.inference_bytes)}
+    in_parts = PART * sum({torch.float32.itemsize, *(x.element_size() for x in weights)})
+    peaks = {"write": in_parts} if trained is not None else {}
+    if config.device == "cpu":
+        peaks |= {"load": n_bytes, **acting}
+    return Estimated(
+        parameters=sum(x.numel() for x in policy.parameters()),
+        trained=trained,
+        bytes=n_bytes,
+        peak_rss_bytes={stage: before + added for stage, added in peaks.items()},
+        peak_device_bytes=acting.get("act") if config.device != "cpu" else None,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Acted:
+    parameters: int
+    trained: int | None
     peaks: dict[str, int]
     seconds: dict[str, float]
     inferences_per_second: dict[int, float]
@@ -259,7 +228,13 @@ class _Timed:
         return chunk
 
 
-def _load_and_act(folder: Path, config: Any, options: RehearsalOptions, batches: Sequence[int]) -> _Acted:
+def _load_and_act(
+    folder: Path,
+    config: Any,
+    options: RehearsalOptions,
+    recipe: FinetuneRecipe | None,
+    batches: Sequence[int],
+) -> _Acted:
     """Load through the strict door of an evaluation, and run one episode on the fake simulator."""
     env = make_env(
         EnvSettings(
@@ -286,9 +261,22 @@ def _load_and_act(folder: Path, config: Any, options: RehearsalOptions, batches:
     assert record.error is None  # else it was raised
     peaks["act"] = peak_rss_bytes()
     seconds |= {"first_inference": timed.seconds[0], "second_inference": timed.seconds[1]}
-    del loaded, timed, policy
-    rates = _rates(folder, options.device, batches) if batches else {}
-    return _Acted(peaks=peaks, seconds=seconds, inferences_per_second=rates)
+    model = loaded._loaded.policy
+    n_parameters = sum(x.numel() for x in model.parameters())
+    trained = None if recipe is None else _n_trained(model, recipe)
+    del loaded, timed, policy, model
+    return _Acted(
+        parameters=n_parameters,
+        trained=trained,
+        peaks=peaks,
+        seconds=seconds,
+        inferences_per_second=_rates(folder, options.device, batches) if batches else {},
+    )
+
+
+def _n_trained(model: Any, recipe: FinetuneRecipe) -> int:
+    """Return how many parameters of a loaded model the recipe trains; its adapters get no memory."""
+    return sum(x.numel() for x in with_adapters(model, recipe).parameters() if x.requires_grad)
 
 
 @torch.no_grad()
@@ -313,31 +301,9 @@ def _cameras(config: Any) -> dict[str, str]:
 
 
 def _check_memory(limit: int, device: str) -> None:
-    if device != "cpu" or not MEMINFO.is_file():
-        return
-    fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
-    available = int(fields["MemAvailable"].split()[0]) * 1024
-    if available < limit:
+    available = available_bytes()
+    if device == "cpu" and available is not None and available < limit:
         raise CheckpointError(
-            f"expected {_gb(limit)} of memory for this model, found {_gb(available)} available. Close other "
-            "programs, or rehearse it on another machine."
+            f"expected {limit / GB:.1f} GB of memory for this model, found {available / GB:.1f} GB "
+            "available. Close other programs, or rehearse it on another machine."
         )
-
-
-def reset_peak() -> None:
-    """Let the peak of this process's memory begin from now, where the kernel can do that."""
-    with contextlib.suppress(OSError):  # the peak is then that since the start: higher, never lower
-        CLEAR_REFS.write_text("5")
-
-
-def peak_rss_bytes() -> int:
-    """Return the most memory that this process has had since `reset_peak`."""
-    if STATUS.is_file():
-        for line in STATUS.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def _gb(n_bytes: float) -> str:
-    return f"{n_bytes / 1e9:.{2 if n_bytes < 10e9 else 1}f} GB" if math.isfinite(n_bytes) else "—"

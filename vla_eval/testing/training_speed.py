@@ -13,7 +13,6 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_unfilled_policy, read_config
 from vla_eval.policies.lerobot_processors import load_processors
-from vla_eval.policies.lerobot_types import history
 from vla_eval.policies.verify import random_batch
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.estimate import estimate
@@ -64,7 +63,7 @@ def _measure(
         model = model.wrap_with_peft(peft_cli_overrides=asdict(adapters))
     model.train()
     before, _ = load_processors(model_folder, config, tokenizer=None)
-    batch = before(_samples(config, n_samples))
+    batch = before(random_samples(config, n_samples))
     trained = [x for x in model.parameters() if x.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=LEARNING_RATE)
     seconds = [_step(model, batch, optimizer, config, device) for _ in range(1 + n_steps)]
@@ -94,10 +93,10 @@ def _step(model: Any, batch: dict[str, Any], optimizer: Any, config: Any, device
     return time.perf_counter() - started
 
 
-def _samples(config: Any, n_samples: int) -> dict[str, Any]:
+def random_samples(config: Any, n_samples: int) -> dict[str, Any]:
     """Return random samples (B, …) with random chunks of actions."""
     draws = torch.Generator().manual_seed(0)
-    one = random_batch(config, history(config), draws)
+    one = random_batch(config, tuple(config.observation_delta_indices or ()), draws)
     batch: dict[str, Any] = {
         key: value.expand(n_samples, *value.shape[1:]).clone()
         if isinstance(value, Tensor)

@@ -91,11 +91,15 @@ def estimate(
 
 def unfilled_model(policy: Any, recipe: FinetuneRecipe) -> Any:
     """Return the model that a recipe trains, with adapters where it has LoRA, without memory for weights."""
-    model = make_unfilled_policy(policy)
+    return with_adapters(make_unfilled_policy(policy), recipe)
+
+
+def with_adapters(model: Any, recipe: FinetuneRecipe) -> Any:
+    """Return a model with adapters where the recipe has LoRA; they get no memory."""
     adapters = peft_config(recipe)
     if adapters is None:
         return model
-    policy.pretrained_path = Path(str(recipe.base_checkpoint))
+    model.config.pretrained_path = Path(str(recipe.base_checkpoint))
     with empty_weights(), torch.no_grad():
         return model.wrap_with_peft(peft_cli_overrides=asdict(adapters))
 
@@ -123,8 +127,8 @@ def estimate_lines(found: Estimate, *, device_bytes: float | None) -> Iterator[s
     )
     yield (
         f"assumptions: the rate; {KEPT_FREE:.0%} of the device kept free; activations from the shapes of "
-        "linear layers by a factor measured on single layers (vla_eval/training/sample_cost.py); loading, "
-        "decoding, attention scores and checkpoints not counted"
+        "layers by a measured factor (vla_eval/training/sample_cost.py); loading, decoding, attention scores "
+        "and checkpoints not counted"
     )
 
 

@@ -1,0 +1,30 @@
+"""The memory of this process and of its machine, as Linux states it. Knows nothing of policies."""
+
+import contextlib
+import resource
+from pathlib import Path
+
+MEMINFO, CLEAR_REFS, STATUS = (Path("/proc") / name for name in ("meminfo", "self/clear_refs", "self/status"))
+
+
+def reset_peak() -> None:
+    """Let the peak of this process's memory begin from now, where the kernel can do that."""
+    with contextlib.suppress(OSError):  # the peak is then that since the start: higher, never lower
+        CLEAR_REFS.write_text("5")
+
+
+def peak_rss_bytes() -> int:
+    """Return the most memory that this process has had since `reset_peak`."""
+    if STATUS.is_file():
+        for line in STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def available_bytes() -> int | None:
+    """Return how much memory programs can still take; None where the kernel does not say."""
+    if not MEMINFO.is_file():
+        return None
+    fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
+    return int(fields["MemAvailable"].split()[0]) * 1024
