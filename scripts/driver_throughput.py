@@ -26,6 +26,7 @@ from vla_eval.workers.cluster.backend import ClusterBackend
 from vla_eval.workers.cluster.connect import connected
 from vla_eval.workers.cluster.machines import Machine, Machines
 from vla_eval.workers.cluster.pool import ClusterPool
+from vla_eval.workers.load import Load
 
 WORKERS_PER_PROCESS = 256
 STEPS = 60
@@ -135,6 +136,9 @@ class Middle:
         self._n += 1
         if self._n in self._marks:
             self.seen.append((time.monotonic(), time.process_time(), self.stored))
+
+    def on_load(self, load: Load) -> None:
+        """Do nothing."""
 
     def on_tick(self) -> bool:
         """Do not stop."""

@@ -3,6 +3,8 @@
 import pytest
 
 from vla_eval.cli.episode_bar import EpisodeBar
+from vla_eval.cli.progress import load_text
+from vla_eval.workers.load import Load, MachineLoad
 
 
 class Clock:
@@ -65,6 +67,27 @@ def test_a_line_says_what_is_done_before_the_first_episode_ends_then_steps(
     clock.seconds += 60
     bar.tick()
     assert "2/5 episodes (1,260 control steps) after 1.5 min" in capsys.readouterr().err
+
+
+def test_steps_of_episodes_under_way_count_and_the_queue_is_at_the_end_of_the_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = Clock()
+    bar = EpisodeBar(clock=clock)
+    bar.begin(n_done=0, n_total=8)
+    bar.advance(n_done=1, n_steps=60, note="success 1.00, errors 0")
+    one = MachineLoad(
+        name="a", is_used=True, n_workers=2, n_running=2, n_done=1, per_second=0.1, n_gpus=1, gpu_share=0.5
+    )
+    load = Load(n_running=2, n_counted=25, machines=(one,))
+    bar.load(load_text(load, n_open=7), n_steps=load.n_counted)
+    clock.seconds += 30
+    bar.tick()
+    # 60 steps of the first episode and 25 of those under way; 2 of the 7 others are running.
+    told = capsys.readouterr().err
+    assert "1/8 episodes (85 control steps)" in told
+    assert told.endswith("success 1.00, errors 0, 1 machine, GPUs 50% busy, 5 episodes in the queue\n")
+    assert load_text(Load(n_running=2), n_open=7) == ""  # this machine alone
 
 
 def test_the_end_is_told_once_and_nothing_is_left(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, GroupKey, Plan
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.rollout import RolloutSettings
+from vla_eval.workers.load import Load, MachineLoad
 
 HORIZON_STEPS = 60
 
@@ -95,6 +96,37 @@ def test_an_episode_that_ends_early_leaves_fewer_steps_and_time_is_known_from_th
     assert (progress["steps_done"], progress["steps_total"]) == (20, 200)
     assert (progress["successes"], progress["errors"]) == (1, 0)
     assert (progress["elapsed_seconds"], progress["remaining_seconds"]) == (10.0, 30.0)
+
+
+def test_a_line_has_the_steps_under_way_the_queue_and_the_machines_of_a_cluster(tmp_path: Path) -> None:
+    reader = Reader()
+    lines = EvaluationLines(reader.lines, out=tmp_path)
+    lines.on_start(plan(4), n_finished=0, n_workers=2)
+    (begin,) = reader.read()
+    assert (begin["steps_running"], begin["queue"], begin["machines"]) == (None, None, None)
+
+    lines.on_record(record(0, n_steps=20))
+    lines.on_load(Load(n_running=2, n_counted=31))
+    reader.seconds = 2.0
+    lines.on_tick()
+    (progress,) = reader.read()
+    # Of 4 episodes one has a result and two are running.
+    assert (progress["steps_running"], progress["queue"], progress["machines"]) == (31, 1, None)
+
+    one = MachineLoad(
+        name="a", is_used=True, n_workers=1, n_running=1, n_done=1, per_second=0.5, n_gpus=1, gpu_share=0.25
+    )
+    lines.on_load(Load(n_running=1, machines=(one,)))
+    reader.seconds = 4.0
+    lines.on_tick()
+    (progress,) = reader.read()
+    assert (progress["steps_running"], progress["queue"]) == (None, 2)
+    assert progress["machines"] == [
+        {
+            **{"name": "a", "is_used": True, "n_workers": 1, "n_running": 1, "n_done": 1},
+            **{"per_second": 0.5, "n_gpus": 1, "gpu_share": 0.25},
+        }
+    ]
 
 
 def test_there_is_at_most_one_line_of_progress_per_second(tmp_path: Path) -> None:

@@ -10,8 +10,10 @@ from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
 from vla_eval.cli.main import main
 from vla_eval.errors import RunChangedError
-from vla_eval.evaluation.evaluate import default_run_folder
+from vla_eval.evaluation import evaluate as evaluate_module
+from vla_eval.evaluation.evaluate import default_run_folder, evaluate
 from vla_eval.storage.run_folder import read_run
+from vla_eval.workers.load import Load
 
 bench = evaluation_bench.bench
 
@@ -111,6 +113,24 @@ class TestSameness:
 
 
 # ------------------------------------------------------------------------------------------ resume
+
+
+def test_an_observer_is_given_the_steps_of_an_episode_while_it_runs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluate_module, "LOAD_SECONDS", 0.0)
+    bench.write_policy(pause=0.25)  # four inferences: a second, and five ticks of the pool
+    loads: list[Load] = []
+
+    class Observer(evaluate_module._Silence):
+        def on_load(self, load: Load) -> None:
+            loads.append(load)
+
+    evaluate(bench.config(episodes=1, n_action_steps=[3]), out=bench.folder / "out", observer=Observer())
+
+    counted = [load.n_counted for load in loads if load.n_running]
+    # Of its 12 steps, as many as there were by then.
+    assert 0 < max(counted) <= 12 and counted == sorted(counted)
 
 
 class TestResume:

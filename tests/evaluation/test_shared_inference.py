@@ -21,6 +21,7 @@ from vla_eval.evaluation.inference_choice import chosen_inference
 from vla_eval.evaluation.plan import Plan, make_plan, results_config
 from vla_eval.records import EpisodeRecord
 from vla_eval.workers import local
+from vla_eval.workers.load import Load
 
 # A recurrent network that infers for all rows of a pass at once: its bits depend on the size of a pass and on
 # the row, as those of any network do.
@@ -174,6 +175,9 @@ def test_a_server_that_dies_costs_errors_that_a_resume_heals(network: Bench) -> 
             for pid in network.worker_pids():
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
+
+        def on_load(self, load: Load) -> None:
+            pass
 
         def on_tick(self) -> bool:
             return False

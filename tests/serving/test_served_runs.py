@@ -12,6 +12,7 @@ from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord
+from vla_eval.workers.load import Load
 
 
 class StopsAfter:
@@ -31,6 +32,9 @@ class StopsAfter:
         if self._n_left == 0:
             self._server.stop()  # type: ignore[attr-defined]
             self._server.wait()  # type: ignore[attr-defined]
+
+    def on_load(self, load: Load) -> None:
+        pass
 
     def on_tick(self) -> bool:
         return False

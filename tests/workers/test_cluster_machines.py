@@ -142,7 +142,7 @@ class TestMachines:
         good, bad = found
         for _ in range(MAX_ERRORS_IN_A_ROW - 1):
             found.note_error(bad, "no memory")
-        found.note_answer(bad)
+        found.note_answer(bad, n_items=1)
         found.note_error(bad, "no memory")
         assert bad.is_usable  # not in a row
         for _ in range(MAX_ERRORS_IN_A_ROW - 1):
@@ -170,6 +170,32 @@ class TestMachines:
         found.look(at_once=True)
         assert "machine a" in lines[-1] and "is gone" in lines[-1]
         assert [machine.node for machine in found.usable] == ["b", "c"]
+
+    def test_progress_says_what_each_did_and_how_busy_its_gpus_are(
+        self, cluster: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        clock = SimpleNamespace(seconds=100.0)
+        monkeypatch.setattr(machines.time, "monotonic", lambda: clock.seconds)
+        found, ray, _ = cluster(a=HERE, b=HERE)
+        found.survey()
+        a, b = found
+        a.n_gpus, a.services = (
+            2,
+            [SimpleNamespace(busy_share=lambda share=share: share) for share in (0.4, 0.8)],
+        )
+        for machine in (a, b):  # the clock began with them
+            machine.seen_at = 100.0
+        a.n_used, clock.seconds = 1, 110.0
+        found.note_answer(a, n_items=5)
+
+        # 5 episodes in 10 seconds; of two servers, one is busy 40 % of the time and one 80 %.
+        assert [line.split("/", 1)[1].split(": ", 1)[1] for line in found.progress().split("; ")] == [
+            "1 worker, 5 done, 0.5 per second, GPU 60%",
+            "0 workers, 0 done, 0 per second",
+        ]
+        ray.gone.add("b")
+        found.look(at_once=True)
+        assert [load.n_done for load in found.loads()] == [5]
 
 
 class TestAddresses:

@@ -22,6 +22,7 @@ from vla_eval.workers.messages import Failed
 class Job:
     number: int
     setup_key: str = "a"
+    n_items: int = 1
 
 
 class Lost(Exception):
@@ -97,7 +98,7 @@ class OneMachine:
     def say(self, line: str) -> None:
         pass
 
-    note_error = note_answer = lambda *_: None
+    note_error = note_answer = lambda *_, **__: None
 
 
 def run(ray: StandIn, jobs: Sequence[Job], monkeypatch: pytest.MonkeyPatch) -> list[Answered[Job, Any]]:

@@ -14,6 +14,7 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.workers.cluster.backend import ClusterBackend
 from vla_eval.workers.cluster.connect import LOCAL_VARIABLES
 from vla_eval.workers.cluster.machines import Machines
+from vla_eval.workers.load import Load
 
 SMALL = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
@@ -91,6 +92,9 @@ class After:
         self.n_left -= 1
         if self.n_left == 0:
             self.do()
+
+    def on_load(self, load: Load) -> None:
+        pass
 
     def on_tick(self) -> bool:
         return False

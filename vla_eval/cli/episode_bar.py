@@ -23,14 +23,15 @@ class EpisodeBar:
         self._clock = clock
         self._is_quiet = is_quiet
         self._bar: tqdm[Any] | None = None
-        self._title = self._note = self._doing = ""
-        self._n_done = self._n_before = self._n_total = self._n_steps = 0
+        self._title = self._note = self._doing = self._load = ""
+        self._n_done = self._n_before = self._n_total = self._n_steps = self._n_running_steps = 0
         self._begun = self._last_line = clock()
 
     def begin(self, *, n_done: int, n_total: int, title: str = "") -> None:
         """Start a new count, of which `n_done` episodes are done already."""
         self.close()
-        self._title, self._note, self._doing, self._n_steps = title, "", "", 0
+        self._title, self._note, self._doing, self._load = title, "", "", ""
+        self._n_steps = self._n_running_steps = 0
         self._n_done = self._n_before = n_done
         self._n_total = n_total
         self._begun = self._last_line = self._clock()
@@ -57,7 +58,18 @@ class EpisodeBar:
         if self._bar is not None:
             self._bar.update(moved)
             if note:  # each postfix is a redraw, which a bar without one need not have
-                self._bar.set_postfix_str(note)
+                self._redraw()
+
+    def load(self, text: str, *, n_steps: int | None) -> None:
+        """Show what the workers are doing.
+
+        Args:
+            text: for a person; empty: nothing.
+            n_steps: control steps of the episodes under way; None: not known.
+        """
+        self._load, self._n_running_steps = text, n_steps or 0
+        if self._bar is not None and (self._n_done > self._n_before or n_steps):
+            self._redraw()
 
     def tick(self) -> None:
         """Write a line if it is time and there is no bar."""
@@ -80,12 +92,20 @@ class EpisodeBar:
             tqdm.write(text, file=sys.stderr)
             sys.stderr.flush()
 
+    def _redraw(self) -> None:
+        assert self._bar is not None  # the callers look
+        self._bar.set_postfix_str(", ".join(filter(None, (self._steps(), self._note, self._load))))
+
+    def _steps(self) -> str:
+        n_steps = self._n_steps + self._n_running_steps
+        return f"{n_steps:,} control steps" if n_steps else ""
+
     def _line(self) -> None:
         self._last_line = self._clock()
         minutes = (self._last_line - self._begun) / 60
         per_minute = (self._n_done - self._n_before) / max(minutes, 1e-9)
         n_left = self._n_total - self._n_done
-        steps = f" ({self._n_steps:,} control steps)" if self._n_steps else ""
+        steps = f" ({self._steps()})" if self._steps() else ""
         parts = [
             f"{self._n_done}/{self._n_total} episodes{steps} after {minutes:.1f} min",
             f"{per_minute:.1f} per minute",
@@ -95,6 +115,5 @@ class EpisodeBar:
         elif n_left:
             doing = [self._doing] if self._doing else []
             parts = [parts[0], *doing, "none has ended yet, so the remaining time is unknown"]
-        if self._note:
-            parts.append(self._note)
+        parts += filter(None, (self._note, self._load))
         self.write((f"{self._title}: " if self._title else "") + ", ".join(parts))

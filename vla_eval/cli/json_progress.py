@@ -8,6 +8,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from vla_eval.evaluation.dry_run import horizon_steps
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeKey, EpisodeRecord
 from vla_eval.storage.run_folder import read_run
+from vla_eval.workers.load import Load
 
 logger = logging.getLogger(__name__)
 
@@ -127,6 +129,9 @@ class EvaluationLines:
             successes=sum(bool(record.success_once) for record in records),
             errors=0,
             workers=n_workers,
+            steps_running=None,
+            queue=None,
+            machines=None,
             left_out=list(plan.left_out),
         )
 
@@ -146,6 +151,17 @@ class EvaluationLines:
             state["errors"] += 1
             error = {name: getattr(record.error, name) for name in ("kind", "stage", "message")}
             self._count.note("error", {"episode": record.key._asdict(), **error})
+
+    def on_load(self, load: Load) -> None:
+        """Take what the workers are doing into the next line."""
+        if self._lines.descriptor is None:
+            return
+        state = self._count.state
+        n_open = state["episodes_total"] - state["episodes_done"]
+        state["steps_running"] = load.n_counted
+        state["queue"] = max(0, n_open - load.n_running)
+        if load.machines:
+            state["machines"] = [asdict(machine) for machine in load.machines]
 
     def on_tick(self) -> None:
         """Write a line if it is time."""

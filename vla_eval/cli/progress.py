@@ -17,6 +17,7 @@ from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.shard import Shard
 from vla_eval.workers.backend import Backend
+from vla_eval.workers.load import Load
 from vla_eval.workers.local import LOCAL
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -103,6 +104,22 @@ def capture_cost(capture: CaptureConfig) -> str:
     )
 
 
+def load_text(load: Load, *, n_open: int) -> str:
+    """Return what the machines of a cluster are doing, for a person; nothing for this machine alone.
+
+    Args:
+        load: of all workers.
+        n_open: episodes that have no result yet.
+    """
+    if not load.machines:
+        return ""
+    used = [machine for machine in load.machines if machine.is_used]
+    machines = "1 machine" if len(used) == 1 else f"{len(used)} machines"
+    shares = [machine.gpu_share for machine in used if machine.gpu_share is not None]
+    gpu = f", GPUs {sum(shares) / len(shares):.0%} busy" if shares else ""
+    return f"{machines}{gpu}, {max(0, n_open - load.n_running)} episodes in the queue"
+
+
 class Progress:
     """Implements `EvaluationObserver` on standard error."""
 
@@ -116,7 +133,7 @@ class Progress:
         self._out = out
         self._bar = EpisodeBar(is_quiet=lines.is_stderr)
         self._lines = EvaluationLines(lines, out=out)
-        self._n_done = self._n_errors = self._n_results = self._n_successes = 0
+        self._n_total = self._n_done = self._n_errors = self._n_results = self._n_successes = 0
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Say how much there is to do, and what is left out."""
@@ -133,7 +150,7 @@ class Progress:
         )
         if self._capture.is_on:
             self._bar.write(capture_cost(self._capture))
-        self._n_done = n_finished
+        self._n_done, self._n_total = n_finished, n_episodes
         self._bar.begin(n_done=n_finished, n_total=n_episodes)
         self._bar.doing("starting processes, loading simulator and policies")
 
@@ -156,6 +173,11 @@ class Progress:
         rate = f"success {self._n_successes / self._n_results:.2f}" if self._n_results else "no result yet"
         note = f"{rate}, errors {self._n_errors}"
         self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)
+
+    def on_load(self, load: Load) -> None:
+        """Show steps as they are executed, and of a cluster its queue and its machines."""
+        self._lines.on_load(load)
+        self._bar.load(load_text(load, n_open=self._n_total - self._n_done), n_steps=load.n_counted)
 
     def on_tick(self) -> bool:
         """Write a line now and then; return whether a signal has asked to stop."""

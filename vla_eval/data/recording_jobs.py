@@ -70,6 +70,11 @@ class AttemptJob:
         return SetupKey(self.plan.task, "attempt")
 
     @property
+    def n_items(self) -> int:
+        """One seed."""
+        return 1
+
+    @property
     def name(self) -> str:
         """What messages call it."""
         return f"{self.plan.task}, seed {self.seed}"
@@ -88,6 +93,11 @@ class ShardJob:
     def setup_key(self) -> SetupKey:
         """See `workers.Job`."""
         return SetupKey(self.plan.task, "render")
+
+    @property
+    def n_items(self) -> int:
+        """Its attempts."""
+        return len(self.attempts)
 
     @property
     def name(self) -> str:
@@ -117,6 +127,11 @@ class JoinJob:
     def setup_key(self) -> SetupKey:
         """See `workers.Job`."""
         return SetupKey(self.plan.task, "join")
+
+    @property
+    def n_items(self) -> int:
+        """One dataset."""
+        return 1
 
     @property
     def name(self) -> str:

@@ -77,6 +77,11 @@ class ReplayJob:
         """See `workers.Job`."""
         return ReplayKey(self.dataset, self.pixels)
 
+    @property
+    def n_items(self) -> int:
+        """One episode."""
+        return 1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeReplayed:

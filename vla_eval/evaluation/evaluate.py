@@ -7,6 +7,7 @@ means, the same call resumes where it stopped.
 
 import functools
 import logging
+import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,6 +38,7 @@ from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.jobs import Answered, MachineKind
+from vla_eval.workers.load import Load
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerMain
@@ -45,6 +47,7 @@ from vla_eval.workers.start import simulator_modules
 RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
 WORKER_MODULE = "vla_eval.evaluation.worker"
+LOAD_SECONDS = 1.0  # between two calls of `on_load`
 MAX_SERVER_STARTS = 3  # of one policy, so that one that always dies ends in errors
 EpisodePool = Pool[EpisodeBatch, Finished]
 
@@ -63,6 +66,9 @@ class EvaluationObserver(Protocol):
     def on_record(self, record: EpisodeRecord) -> None:
         """Called with each record once it is durable."""
 
+    def on_load(self, load: Load) -> None:
+        """Called about once a second with what the workers are doing."""
+
     def on_tick(self) -> bool:
         """Called several times a second; returns whether the run has to stop now."""
 
@@ -77,6 +83,9 @@ class _Silence:
         """Do nothing."""
 
     def on_record(self, record: EpisodeRecord) -> None:
+        """Do nothing."""
+
+    def on_load(self, load: Load) -> None:
         """Do nothing."""
 
     def on_tick(self) -> bool:
@@ -237,6 +246,7 @@ def _run(
     phase: ReadyPhase, bookkeeper: "_Bookkeeper", pool: EpisodePool, *, is_last_start: bool
 ) -> Literal["finished", "stopped", "server lost"]:
     """Run the queue's episodes until they are finished, the observer stops it, or a server has died."""
+    next_load = time.monotonic()
     with bookkeeper, pool as running:
         for event in running.run(bookkeeper.queue):
             if isinstance(event, Answered):
@@ -250,6 +260,9 @@ def _run(
                 bookkeeper.observer.on_device(event.device)
             else:
                 bookkeeper.store()
+                if time.monotonic() >= next_load:
+                    next_load = time.monotonic() + LOAD_SECONDS
+                    bookkeeper.observer.on_load(running.load())
                 if bookkeeper.observer.on_tick():
                     return "stopped"
     return "finished"

@@ -24,6 +24,11 @@ class EpisodeBatch:
         """Batches with the same one can be run with the same environment and policy."""
         return self.group.setup_key
 
+    @property
+    def n_items(self) -> int:
+        """Its episodes."""
+        return len(self.jobs)
+
 
 class JobQueue:
     """Hands out episodes so that mistakes appear early and few processes start.

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import EpisodeStart, Policy, SimEnv
+from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import (
     InvalidActionError,
@@ -56,6 +56,25 @@ class EnvFacts(NamedTuple):
 
     spec: EnvSpec
     n_candidates: int
+
+
+class _StepCount:
+    """Counts control steps for the parent; implements `StepObserver`."""
+
+    def __init__(self, heartbeat: Heartbeat) -> None:
+        self._heartbeat = heartbeat
+
+    def wants_images(self, _step: int) -> bool:
+        return False
+
+    def on_reset(self, _episode: EpisodeStart, _result: StepResult) -> None:
+        pass
+
+    def on_inference(self, _episode: EpisodeStart, _step: int, _chunk: ActionChunk) -> None:
+        pass
+
+    def on_step(self, _episode: EpisodeStart, _action: FloatArray, _result: StepResult) -> None:
+        self._heartbeat.count()
 
 
 class EpisodeRunner:
@@ -111,7 +130,7 @@ class EpisodeRunner:
         # By the episode of slot 0, even if it has a result already and is not in the batch.
         seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
         tapes = self._capture.tapes(batch.jobs) if self._capture else None
-        observers = [tapes] if tapes else []
+        observers: list[StepObserver] = [_StepCount(self._heartbeat), *([tapes] if tapes else [])]
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)

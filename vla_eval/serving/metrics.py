@@ -34,10 +34,16 @@ class ServerMetrics:
 
     Args:
         clock: seconds; not of a calendar.
+        on_pass: called with the seconds of each pass, in the thread that infers.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        on_pass: Callable[[float], None] = lambda _seconds: None,
+    ) -> None:
+        self._clock, self._on_pass = clock, on_pass
         self._lock = threading.Lock()
         self._counts = Counts()
         self._reported, self._reported_at = Counts(), clock()
@@ -59,6 +65,7 @@ class ServerMetrics:
                 infer_seconds=counts.infer_seconds + infer_seconds,
                 queue_seconds=counts.queue_seconds + queue_seconds,
             )
+        self._on_pass(infer_seconds)
 
     def count_error(self) -> None:
         """Count an error of the policy."""

@@ -73,11 +73,14 @@ class PolicyServer:
     Args:
         hosted: the policy.
         options: where and how.
+        metrics: counts what is done; None: new ones.
     """
 
-    def __init__(self, hosted: HostedPolicy, options: ServerOptions) -> None:
+    def __init__(
+        self, hosted: HostedPolicy, options: ServerOptions, metrics: ServerMetrics | None = None
+    ) -> None:
         self._hosted, self._options = hosted, options
-        self._metrics = ServerMetrics()
+        self._metrics = metrics or ServerMetrics()
         self._sessions = SessionTable(
             hosted.reader, reads=hosted.policy.spec.reads, n_rows=hosted.n_rows, task=hosted.task
         )
@@ -181,6 +184,7 @@ def run_server(
     *,
     ready: Callable[[int], None],
     ends: Callable[[], None] | None = None,
+    metrics: ServerMetrics | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; a second one ends the process at once.
 
@@ -189,6 +193,7 @@ def run_server(
         options: where and how.
         ready: called once with the port when clients can connect.
         ends: called in a thread of its own; when it returns, the server stops as well.
+        metrics: counts what is done; None: new ones.
 
     Raises:
         ServeError: the address cannot be listened on.
@@ -213,6 +218,6 @@ def run_server(
                     loop.call_soon_threadsafe(stop.set)
 
             threading.Thread(target=watch, name="end of serving", daemon=True).start()
-        await PolicyServer(hosted, options).run(stop, ready)
+        await PolicyServer(hosted, options, metrics).run(stop, ready)
 
     asyncio.run(serve_until_stopped())

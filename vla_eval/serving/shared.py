@@ -3,6 +3,7 @@
 Each is guarded like a worker: however the parent ends, its servers end with it.
 """
 
+import functools
 import logging
 import os
 import secrets
@@ -16,11 +17,12 @@ from typing import Self
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.serving.host import HostOptions, host_policy
+from vla_eval.serving.metrics import ServerMetrics
 from vla_eval.serving.server import ServerOptions, run_server
 from vla_eval.wire.metadata import ServerMetadata
 from vla_eval.workers.backend import Backend, Service
 from vla_eval.workers.framing import BrokenMessageError, send_message
-from vla_eval.workers.inside import SharedStage, detach
+from vla_eval.workers.inside import SharedStage, add_count, detach
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import Failed, as_exception, describe_error
 from vla_eval.workers.process import CLOSE_SECONDS
@@ -195,6 +197,7 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
             ServerOptions(host=job.address, port=0, api_key=job.api_key),
             ready=lambda port: send_message(connection, ServerReady(port=port, metadata=hosted.metadata)),
             ends=lambda: _wait_for_parent(connection),
+            metrics=ServerMetrics(on_pass=functools.partial(add_count, shared)),
         )
     except BaseException as exc:  # also SystemExit: a policy must not end the server unseen
         logger.exception("the server ends")

@@ -31,6 +31,11 @@ class FinetuneJob:
         """See `workers.Job`: each has a process of its own."""
         return self.config.out
 
+    @property
+    def n_items(self) -> int:
+        """One fine-tuning."""
+        return 1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finetuned:

@@ -11,6 +11,7 @@ from typing import Protocol, Self
 
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.jobs import Event, Job, JobSource
+from vla_eval.workers.load import Load
 from vla_eval.workers.process import WorkerMain
 
 
@@ -30,6 +31,9 @@ class Pool[J: Job, A](Protocol):
 
         Every job gets an answer, whatever a worker does.
         """
+
+    def load(self) -> Load:
+        """Return what the workers are doing; called while `run` waits for its next event."""
 
 
 class Service(Protocol):

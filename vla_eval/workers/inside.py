@@ -24,7 +24,9 @@ logger = logging.getLogger(__name__)
 STAGES: tuple[Stage, ...] = ("setup", "reset", "step", "inference")
 
 SharedStage = ctypes.Array[ctypes.c_double]
-"""(time.monotonic() when the stage began, index of the stage), in memory shared with the parent."""
+"""Memory shared with the parent: time.monotonic() when the stage began, index of the stage, and a count of
+the job's progress: an episode's control steps, a policy server's seconds in forward passes."""
+SHARED_SIZE = 3
 
 
 class Heartbeat:
@@ -43,6 +45,10 @@ class Heartbeat:
         self._add_up(now)
         self._stage, self._since = stage, now
         write_stage(self._shared, stage, now)
+
+    def count(self) -> None:
+        """Count one more of what the job consists of."""
+        add_count(self._shared, 1)
 
     @property
     def stage(self) -> Stage:
@@ -79,6 +85,11 @@ def write_stage(shared: SharedStage, stage: Stage, now: float) -> None:
     """Begin a stage; the time first, so that no reader sees a new stage with an old time."""
     shared[0] = now
     shared[1] = STAGES.index(stage)
+
+
+def add_count(shared: SharedStage, amount: float) -> None:
+    """Add to what was counted of the job."""
+    shared[2] += amount
 
 
 class Runner(Protocol):

@@ -15,6 +15,10 @@ class Job(Protocol):
     def setup_key(self) -> Hashable:
         """Jobs with the same one need the same preparation, which a process keeps; others get their own."""
 
+    @property
+    def n_items(self) -> int:
+        """How many of what progress counts it has: the episodes of a batch, for example."""
+
 
 class JobSource[J: Job](Protocol):
     """A source of jobs; `JobQueue` is one."""

@@ -24,6 +24,7 @@ from vla_eval.core import Stage
 from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
+from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
 from vla_eval.workers.start import end_server, server_is_stopped, worker_context
@@ -110,6 +111,14 @@ class WorkerPool[J: Job, A]:
             for index, worker in busy.items():
                 yield from self._look_at(index, worker)
             yield None
+
+    def load(self) -> Load:
+        """Return what the workers are doing."""
+        busy = [(worker.process, worker.job) for worker in self._workers.values() if worker.job is not None]
+        return Load(
+            n_running=sum(job.n_items for _, job in busy),
+            n_counted=round(sum(process.count for process, _ in busy)),
+        )
 
     def _hand_out(self, queue: JobSource[J]) -> None:
         for index in range(self._size):

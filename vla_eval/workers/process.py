@@ -18,7 +18,7 @@ from pathlib import Path
 from vla_eval.core import Stage
 from vla_eval.workers.framing import BrokenMessageError, Inbox
 from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
-from vla_eval.workers.inside import STAGES, SharedStage, write_stage
+from vla_eval.workers.inside import SHARED_SIZE, STAGES, SharedStage, write_stage
 from vla_eval.workers.messages import MAX_DETAILS
 from vla_eval.workers.start import begin, end_server, worker_environment
 
@@ -71,7 +71,7 @@ class WorkerProcess:
         self.start_error: BaseException | None = None
         self._inbox = Inbox(self.connection)
         self._their_lifeline, self._lifeline = context.Pipe(duplex=False)
-        self._shared: SharedStage = context.RawArray("d", 2)
+        self._shared: SharedStage = context.RawArray("d", SHARED_SIZE)
         self._main = main
         self._context = context
         self._predecessor = predecessor
@@ -85,6 +85,7 @@ class WorkerProcess:
         """Have the process do a job, starting it if need be; returns at once."""
         self._log_offset = self.log.stat().st_size if self.log.exists() else 0
         self._given_at = time.monotonic()
+        self._shared[2] = 0
         write_stage(self._shared, "setup", self._given_at)
         self._thread = threading.Thread(target=self._hand_over, args=(job,), daemon=True)
         self._thread.start()
@@ -110,6 +111,11 @@ class WorkerProcess:
                 f"expected a stage and its time in shared memory, found {stage}, {since}"
             )
         return Busy(stage=STAGES[int(stage)], since=since)
+
+    @property
+    def count(self) -> float:
+        """What it has counted of its job."""
+        return float(self._shared[2])
 
     def ask_where(self) -> None:
         """Have it write the stack of every thread to its log."""

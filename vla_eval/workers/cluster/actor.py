@@ -112,6 +112,10 @@ class ServiceActor:
             raise self._service.start_error
         return self._service.read()
 
+    def busy_seconds(self) -> float:
+        """Return how long it has been in forward passes."""
+        return self._service.count
+
     def wait(self, seconds: float) -> int | None:
         """Wait for its end; return its exit code if there is one."""
         return self._service.wait(seconds)

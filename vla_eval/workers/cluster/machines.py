@@ -4,13 +4,14 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any  # Ray is optional: not looked at by mypy
+from dataclasses import dataclass, field
+from typing import Any, Protocol  # Ray is optional: not looked at by mypy
 
 from vla_eval.errors import ClusterError
 from vla_eval.workers.cluster.connect import on_machine
 from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections
 from vla_eval.workers.jobs import MachineKind
+from vla_eval.workers.load import MachineLoad
 from vla_eval.workers.needed import Needed
 
 MAX_ERRORS_IN_A_ROW = 3
@@ -21,6 +22,13 @@ NOTE_SECONDS = 60.0  # between two notes of how fast each machine is
 COLUMNS = ("machine", "address", "cores", "GPUs", "memory", "CPU", "Mesa", "NVIDIA", "used")
 
 logger = logging.getLogger(__name__)
+
+
+class BusyService(Protocol):
+    """A policy server, for its share of time in forward passes."""
+
+    def busy_share(self) -> float | None:
+        """Return it, from 0 to 1, since an earlier call; None: it is not known yet."""
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -37,7 +45,10 @@ class Machine:
         is_alive: whether the cluster has it.
         kind: what kind it is; None: the same as the planning machine.
         n_used: workers that it has.
-        n_done: answers that it gave.
+        n_running: items that they have been given and have not answered.
+        n_done: items that they have answered.
+        services: the policy servers on it.
+        seen_at: `time.monotonic` when it came.
         n_errors_in_a_row: workers that died and jobs that failed since its last answer.
     """
 
@@ -51,13 +62,30 @@ class Machine:
     is_alive: bool = True
     kind: MachineKind | None = None
     n_used: int = 0
+    n_running: int = 0
     n_done: int = 0
     n_errors_in_a_row: int = 0
+    services: list[BusyService] = field(default_factory=list)
+    seen_at: float = field(default_factory=time.monotonic)
 
     @property
     def is_usable(self) -> bool:
         """Whether workers may be started on it."""
         return self.is_alive and self.facts is not None and not self.refused
+
+    def load(self) -> MachineLoad:
+        """Return what it is doing."""
+        shares = [share for service in self.services if (share := service.busy_share()) is not None]
+        return MachineLoad(
+            name=self.name,
+            is_used=self.is_usable,
+            n_workers=self.n_used,
+            n_running=self.n_running,
+            n_done=self.n_done,
+            per_second=self.n_done / max(time.monotonic() - self.seen_at, 1e-9),
+            n_gpus=self.n_gpus,
+            gpu_share=sum(shares) / len(shares) if shares and self.n_gpus else None,
+        )
 
     def n_free(self, *, takes_gpu: bool = False) -> int:
         """Return how many more workers it has room for."""
@@ -88,7 +116,7 @@ class Machines:
         self._known: dict[str, Machine] = {}
         self._checks: dict[Any, tuple[Machine, float]] = {}
         self._looked_at = -LOOK_SECONDS
-        self._begun = self._noted_at = time.monotonic()
+        self._noted_at = time.monotonic()
 
     def __iter__(self) -> Iterator[Machine]:
         """All machines that there ever were, in the order in which they came."""
@@ -146,21 +174,18 @@ class Machines:
         machine.refused = (f"set aside after {machine.n_errors_in_a_row} errors in a row: {what}",)
         self.say(f"machine {machine.name}: {machine.refused[0]}")
 
-    def note_answer(self, machine: Machine) -> None:
+    def note_answer(self, machine: Machine, *, n_items: int) -> None:
         """Count what a machine has done."""
         machine.n_errors_in_a_row = 0
-        machine.n_done += 1
+        machine.n_done += n_items
+
+    def loads(self) -> tuple[MachineLoad, ...]:
+        """Return what each machine that can be used, or has done something, is doing."""
+        return tuple(machine.load() for machine in self if machine.n_done or machine.is_usable)
 
     def progress(self) -> str:
         """Return what each machine has done, for a person."""
-        seconds = max(time.monotonic() - self._begun, 1e-9)
-        parts = [
-            f"{machine.name}: {machine.n_used} workers, {machine.n_done} done, "
-            f"{machine.n_done / seconds:.3g} per second"
-            for machine in self
-            if machine.n_done or machine.is_usable
-        ]
-        return "; ".join(parts)
+        return "; ".join(map(_described, self.loads()))
 
     def rows(self) -> list[dict[str, str]]:
         """Return the table's rows: column -> text."""
@@ -215,6 +240,12 @@ def _machine(node: dict[str, Any]) -> Machine:
         n_cores=int(resources.get("CPU", 0)),
         n_gpus=int(resources.get("GPU", 0)),
     )
+
+
+def _described(load: MachineLoad) -> str:
+    workers = "1 worker" if load.n_workers == 1 else f"{load.n_workers} workers"
+    gpu = "" if load.gpu_share is None else f", GPU {load.gpu_share:.0%}"
+    return f"{load.name}: {workers}, {load.n_done} done, {load.per_second:.3g} per second{gpu}"
 
 
 def _row(machine: Machine) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from vla_eval.workers.cluster.actor import WorkerActor, WorkerSpec
 from vla_eval.workers.cluster.connect import on_machine
 from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machine, Machines
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
+from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS
 
@@ -48,6 +49,11 @@ class _Worker[J: Job]:
     given: list[_Given[J]] = field(default_factory=list)
     is_ready: bool = False
     since: float = 0.0
+
+    @property
+    def n_items(self) -> int:
+        """How many of what progress counts it has been given."""
+        return sum(one.job.n_items for one in self.given)
 
 
 class ClusterPool[J: Job, A]:
@@ -110,6 +116,12 @@ class ClusterPool[J: Job, A]:
             self._hand_out(queue)  # before the tick: workers need not wait for the disk
             yield None
 
+    def load(self) -> Load:
+        """Return what the workers are doing, machine by machine."""
+        return Load(
+            n_running=sum(machine.n_running for machine in self._machines), machines=self._machines.loads()
+        )
+
     def _has_next(self, queue: JobSource[J]) -> bool:
         return bool(self._returned) or queue.has_next()
 
@@ -157,6 +169,7 @@ class ClusterPool[J: Job, A]:
             worker.given = self._next_jobs(queue, worker, taken)
             worker.loaded = worker.given[0].job.setup_key
             worker.since = time.monotonic()
+            worker.machine.n_running += worker.n_items
             worker.call = worker.actor.do.remote([one.job for one in worker.given])
 
     def _next_jobs(self, queue: JobSource[J], worker: _Worker[J], taken: set[Any]) -> list[_Given[J]]:
@@ -215,6 +228,7 @@ class ClusterPool[J: Job, A]:
         if not worker.is_ready:
             worker.is_ready = True
             return
+        worker.machine.n_running -= worker.n_items
         seconds = (time.monotonic() - worker.since) / len(worker.given)
         before = self._seconds_per_job
         self._seconds_per_job = seconds if before is None else 0.9 * before + 0.1 * seconds
@@ -223,12 +237,13 @@ class ClusterPool[J: Job, A]:
             if isinstance(event, DeviceFound):
                 yield event
                 continue
-            self._note(worker.machine, event)
-            yield Answered(job=given.popleft().job, answer=event, kind=worker.machine.kind)
+            job = given.popleft().job
+            self._note(worker.machine, job, event)
+            yield Answered(job=job, answer=event, kind=worker.machine.kind)
 
-    def _note(self, machine: Machine, answer: A | Failed) -> None:
+    def _note(self, machine: Machine, job: J, answer: A | Failed) -> None:
         if not isinstance(answer, Failed):
-            self._machines.note_answer(machine)
+            self._machines.note_answer(machine, n_items=job.n_items)
         elif not answer.refused:
             self._machines.note_error(machine, f"{answer.error.kind}: {answer.error.message[:200]}")
 
@@ -268,6 +283,7 @@ class ClusterPool[J: Job, A]:
     def _end(self, index: int) -> None:
         worker = self._workers.pop(index)
         worker.machine.n_used -= 1
+        worker.machine.n_running -= worker.n_items
         self.kill(worker.actor)
 
     def kill(self, actor: Any) -> None:

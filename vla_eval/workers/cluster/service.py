@@ -3,7 +3,7 @@
 import contextlib
 import time
 from pathlib import Path
-from typing import Any  # Ray is optional: not looked at by mypy
+from typing import Any, NamedTuple  # Ray is optional: not looked at by mypy
 
 from vla_eval.workers.cluster.actor import Place, ServiceActor
 from vla_eval.workers.cluster.connect import on_machine
@@ -11,6 +11,14 @@ from vla_eval.workers.cluster.machines import Machine
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain
 
 KILLED = -9
+SHARE_SECONDS = 5.0  # between two questions for the time in forward passes
+
+
+class _Busy(NamedTuple):
+    """At a time of `time.monotonic`, how long a server had been in forward passes."""
+
+    at: float
+    seconds: float
 
 
 class ClusterService:
@@ -55,6 +63,10 @@ class ClusterService:
         )
         self._actor = actor.remote(main, preload, place, index, machine.address)
         self._reading: Any = None
+        self._asked: tuple[float, Any] | None = None  # when, and the call
+        self._busy = _Busy(time.monotonic(), 0.0)
+        self._share: float | None = None
+        machine.services.append(self)
 
     def give(self, job: object) -> None:
         """Start the process with its job; returns at once."""
@@ -75,6 +87,22 @@ class ClusterService:
         except self._ray.exceptions.RayError as exc:
             raise EOFError(f"the actor on {self._machine.name} has died: {exc}") from exc
         return messages
+
+    def busy_share(self) -> float | None:
+        """Return its share of time in forward passes of late; never waits for an answer."""
+        now = time.monotonic()
+        if self._asked is None and now - self._busy.at >= SHARE_SECONDS:
+            self._asked = now, self._actor.busy_seconds.remote()
+        if self._asked is not None:
+            at, call = self._asked
+            ready, _ = self._ray.wait([call], timeout=0)
+            if ready:
+                self._asked = None
+                with contextlib.suppress(self._ray.exceptions.RayError):  # it has died, which others notice
+                    seconds: float = self._ray.get(call)
+                    self._share = min(1.0, (seconds - self._busy.seconds) / (at - self._busy.at))
+                    self._busy = _Busy(at, seconds)
+        return self._share
 
     def has_ended(self) -> bool:
         """Whether it is there no longer."""
@@ -105,6 +133,8 @@ class ClusterService:
     def end(self) -> None:
         """Kill it, and wait until Ray has noticed."""
         self.ask_to_end()
+        if self in self._machine.services:
+            self._machine.services.remove(self)
         deadline = time.monotonic() + CLOSE_SECONDS
         while time.monotonic() < deadline and self._closing is None and self.wait(0.0) is None:
             time.sleep(0.05)
