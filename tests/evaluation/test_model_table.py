@@ -1,7 +1,6 @@
 """A table of learned policies: what it takes, what is missing of it, and all of it with tiny models."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -339,58 +338,3 @@ def test_demonstrations_of_every_task_of_the_table_can_be_recorded_on_the_stand_
     )
     (record,) = rollout(env, make_oracle(context), [start], RolloutSettings(chunking=chunking))
     assert record.success_once
-
-
-@pytest.mark.parametrize(
-    ("tasks", "left_out"),
-    [
-        ([TASK], ("memoryless", "diffusion")),
-        pytest.param([TASK, "InterceptMedium-v0"], (), marks=pytest.mark.slow),
-    ],
-)
-def test_small_policies_come_to_a_table_at_several_numbers_of_action_steps(
-    tasks: list[str], left_out: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = yaml.safe_load(Path("configs/memory_table.yaml").read_text(encoding="utf-8"))
-    data["tasks"] = tasks
-    for row in data["rows"]:
-        row["tasks"] = [task for task in row.get("tasks", tasks) if task in tasks]
-        row["n_action_steps"] = [4, 8]
-    data["rows"] = [row for row in data["rows"] if row["tasks"] and row["name"] not in left_out]
-    path = tmp_path / "memory.yaml"
-    path.write_text(yaml.safe_dump(data), encoding="utf-8")
-    assert main(["eval", str(path), "--tiny", "--format", "json", "--out", str(tmp_path / "out")]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    controls = ["random", "cue_blind", "oracle"]
-    policies = {
-        TASK: [*controls, "memory", "memoryless", "diffusion"],
-        "InterceptMedium-v0": [*controls, "memory_free", "memoryless_free", "diffusion"],
-    }
-    assert {(row["task"], row["policy"], row["n_action_steps"]) for row in rows} == {
-        (task, name, steps)
-        for task in tasks
-        for name in policies[task]
-        for steps in (4, 8)
-        if name not in left_out
-    }
-    assert all(row["n_episodes"] == 2 and row["n_errors"] == 0 for row in rows)
-
-
-@pytest.mark.slow
-def test_with_tiny_models_it_prints_every_row_beside_controls_and_the_papers_figures(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["eval", str(small), "--tiny", "--paper", "--format", "json", "--out", str(tmp_path / "out")]
-    assert main(arguments) == 0
-    first = capsys.readouterr()
-    told = json.loads(first.out)
-    rows = {(row["policy"], row["n_action_steps"]) for row in told["rows"]}
-    models = {(row.name, row.n_action_steps[0]) for row in load_model_table(PAPER).rows}
-    controls = {(name, n) for name in ("random", "cue_blind", "oracle") for n in (4, 8)}
-    assert rows == models | controls
-    assert len(told["paper"]["rows"]) == 5
-    assert "mean nothing" in first.err
-
-    assert main(arguments) == 0  # everything is there
-    again = capsys.readouterr()
-    assert json.loads(again.out) == told and "[1/" not in again.err

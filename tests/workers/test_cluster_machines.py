@@ -1,6 +1,7 @@
 """Which machines of a cluster are used, and what is said of the others; Ray is a stand-in."""
 
 import dataclasses
+import json
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -9,12 +10,16 @@ from typing import Any
 
 import pytest
 
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
+from vla_eval.evaluation.needed import needed_files
+from vla_eval.workers import parcel as parcel_module
 from vla_eval.workers.cluster import connect, machines
 from vla_eval.workers.cluster.connect import check_address
 from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machines
-from vla_eval.workers.cluster.node_facts import NodeFacts, objections
+from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections, receive
 from vla_eval.workers.needed import Needed
+from vla_eval.workers.parcel import PackedFolder, pack, unpack
 
 HERE = NodeFacts(
     environment={
@@ -46,6 +51,7 @@ class TestObjections:
             (dataclasses.replace(HERE, vulkan=()), "no Vulkan driver"),
             (dataclasses.replace(HERE, free_bytes=1 << 29), "0.5 GB of memory are free"),
             (dataclasses.replace(HERE, missing=("data: it is not there",)), "data: it is not there"),
+            (dataclasses.replace(HERE, recipes={"policies/act": "1" * 64}), "recipes.policies/act"),
         ],
     )
     def test_a_machine_that_would_give_other_results_is_refused(self, found: NodeFacts, reason: str) -> None:
@@ -76,6 +82,63 @@ class TestNeededFiles:
         assert "is the storage shared?" in (Needed(path=str(tmp_path / "x")).objection() or "")
 
 
+class TestParcels:
+    def test_a_folder_is_written_whole_with_what_its_digest_needs(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        here, there = tmp_path / "here", tmp_path / "there"
+        weights = here / "runs/x/checkpoints/last/pretrained_model/model.safetensors"
+        weights.parent.mkdir(parents=True)
+        weights.write_text("right")
+        name = str(weights.parent.relative_to(here))
+        need = Needed(
+            path="runs/x",
+            sha256="right",
+            digest=lambda path: (path / "checkpoints/last/pretrained_model/model.safetensors").read_text(),
+            folders=(name,),
+        )
+        monkeypatch.chdir(here)
+        parcel = pack(name)
+
+        there.mkdir()
+        asked = node_facts((need,), folder=str(there))
+        assert asked.absent == (name,) and len(asked.missing) == 1
+        told = receive([parcel], (need,), folder=str(there))
+
+        assert (told.absent, told.missing) == ((), ())
+        assert (there / name / "model.safetensors").read_text() == "right"
+        assert [path.name for path in (there / name).parent.iterdir()] == ["pretrained_model"]  # no draft
+
+    def test_what_is_there_is_never_overwritten(self, tmp_path: Path) -> None:
+        (tmp_path / "w").mkdir()
+        (tmp_path / "w/file").write_text("theirs")
+        unpack(PackedFolder(str(tmp_path / "w"), {"file": b"ours"}))
+        assert (tmp_path / "w/file").read_text() == "theirs"
+
+    def test_where_it_cannot_be_written_the_machine_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        need = Needed(path="w", sha256="s", digest=lambda path: path.read_text(), folders=("w",))
+        told = receive([PackedFolder("w", {})], (need,), folder=str(tmp_path / "file"))
+        assert "a checkpoint cannot be written there" in told.missing[-1]
+
+    def test_large_ones_and_those_of_the_package_are_not_sent(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        folder = tmp_path / "weights"
+        folder.mkdir()
+        (folder / "config.json").write_text('{"type": "act"}')
+        (folder / "model.safetensors").write_bytes(b"0" * 100)
+        recipe = {"version": 1, "description": "d", "adapter": "lerobot", "default_n_action_steps": 4}
+        (tmp_path / "own.yaml").write_text(json.dumps({**recipe, "args": {"checkpoint": str(folder)}}))
+        config = EvalConfig(
+            name="x", tasks=("RememberColor3-v0",), policies=(str(tmp_path / "own.yaml"), "memory_color3")
+        )
+
+        assert [need.folders for need in needed_files(config)] == [(str(folder),), ()]
+        monkeypatch.setattr(parcel_module, "MAX_PARCEL_BYTES", 100)
+        assert [need.folders for need in needed_files(config)] == [(), ()]
+
+
 class StandIn:
     """Runs a task at once, where it is called."""
 
@@ -85,6 +148,7 @@ class StandIn:
         self.facts = facts
         self.n_cores = dict.fromkeys(facts, 2.0)
         self.gone: set[str] = set()
+        self.sent: list[tuple[str, list[str]]] = []
 
     def nodes(self) -> list[dict[str, Any]]:
         return [
@@ -100,9 +164,15 @@ class StandIn:
 
     def remote(self, _task: Callable[..., Any]) -> Any:
         def options(*, scheduling_strategy: str, **_: Any) -> Any:
-            return SimpleNamespace(remote=lambda *_args, **_kwargs: scheduling_strategy)
+            return SimpleNamespace(remote=lambda *args, **_kwargs: self._call(scheduling_strategy, args))
 
         return SimpleNamespace(options=options)
+
+    def _call(self, name: str, args: tuple[Any, ...]) -> str:
+        if isinstance(args[0], list):  # folders are sent
+            self.sent.append((name, [packed.path for packed in args[0]]))
+            self.facts[name] = dataclasses.replace(self.facts[name], absent=())
+        return name
 
     def wait(self, refs: list[str], **_: Any) -> tuple[list[str], list[str]]:
         return refs, []
@@ -130,6 +200,18 @@ class TestMachines:
         found.survey()
         assert [machine.name.split("/")[0] for machine in found.usable] == ["good"]
         assert 'python: "3.12.1" -> "3.11.0"' in found.table()
+
+    def test_a_machine_is_sent_once_what_it_does_not_have(self, cluster: Any, tmp_path: Path) -> None:
+        adapter, base = tmp_path / "adapter", tmp_path / "base"
+        for folder in (adapter, base):
+            folder.mkdir()
+            (folder / "file").write_bytes(b"0" * 1_500_000)
+        found, ray, lines = cluster(a=HERE, b=dataclasses.replace(HERE, absent=(str(adapter), str(base))))
+        found.survey()
+        # The base first, so that an adapter that is there has its base.
+        assert ray.sent == [("b", [str(base), str(adapter)])]
+        assert "machine b" in lines[0] and lines[0].endswith("(3.0 MB)")
+        assert [machine.node for machine in found.usable] == ["a", "b"]
 
     def test_without_a_usable_one_there_is_an_error_with_the_table(self, cluster: Any) -> None:
         found, _, _ = cluster(old=with_environment(python="3.11.0"))

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, dry_run_options, typed_command
 from vla_eval.cli.cluster import backend_of, shared_folder
+from vla_eval.config.files import find_recipe
+from vla_eval.config.shipped import search_folders
 from vla_eval.errors import FolderInUseError, RecipeError
 from vla_eval.evaluation.grid import (
     EVALUATION_FOLDER,
@@ -167,8 +169,16 @@ def _work(args: argparse.Namespace, *, rows: Sequence[str] | None) -> _Work:
 
 
 def _needs(work: _Work) -> tuple[Needed, ...]:
-    """Return the folders that workers write into and read from."""
-    return (shared_folder(work.out), shared_folder(Path(work.table.datasets)))
+    """Return the folders that workers write into and read from, and the recipes that they read.
+
+    Those of the package are compared anyway.
+    """
+    from vla_eval.policies.checkpoint import file_sha256
+
+    found = dict.fromkeys(find_recipe("policies", row.policy) for row in work.table.rows)
+    own = [path for path in found if path.parent != search_folders("policies")[-1]]
+    recipes = [Needed(path=str(path), sha256=file_sha256(path), digest=file_sha256) for path in own]
+    return (shared_folder(work.out), shared_folder(Path(work.table.datasets)), *recipes)
 
 
 def _finetune(work: _Work, backend: Backend, *, device: str, allow_unreplayed: bool = False) -> None:

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from vla_eval.bounds import require
 from vla_eval.config.decoding import decode, set_field
@@ -63,6 +63,15 @@ def list_recipes(folder: Folder) -> dict[str, Path]:
     for place in reversed(search_folders(folder)):
         found.update({path.stem: path for path in sorted(place.glob("*.yaml"))})
     return dict(sorted(found.items()))
+
+
+def shipped_digests() -> dict[str, str]:
+    """Return `policies/act` -> sha256 of its file, of all recipes that come with the package."""
+    return {
+        f"{folder}/{path.stem}": hashlib.sha256(path.read_bytes()).hexdigest()
+        for folder in get_args(Folder)
+        for path in sorted(search_folders(folder)[-1].glob("*.yaml"))
+    }
 
 
 def find_recipe(folder: Folder, name: str) -> Path:

@@ -1,6 +1,6 @@
 """What the machines of a cluster must have before an evaluation begins: checkpoints, by path and digest.
 
-Recipes, prompts and settings travel with the episodes; weights do not.
+Recipes, prompts and settings travel with the episodes; small checkpoints are sent where they are missing.
 """
 
 from collections.abc import Iterator
@@ -8,11 +8,13 @@ from itertools import product
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.policies.checkpoint import checkpoint_sha256
+from vla_eval.config.shipped import search_folders
+from vla_eval.policies.checkpoint import SHIPPED_FOLDER, adapter_bases, checkpoint_sha256, find_checkpoint
 from vla_eval.policies.checkpoint_notes import LEROBOT_CHECKPOINTS
 from vla_eval.policies.run_seeds import load_policy_entry
 from vla_eval.wire.addresses import named_server
 from vla_eval.workers.needed import Needed
+from vla_eval.workers.parcel import fits
 
 CHECKPOINT_ARGS = ("checkpoint", "base_checkpoint")
 
@@ -36,4 +38,20 @@ def _checkpoints(config: EvalConfig) -> Iterator[Needed]:
         for recipe, arg in product(own, CHECKPOINT_ARGS):
             path = recipe.args.get(arg)
             if isinstance(path, str):
-                yield Needed(path=path, sha256=checkpoint_sha256(Path(path)), digest=checkpoint_sha256)
+                yield Needed(
+                    path=path,
+                    sha256=checkpoint_sha256(Path(path)),
+                    digest=checkpoint_sha256,
+                    folders=_to_send(Path(path)),
+                )
+
+
+def _to_send(checkpoint: Path) -> tuple[str, ...]:
+    """Return the folders of a checkpoint that is small enough to be sent; those of the package are there."""
+    folder = find_checkpoint(checkpoint)
+    folders = [folder, *adapter_bases(folder)]
+    shipped = search_folders(SHIPPED_FOLDER)[-1].resolve()
+    if any(part.resolve().is_relative_to(shipped) for part in folders) or not fits(folders):
+        return ()
+    here = Path.cwd()
+    return tuple(str(part.relative_to(here) if part.is_relative_to(here) else part) for part in folders)

@@ -15,11 +15,18 @@ class Needed:
         path: absolute, or below the working directory.
         sha256: its digest; None: it is enough that it is there.
         digest: what computes the digest.
+        folders: those that it consists of, if they are small enough to be sent to a machine that does not
+            have them (`parcel.MAX_PARCEL_BYTES`); empty: it must be there.
     """
 
     path: str
     sha256: str | None = None
     digest: Callable[[Path], str] | None = None
+    folders: tuple[str, ...] = ()
+
+    def absent(self) -> tuple[str, ...]:
+        """Return which of its folders can be sent and are not on this machine."""
+        return tuple(folder for folder in self.folders if not Path(folder).exists())
 
     def objection(self) -> str | None:
         """Return what is wrong with it on this machine; None: nothing."""

@@ -3,23 +3,24 @@
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol  # Ray is optional: not looked at by mypy
 
 from vla_eval.errors import ClusterError
 from vla_eval.workers.cluster.connect import on_machine
-from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections
+from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections, receive
 from vla_eval.workers.jobs import MachineKind
 from vla_eval.workers.load import MachineLoad
 from vla_eval.workers.needed import Needed
+from vla_eval.workers.parcel import pack
 
 MAX_ERRORS_IN_A_ROW = 3
 CHECK_SECONDS = 120.0  # for a machine to say what it has; its first Python process may be on a cold disk
 LOOK_SECONDS = 5.0  # between two looks at which machines there are
 NOTE_SECONDS = 60.0  # between two notes of how fast each machine is
 
-COLUMNS = ("machine", "address", "cores", "GPUs", "memory", "CPU", "Mesa", "NVIDIA", "used")
+COLUMNS = ("machine", "address", "cores", "GPUs", "memory", "CPU", "Mesa", "NVIDIA", "recipes", "used")
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +44,7 @@ class Machine:
         facts: what it said of itself; None: it has not answered yet.
         refused: why it is not used; empty: it is.
         is_alive: whether the cluster has it.
+        was_sent: whether folders that it did not have were sent to it.
         kind: what kind it is; None: the same as the planning machine.
         n_used: workers that it has.
         n_running: items that they have been given and have not answered.
@@ -60,6 +62,7 @@ class Machine:
     facts: NodeFacts | None = None
     refused: tuple[str, ...] = ()
     is_alive: bool = True
+    was_sent: bool = False
     kind: MachineKind | None = None
     n_used: int = 0
     n_running: int = 0
@@ -202,10 +205,21 @@ class Machines:
 
     def _begin_check(self, machine: Machine) -> None:
         self._known[machine.node] = machine
-        task = self._ray.remote(node_facts).options(
-            num_cpus=0, max_retries=0, scheduling_strategy=on_machine(machine.node)
-        )
-        self._checks[task.remote(self._needs, folder=os.getcwd())] = (machine, time.monotonic())
+        self._ask(machine, node_facts, self._needs)
+
+    def _ask(self, machine: Machine, task: Callable[..., NodeFacts], *args: Any) -> None:
+        """Have a machine say what it has."""
+        options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": on_machine(machine.node)}
+        ref = self._ray.remote(task).options(**options).remote(*args, folder=os.getcwd())
+        self._checks[ref] = (machine, time.monotonic())
+
+    def _send(self, machine: Machine, absent: Sequence[str]) -> None:
+        """Send the folders that a machine does not have; it then says again what it has."""
+        machine.was_sent = True
+        folders = [pack(path) for path in reversed(absent)]  # an adapter's base before the adapter
+        megabytes = sum(folder.n_bytes for folder in folders) / 1e6
+        self.say(f"machine {machine.name}: sending it {', '.join(absent)} ({megabytes:.1f} MB)")
+        self._ask(machine, receive, folders, self._needs)
 
     def _collect(self) -> None:
         """Take the answers that have come."""
@@ -220,6 +234,10 @@ class Machines:
                 machine.refused = (f"it could not be asked: {_last_line(exc)}",)
                 continue
             assert machine.facts is not None  # that is what the task returns
+            if machine.facts.absent and not machine.was_sent:
+                self._send(machine, machine.facts.absent)
+                machine.facts = None
+                continue
             found = objections(machine.facts, self.here, allow_other_kind=self._allow_other_kind)
             machine.refused = found
             if machine.facts.kind != self.here.kind:
@@ -261,6 +279,7 @@ def _row(machine: Machine) -> tuple[str, ...]:
         str(kind.get("cpu") or "—"),
         str(kind.get("mesa") or "—"),
         str(kind.get("nvidia_driver") or "—"),
+        "—" if facts is None else facts.recipes_name,
         state if machine.is_alive else "gone",
     )
 

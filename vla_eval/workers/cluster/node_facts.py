@@ -2,19 +2,20 @@
 
 import contextlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from vla_eval.config.files import digest_of
+from vla_eval.config.files import digest_of, shipped_digests
 from vla_eval.storage.provenance import collect_environment, vulkan_drivers
 from vla_eval.storage.run_file import JsonValue, find_changes
 from vla_eval.workers.needed import Needed
+from vla_eval.workers.parcel import PackedFolder, unpack
 from vla_eval.workers.start import visible_gpus
 
 KIND_FACTS = ("cpu", "mesa", "nvidia_driver")
 """What may move the last bits of a state or a pixel while code and packages are the same."""
-KIND_DIGITS = 8
+KIND_DIGITS = 8  # of a digest, for people
 MEMINFO_FILE = Path("/proc/meminfo")
 LEAST_FREE_BYTES = 1 << 30  # a worker with simulator and policy has more
 GB = 1e9
@@ -30,6 +31,8 @@ class NodeFacts:
         free_bytes: memory that is free.
         n_gpus: GPUs with a driver.
         missing: what is wrong with the files that it was asked for.
+        absent: folders that it was asked for, does not have, and can be sent.
+        recipes: `policies/act` -> sha256, of the recipes of its package.
     """
 
     environment: Mapping[str, JsonValue]
@@ -37,11 +40,18 @@ class NodeFacts:
     free_bytes: int
     n_gpus: int
     missing: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
+    recipes: Mapping[str, JsonValue] = field(default_factory=dict)
 
     @property
     def kind(self) -> dict[str, JsonValue]:
         """What bits may depend on."""
         return {name: self.environment.get(name) for name in KIND_FACTS}
+
+    @property
+    def recipes_name(self) -> str:
+        """The beginning of a digest of all recipes."""
+        return digest_of(dict(self.recipes))[:KIND_DIGITS]
 
     @property
     def kind_name(self) -> str:
@@ -58,13 +68,35 @@ def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFact
     """
     with contextlib.chdir(folder) if Path(folder).is_dir() else contextlib.nullcontext():
         missing = tuple(wrong for need in needs if (wrong := need.objection()) is not None)
+        absent = tuple(dict.fromkeys(path for need in needs for path in need.absent()))
     return NodeFacts(
         environment=collect_environment(),
         vulkan=vulkan_drivers(),
         free_bytes=free_memory_bytes(),
         n_gpus=len(visible_gpus()),
         missing=missing,
+        absent=absent,
+        recipes=dict(shipped_digests()),
     )
+
+
+def receive(folders: Sequence[PackedFolder], needs: tuple[Needed, ...], *, folder: str) -> NodeFacts:
+    """Write the folders that this machine did not have, and return its facts again.
+
+    Args:
+        folders: in the order in which they are to appear.
+        needs: see `node_facts`.
+        folder: the planning machine's working directory, where relative paths begin.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with contextlib.chdir(folder):
+            for packed in folders:
+                unpack(packed)
+    except OSError as exc:
+        found = node_facts(needs, folder=folder)
+        return replace(found, missing=(*found.missing, f"a checkpoint cannot be written there ({exc})"))
+    return node_facts(needs, folder=folder)
 
 
 def free_memory_bytes() -> int:
@@ -98,4 +130,5 @@ def objections(found: NodeFacts, expected: NodeFacts, *, allow_other_kind: bool)
 
 
 def _code(facts: NodeFacts) -> dict[str, JsonValue]:
-    return {name: value for name, value in facts.environment.items() if name not in KIND_FACTS}
+    own = {name: value for name, value in facts.environment.items() if name not in KIND_FACTS}
+    return {**own, "recipes": dict(facts.recipes)}
