@@ -28,7 +28,7 @@ from vla_eval.evaluation.grid import (
 )
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.scripted import make_oracle
-from vla_eval.results.paper_table import PAPER_TABLE
+from vla_eval.results.published import paper_figures
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
 
@@ -47,6 +47,7 @@ USED = {
         "format",
         "baseline",
         "paper",
+        "published",
         "preset",
         "wide",
         "tiny",
@@ -83,7 +84,7 @@ def changed(small: Path, **changes: Any) -> Path:
 def test_the_papers_table_is_five_rows_on_five_tasks_in_three_runs() -> None:
     table = load_model_table(PAPER)
     assert {row.n_action_steps for row in table.rows} == {(4,), (8,)} and len(table.rows) == 5
-    assert set(table.tasks) == {figure.task for figure in PAPER_TABLE}
+    assert set(table.tasks) == {figure.task for figure in paper_figures()}
     every = finetunings(table, Path("out"))
     assert len(every) == 5 * 5 * 3 and len({one.config.out for one in every}) == 75
     assert all(one.config.finetune["steps"] == 50_000 for one in every)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 # Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
 FORMATS = ("markdown", "csv", "json", "latex", "html-table")
 PRESETS = ("paper",)
+DEFAULT_BOARD = "leaderboard_mikasa"
 
 
 def add_table_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +36,13 @@ def add_table_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper", action="store_true", help="print the paper's figures for the same tasks beside yours"
     )
+    parser.add_argument(
+        "--published",
+        nargs="?",
+        const=DEFAULT_BOARD,
+        metavar="NAME",
+        help=f"print published results beside yours, with their sources ({DEFAULT_BOARD})",
+    )
 
 
 def print_table(
@@ -44,7 +52,15 @@ def print_table(
     from vla_eval.results.report import build_table, render
 
     table = build_table(runs, baseline=args.baseline, protocols=getattr(args, "protocols", ()))
-    text = render(table, args.format, paper=args.paper, columns=columns, wide=args.wide, preset=args.preset)
+    text = render(
+        table,
+        args.format,
+        paper=args.paper,
+        published=args.published,
+        columns=columns,
+        wide=args.wide,
+        preset=args.preset,
+    )
     print(text)
     if args.format == "csv":  # has no place for them
         for note in table.notes:
@@ -56,17 +72,22 @@ def check_table_arguments(args: argparse.Namespace) -> None:
 
     Raises:
         ReportError: a preset or --wide in a format that does not take it.
+        UnknownNameError: there is no such list of published results.
     """
+    from vla_eval.results.published import load_published
     from vla_eval.results.table_formats import check_format
 
-    check_format(args.format, columns=(), wide=args.wide, preset=args.preset, paper=args.paper)
+    beside = args.paper or args.published is not None
+    check_format(args.format, columns=(), wide=args.wide, preset=args.preset, beside=beside)
+    if args.published is not None:
+        load_published().of_board(args.published)
 
 
 def write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
     """Write the report page and say where."""
     from vla_eval.page.build import write_page
 
-    page = write_page(runs, args.html, baseline=args.baseline)
+    page = write_page(runs, args.html, baseline=args.baseline, published=args.published)
     sys.stdout.flush()  # the table first, wherever the two go
     print(f"Report page: {page}", file=sys.stderr)
 

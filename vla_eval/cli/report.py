@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
 
 Each RUN is a folder that `mikasa-vla eval` made; a run may still be unfinished. Several runs go into one
-table: rows with the same task, policy, n_action_steps and settings are put together.
+table: rows with the same task, policy, n_action_steps and settings are put together. Without a RUN,
+--published prints published results alone.
 
 With --html, a page with plots, choices, errors and videos is written instead, and its path printed. With
 --filmstrip, an image per row of the table: ten seeds, cue | reveal | touch."""
@@ -30,7 +31,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         description=DESCRIPTION,
         epilog="The columns are explained in docs/statistics.md.",
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folder (runs/…)")
     add_table_arguments(parser)
     parser.add_argument(
         "--protocol",
@@ -72,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.probe.report_text import probe_texts
     from vla_eval.storage.run_folder import read_run
 
+    if not args.runs:
+        return _print_published(args)
     runs = [read_run(path) for path in args.runs]
     if args.html is not None:
         _check_alone("--html writes a page", args)
@@ -87,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
             baseline=args.baseline,
             probes=probe_sections(runs),
             protocols=args.protocols,
+            published=args.published,
         )
         print(page)
     if args.filmstrip is not None:
@@ -97,6 +101,17 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "markdown":
         for text in probe_texts(runs):
             print(f"\n{text}")
+    return 0
+
+
+def _print_published(args: argparse.Namespace) -> int:
+    """Print published results alone, without a run."""
+    from vla_eval.errors import ReportError
+    from vla_eval.results.table_formats import render_published
+
+    if args.published is None or args.html is not None or args.filmstrip is not None:
+        raise ReportError("Name at least one RUN, a run folder, or --published alone.")
+    print(render_published(args.published, args.format))
     return 0
 
 

@@ -34,6 +34,7 @@ def build_page(
     baseline: str | None = None,
     probes: Sequence[ProbeSection] = (),
     protocols: Sequence[str] = (),
+    published: str | None = None,
     folder: Path | None = None,
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
@@ -43,6 +44,7 @@ def build_page(
         baseline: as for `build_table`.
         probes: those that the run folders are of.
         protocols: as for `build_table`.
+        published: as for `render`.
         folder: where the page will be, for links to captures; None: the current folder.
 
     Raises:
@@ -65,7 +67,7 @@ def build_page(
         script_hash=_script_hash(script),
         n_open_matrices=N_OPEN_MATRICES,
         results=rates.results(material),
-        sides=rates.side_sections(material.table),
+        sides=rates.side_sections(material.table, published=published),
         success=rates.success_plots(material),
         chunks=chunks,
         sweep=rates.chunk_sweep(material) if chunks.charts else None,
@@ -88,6 +90,7 @@ def write_page(
     baseline: str | None = None,
     probes: Sequence[ProbeSection] = (),
     protocols: Sequence[str] = (),
+    published: str | None = None,
 ) -> Path:
     """Write the page and return its path.
 
@@ -97,12 +100,15 @@ def write_page(
         baseline: as for `build_page`.
         probes: as for `build_page`.
         protocols: as for `build_table`.
+        published: as for `render`.
 
     Raises:
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(runs, baseline=baseline, probes=probes, protocols=protocols, folder=folder)
+    page = build_page(
+        runs, baseline=baseline, probes=probes, protocols=protocols, published=published, folder=folder
+    )
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -21,11 +21,12 @@ from vla_eval.page.charts import (
 )
 from vla_eval.page.material import Material, key_of
 from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
-from vla_eval.results.side_tables import SideTable, side_tables
+from vla_eval.results.side_table import SideTable
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_cells, sweep_notes
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of
+from vla_eval.results.table_formats import side_tables
 
 MAX_STEP_TICKS = 7
 
@@ -84,9 +85,9 @@ class SideSection(NamedTuple):
     notes: tuple[str, ...]
 
 
-def side_sections(table: Table) -> tuple[SideSection, ...]:
+def side_sections(table: Table, *, published: str | None) -> tuple[SideSection, ...]:
     """Return the tables that `mikasa-vla report` prints below the success table."""
-    return tuple(_side_section(side) for side in side_tables(table))
+    return tuple(_side_section(side) for side in side_tables(table, published=published))
 
 
 def _side_section(side: SideTable) -> SideSection:

@@ -12,7 +12,9 @@ from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cel
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.latex import latex_table, latex_text
 from vla_eval.results.latex_preset import paper_preset
-from vla_eval.results.side_tables import SideTable, side_tables
+from vla_eval.results.protocol_table import protocol_side_table
+from vla_eval.results.published_table import paper_side_table, published_side_tables
+from vla_eval.results.side_table import SideTable
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of
 
@@ -30,6 +32,7 @@ def render(
     fmt: Format,
     *,
     paper: bool = False,
+    published: str | None = None,
     columns: Sequence[str] = (),
     wide: bool = False,
     preset: Preset | None = None,
@@ -41,6 +44,7 @@ def render(
         fmt: `markdown`, `latex` and `html-table` are for reading, `csv` and `json` have every column in full
             precision.
         paper: add the paper's results for the same tasks, marked and separate from the measured ones.
+        published: add the published results of this board, marked and separate from the measured ones.
         columns: names of the columns in the formats for reading, in this order; none: those that fit.
         wide: all columns in the formats for reading, however wide the table becomes, and a row per run.
         preset: `paper`: LaTeX with tasks as columns and policies as rows.
@@ -49,11 +53,11 @@ def render(
         The text, without a newline at its end.
 
     Raises:
-        UnknownNameError: there is no such column.
+        UnknownNameError: there is no such column or board.
         ReportError: columns are selected for a format that has all of them, or a preset that it has not.
     """
-    check_format(fmt, columns=columns, wide=wide, preset=preset, paper=paper)
-    sides = side_tables(table, paper=paper)
+    check_format(fmt, columns=columns, wide=wide, preset=preset, beside=paper or published is not None)
+    sides = side_tables(table, paper=paper, published=published)
     if preset is not None:
         return paper_preset(table)
     if fmt == "csv":
@@ -64,27 +68,42 @@ def render(
     return {"markdown": _markdown, "latex": _latex, "html-table": _html}[fmt](table, layout, sides)
 
 
+def render_published(board: str, fmt: Format) -> str:
+    """Write the published results of a board without measured ones; see `render`."""
+    empty = Table(rows=(), notes=(), baselines=(), n_comparisons=0, runs={})
+    return render(empty, fmt, published=board)
+
+
 def check_format(
-    fmt: Format, *, columns: Sequence[str], wide: bool, preset: Preset | None, paper: bool
+    fmt: Format, *, columns: Sequence[str], wide: bool, preset: Preset | None, beside: bool
 ) -> None:
-    """Refuse what a format does not have; arguments as for `render`.
+    """Refuse what a format does not have; arguments as for `render`, `beside`: published results are added.
 
     Raises:
         ReportError: columns are selected for a format that has all of them, or a preset that it has not.
     """
-    if preset is not None and (fmt != "latex" or columns or wide or paper):
+    if preset is not None and (fmt != "latex" or columns or wide or beside):
         raise ReportError(
             f"--preset {preset} is a whole table in LaTeX, with its own columns. Add --format latex, and "
-            "remove --columns, --wide and --paper."
+            "remove --columns, --wide, --paper and --published."
         )
     if fmt in ("csv", "json") and (columns or wide):
         flag = "--columns" if columns else "--wide"
         raise ReportError(f"{flag}: {fmt} has every column. Remove {flag}, or use {', '.join(FOR_READING)}.")
 
 
+def side_tables(table: Table, *, paper: bool = False, published: str | None = None) -> list[SideTable]:
+    """Return the tables below a success table; arguments as for `render`."""
+    return [
+        *([protocol_side_table(table)] if table.protocols else []),
+        *([paper_side_table(table)] if paper else []),
+        *(published_side_tables(published) if published is not None else []),
+    ]
+
+
 def _notes(table: Table, layout: Layout) -> list[str]:
     """Return the notes of the table, and which columns it lacks."""
-    if not layout.left_out:
+    if not layout.left_out or not table.rows:
         return list(table.notes)
     return [*table.notes, f"not shown: {some_of(layout.left_out)} (`--wide` shows every column)."]
 
@@ -104,13 +123,21 @@ def _markdown(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     parts = []
     if layout.same:
         parts.append(sentence_of([(title, markdown_cell(cell)) for title, cell in layout.same]))
-    parts.append(markdown_table(_titles(layout), layout.cells, _is_number(layout)))
+    if table.rows:
+        parts.append(markdown_table(_titles(layout), layout.cells, _is_number(layout)))
     if notes := _notes(table, layout):
         parts.append("\n".join(f"- {markdown_text(note)}" for note in notes))
-    for side in sides:
-        if side.rows:
-            parts.append(f"**{markdown_text(side.title)}**")
-            parts.append(markdown_table(side.titles, side.rows, side.is_number))
+    parts += [markdown_side_table(side) for side in sides]
+    return "\n\n".join(parts)
+
+
+def markdown_side_table(side: SideTable) -> str:
+    """Return a table below the success table: title, table, notes."""
+    parts = []
+    if side.rows:
+        parts.append(f"**{markdown_text(side.title)}**")
+        parts.append(markdown_table(side.titles, side.rows, side.is_number))
+    if side.notes:
         parts.append("\n".join(f"- {markdown_text(note)}" for note in side.notes))
     return "\n\n".join(parts)
 
@@ -164,7 +191,8 @@ def _json(table: Table, sides: Sequence[SideTable]) -> str:
         "run_rows": [row.to_dict() for row in table.run_rows],
         "notes": list(table.notes),
     }
-    data |= {side.json_name: side.json_value for side in sides}
+    for side in sides:
+        data |= side.json
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
 
 
@@ -173,7 +201,8 @@ def _latex(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     if layout.same:
         lines.append(f"{{\\footnotesize {latex_text(sentence_of(layout.same))}\\par}}\\smallskip")
     by_task = layout.columns[0].name == "task"
-    lines += latex_table(_titles(layout), layout.cells, _is_number(layout), ruled_by_first=by_task)
+    if table.rows:
+        lines += latex_table(_titles(layout), layout.cells, _is_number(layout), ruled_by_first=by_task)
     lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in _notes(table, layout)]
     for side in sides:
         if side.rows:
@@ -185,7 +214,8 @@ def _latex(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
 
 def _html(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
     parts = [f"<p>{html_text(sentence_of(layout.same))}</p>"] if layout.same else []
-    parts.append(html_table(_titles(layout), layout.cells, _is_number(layout)))
+    if table.rows:
+        parts.append(html_table(_titles(layout), layout.cells, _is_number(layout)))
     parts += _html_notes(_notes(table, layout))
     for side in sides:
         if side.rows:

@@ -1,85 +1,14 @@
-"""Tables below the success table: a protocol's summary figures, the paper's results. Knows no format.
+"""Summary figures of protocols as a table below the success table."""
 
-They are never rows of the success table, so that nothing published is mistaken for a measured value.
-"""
-
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, fields
 from typing import Any
 
-from vla_eval.results import paper_table
-from vla_eval.results.paper_table import PAPER_TABLE
+from vla_eval.results.side_table import SideTable
 from vla_eval.results.success_table import ProtocolRow, Table
 from vla_eval.results.table_columns import UNDEFINED, rate
 
 NOT_THE_PROTOCOL = "not the protocol"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SideTable:
-    """A table below the success table.
-
-    Attributes:
-        title: a sentence without its full stop.
-        titles, rows, is_number: of the columns in formats for reading; without rows only the notes appear.
-        notes: whole sentences.
-        csv_columns: those that the success table has not.
-        csv_rows: column -> value; `source` says that they are not measured episodes.
-        json_name, json_value: the field of the JSON report.
-        ruled_by_first: draw a rule wherever the first cell changes.
-    """
-
-    title: str
-    titles: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    is_number: Sequence[bool]
-    notes: Sequence[str]
-    csv_rows: Sequence[Mapping[str, object]]
-    json_name: str
-    json_value: object
-    csv_columns: Sequence[str] = ()
-    ruled_by_first: bool = False
-
-
-def side_tables(table: Table, *, paper: bool = False) -> list[SideTable]:
-    """Return the tables below a success table.
-
-    Args:
-        table: what `build_table` returned.
-        paper: the paper's results for the same tasks are one of them.
-    """
-    return [
-        *([protocol_side_table(table)] if table.protocols else []),
-        *([paper_side_table(table)] if paper else []),
-    ]
-
-
-def paper_side_table(table: Table) -> SideTable:
-    """Return the paper's results for the tasks of a table."""
-    tasks = dict.fromkeys(row.task for row in table.rows)
-    figures = [figure for task in tasks for figure in PAPER_TABLE if figure.task == task]
-    return SideTable(
-        title=f"The paper's figures, not measured here ({paper_table.PROTOCOL})",
-        titles=["task", "model (paper)", "K", "success once (paper)"],
-        rows=[
-            [one.task, one.model, str(one.n_action_steps), f"{one.success_once:.2f} ± {one.sem:.2f}"]
-            for one in figures
-        ],
-        is_number=[False, False, True, True],
-        notes=[
-            f"Source: {paper_table.SOURCE}."
-            if figures
-            else "The paper's table of VLA models has none of these tasks."
-        ],
-        csv_rows=[{"source": "paper", "policy": one.model, **asdict(one)} for one in figures],
-        json_name="paper",
-        json_value={
-            "source": paper_table.SOURCE,
-            "protocol": paper_table.PROTOCOL,
-            "rows": [asdict(figure) for figure in figures],
-        },
-        ruled_by_first=True,
-    )
 
 
 def protocol_side_table(table: Table) -> SideTable:
@@ -116,8 +45,7 @@ def protocol_side_table(table: Table) -> SideTable:
         notes=_protocol_notes(rows),
         csv_columns=("departures",),
         csv_rows=[_csv_row(row) for row in rows],
-        json_name="protocols",
-        json_value=[asdict(row) for row in rows],
+        json={"protocols": [asdict(row) for row in rows]},
     )
 
 

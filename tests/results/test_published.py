@@ -1,0 +1,103 @@
+"""Published results: what they are checked for, and that they are never taken for measured ones."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import pytest
+
+from tests.results.stored_runs import episodes, stored
+from vla_eval.cli.main import main
+from vla_eval.errors import RecipeError, UnknownNameError
+from vla_eval.page.build import build_page
+from vla_eval.results.published import Published, PublishedRate, load_published, paper_figures
+from vla_eval.results.published_table import published_side_tables
+from vla_eval.results.report import build_table, render
+
+BOARD = "leaderboard_mikasa"
+
+
+def test_a_mean_is_the_sources_or_computed_from_every_task_or_unknown() -> None:
+    published = load_published()
+    by_name = {(one.method, one.n_action_steps): one for one in published.of_board(BOARD)}
+    octo = by_name["Octo-small", 4]
+    assert octo.mean is None
+    assert published.mean_of(octo) == pytest.approx((0.46 + 0.39 + 0.45 + 0.17 + 0.11) / 5)
+    assert published.mean_of(by_name["SimpleMemVLA", None]) == 0.74
+    assert published.mean_of(by_name["ELMUR", None]) is None  # three of five tasks
+
+
+def test_a_stated_mean_agrees_with_its_rates() -> None:
+    published = load_published()
+    for one in published.results:
+        if one.mean is not None and one.rates:
+            computed = published.mean_of(replace(one, mean=None))
+            assert computed == pytest.approx(one.mean.rate, abs=0.001), one.method
+
+
+def test_unknown_values_are_dashes_and_contested_ones_are_marked() -> None:
+    rates, how = published_side_tables(BOARD)
+    rows = {(row[0], row[1]): row for row in rates.rows}
+    assert rows["Chameleon", "—"][2:7] == ["—"] * 5
+    assert rows["RATE", "—"][3] == "0.32 ± 0.02 ‡"
+    assert any("0.09 ± 0.03 in the appendix" in note for note in rates.notes)
+    assert {row[0] for row in how.rows} == {row[0] for row in rates.rows}
+    here = [row[0] for row in rates.rows if "[measured here]" in row[0]]
+    assert here == ["memory [measured here]", "cue_blind [measured here]"]
+
+
+@pytest.mark.parametrize("fmt", ["markdown", "latex", "html-table"])
+def test_they_stand_below_the_measured_table_with_a_title_that_says_so(fmt: str) -> None:
+    table = build_table([stored(episodes("p", "++--"))])
+    text = render(table, fmt, published=BOARD)  # type: ignore[arg-type]
+    measured, published = text.split("Published results, not measured here unless marked")
+    assert "MemoryVLA" in published
+    assert "MemoryVLA" not in measured
+
+
+def test_they_are_marked_in_csv_and_json() -> None:
+    table = build_table([stored(episodes("p", "++--"))])
+    lines = list(csv.DictReader(io.StringIO(render(table, "csv", published=BOARD))))
+    assert [line["source"] for line in lines].count("measured") == 1
+    unmarked = {line["source"] for line in lines} - {"measured"}
+    assert unmarked == {"published", "measured here, not in these runs"}
+    assert all(line["success_once"] for line in lines)  # what is unknown has no line
+    data = json.loads(render(table, "json", published=BOARD))
+    assert len(data["rows"]) == 1
+    assert data["published"]["rows"][0]["rates"] == {}
+
+
+def test_the_papers_table_is_part_of_the_same_file() -> None:
+    cells = {(one.model, one.n_action_steps, one.task): one.success_once for one in paper_figures()}
+    assert len(cells) == 25  # five rows, five tasks
+    assert cells["OpenVLA", 8, "RememberColor3-v0"] == 0.59
+
+
+def test_a_result_of_an_unknown_task_or_rate_is_refused() -> None:
+    published = load_published()
+    wrong = replace(published.results[0], rates={"RememberColor4-v0": PublishedRate(rate=0.5)})
+    with pytest.raises(RecipeError, match="RememberColor4"):
+        Published(
+            checked=published.checked,
+            sources=published.sources,
+            boards=published.boards,
+            results=(wrong,),
+        )
+    with pytest.raises(RecipeError, match="a number from 0 to 1"):
+        PublishedRate(rate=41.2)  # percent
+    with pytest.raises(UnknownNameError, match="Did you mean 'leaderboard_mikasa'"):
+        published_side_tables("leaderbord_mikasa")
+
+
+def test_report_prints_them_without_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "--published"]) == 0
+    assert "MemoryVLA++" in capsys.readouterr().out
+    assert main(["report"]) == 1
+    assert "Name at least one RUN" in capsys.readouterr().err
+
+
+def test_the_page_has_them_below_its_results() -> None:
+    runs = [stored(episodes("p", "++--"))]
+    assert "MemoryVLA++" in build_page(runs, published=BOARD)
+    assert "MemoryVLA++" not in build_page(runs)
