@@ -26,8 +26,8 @@ test: setup  ## run the tests that need neither GPU, network nor much time
 test-all: setup  ## run every test this machine can run
 	$(PYTEST) -m "not network and not parity and not peer and not full_size"
 
-rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory and disk
-	REHEARSAL_TABLE=rehearsal.jsonl $(BIN)/python -m pytest -n 0 -m full_size tests/testing/test_full_size.py
+rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory, 30 GB of disk
+	$(BIN)/python scripts/rehearse.py
 
 gpu-check: setup  ## measure a machine with a GPU: at most 30 minutes, resumable, writes runs/gpu_check
 	$(BIN)/python scripts/gpu_check.py

@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import time
-import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,30 +79,10 @@ def rendering_speed(check: Check) -> dict[str, Any]:
 
 
 def golden(check: Check) -> dict[str, Any]:
-    """Compare OpenVLA-OFT's tiny network with the original's stored actions in several precisions."""
-    import torch
+    """Compare the tiny networks of the golden files with what the originals said, in several precisions."""
+    from golden_differences import compare
 
-    _find_tests()
-    from tests.policies.openvla import openvla_golden
-    from vla_eval.policies.openvla.network import Inputs
-
-    expected = openvla_golden.values()["infer.img2.prompt1.actions_normalized"]
-    found: dict[str, Any] = {}
-    for name, dtype, tf32 in (
-        ("float32", torch.float32, False),
-        ("float32, TF32", torch.float32, True),
-        ("bfloat16", torch.bfloat16, False),
-    ):
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = tf32
-        network = openvla_golden.network().to(check.device, dtype)
-        network.action_head.float()
-        prompts = openvla_golden.prompts("prompt1")
-        moved = type(prompts)(*(x.to(check.device) for x in prompts))
-        inputs = Inputs(openvla_golden.images(2)[:1].to(check.device), moved)
-        with torch.no_grad():
-            actions = network.actions(inputs)[0].float().cpu()
-        found[name] = float((actions - expected).abs().max())
-    return {"largest_difference_of_actions": found, "tolerance_in_tests": openvla_golden.TOLERANCE}
+    return compare(check.device)
 
 
 def rehearsals(check: Check) -> dict[str, Any]:
@@ -286,13 +265,6 @@ def _command(*arguments: str, may_fail: bool = False) -> "subprocess.CompletedPr
     if done.returncode != 0 and not may_fail:
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-1500:]}")
     return done
-
-
-def _find_tests() -> None:
-    """Let `tests` be this project's folder: an installed package has a folder of that name, too."""
-    tests = types.ModuleType("tests")
-    tests.__path__ = [str(ROOT / "tests")]
-    sys.modules["tests"] = tests
 
 
 def _machine(check: Check) -> dict[str, Any]:

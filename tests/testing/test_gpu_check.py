@@ -1,25 +1,18 @@
 """`make gpu-check` stores each part, resumes with the next one, and says why a part cannot run."""
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "gpu_check.py"
+from tests.testing.script_files import SCRIPTS, load_script
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gpu_check", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "gpu_check", module)
-    spec.loader.exec_module(module)
-    return module
+def script() -> Any:
+    return load_script("gpu_check")
 
 
 def test_parts_are_stored_and_only_failed_ones_run_again(
@@ -50,3 +43,18 @@ def test_parts_are_stored_and_only_failed_ones_run_again(
     assert stored["fails"]["why"] == "ValueError: mistake"
     page = (tmp_path / "gpu_check.md").read_text()
     assert "these figures only show that the script runs" in page and "no GPU here" in page
+
+
+def test_all_ports_are_compared_with_their_originals_and_agree_in_float32(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "tests", sys.modules["tests"])  # put back what the script replaces
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    found = load_script("golden_differences").compare("cpu")
+    differences, tolerances = found["largest_differences"], found["tolerances_in_tests"]
+    assert set(differences) == set(tolerances) == {"openvla_oft", "spatialvla", "octo"}
+    for model, tolerated in tolerances.items():
+        assert set(differences[model]) == {"float32", "float32, TF32", "bfloat16"}
+        for name, limit in tolerated.items():
+            assert differences[model]["float32"][name] <= limit
+        assert max(differences[model]["bfloat16"].values()) > max(tolerated.values())  # it had an effect

@@ -81,7 +81,7 @@ def stand_in_config(
         dtype: precision, for policies with such a setting; None: the recipe's.
         tiny: build the π0 family and SmolVLA in their tiny form.
     """
-    changes: dict[str, Any] = {} if dtype is None else {"dtype": dtype}
+    changes: dict[str, Any] = {}
     tokenizer: Path | None = None
     kind = recipe.type
     if kind in BYTE_TOKENIZER_SIZES:
@@ -99,6 +99,8 @@ def stand_in_config(
     elif kind == "pi0_fast":
         tokenizer, own = _fast_tokenizers(folder, tiny=tiny)
         changes |= own
+    if dtype is not None:
+        changes["dtype"] = dtype
     base = recipe.base_checkpoint
     changed = FinetuneRecipe(type=kind, policy={**recipe.policy, **changes}, base_checkpoint=base)
     return assumed_config(changed), tokenizer

@@ -3,19 +3,25 @@
 `tests/golden/octo/README.md` says what the stored tensors are and how close to expect them.
 """
 
-import json
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, cast
 from unittest.mock import patch
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
 from tests.policies.golden_values import GoldenValues
+from tests.policies.octo.octo_golden import (
+    CONFIG,
+    TIGHT,
+    make_network,
+    original_weights,
+    sampling_noise,
+    values,
+    window,
+)
 from vla_eval.errors import CheckpointError
 from vla_eval.policies.octo import diffusion_head, transformer
 from vla_eval.policies.octo.diffusion_head import Draws, HeadSizes, Targets, cosine_schedule
@@ -23,79 +29,23 @@ from vla_eval.policies.octo.flax_names import from_flax, our_name
 from vla_eval.policies.octo.network import OctoNetwork
 from vla_eval.policies.octo.transformer import Outputs, TransformerSizes, Window
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "octo"
-CONFIG: dict[str, Any] = json.loads((GOLDEN / "config.json").read_text())
-TIGHT, GROUPS = 1e-5, 3e-5  # readouts, noise, samples, losses; image tokens and observation groups
+GROUPS = 3e-5  # absolute, as `TIGHT`: image tokens and observation groups
 WITH_LANGUAGE = [case for case in CONFIG["cases"] if case != "w2_nolang"]
 
 
 @pytest.fixture(scope="module")
 def io() -> GoldenValues:
-    return GoldenValues(GOLDEN / "io.safetensors")
+    return values()
 
 
 @pytest.fixture(scope="module")
 def weights() -> dict[str, Tensor]:
-    return dict(load_file(GOLDEN / "weights.safetensors"))
-
-
-def sizes() -> tuple[TransformerSizes, HeadSizes]:
-    head, stem = CONFIG["action_head"], CONFIG["stem"]
-    return (
-        TransformerSizes(
-            image_px={name: camera["image_size"] for name, camera in CONFIG["cameras"].items()},
-            max_window=CONFIG["max_horizon"],
-            language_tokens=CONFIG["language_tokens"],
-            language_width=CONFIG["language_embedding_dim"],
-            width=CONFIG["token_embedding_size"],
-            layers=CONFIG["num_layers"],
-            heads=CONFIG["num_attention_heads"],
-            mlp_width=CONFIG["mlp_dim"],
-            stem_channels=tuple(stem["features"]),
-            stem_features=stem["num_features"],
-        ),
-        HeadSizes(
-            condition=CONFIG["token_embedding_size"],
-            chunk=head["action_horizon"],
-            action=head["action_dim"],
-            hidden=head["hidden_dim"],
-            blocks=head["num_blocks"],
-            time=head["time_dim"],
-            diffusion_steps=head["diffusion_steps"],
-            max_action=head["max_action"],
-        ),
-    )
-
-
-def make_network(weights: Mapping[str, Tensor]) -> OctoNetwork:
-    made = OctoNetwork(*sizes())
-    converted = from_flax(weights)
-    prefix = "network."
-    own = {key.removeprefix(prefix): x for key, x in converted.items() if key.startswith(prefix)}
-    made.load_state_dict(own, strict=True)
-    return made
+    return original_weights()
 
 
 @pytest.fixture(scope="module")
 def network(weights: dict[str, Tensor]) -> OctoNetwork:
     return make_network(weights)
-
-
-def window(io: Mapping[str, Tensor], case: str) -> Window:
-    n_steps = io[f"{case}.timestep_pad_mask"].shape[1]
-    images, masks = {}, {}
-    for camera in CONFIG["cameras"]:
-        frames = io[f"in.image_{camera}"][:, -n_steps:].permute(0, 1, 4, 2, 3).float()
-        images[camera] = frames
-        none = torch.zeros(frames.shape[:2], dtype=torch.bool)
-        masks[camera] = io.get(f"{case}.pad_mask_{camera}", none)
-    return Window(
-        images=images,
-        image_mask=masks,
-        step_mask=io[f"{case}.timestep_pad_mask"],
-        language_BLD=io["mid.language_embeddings"],
-        language_mask=io[f"{case}.pad_mask_language"],
-    )
 
 
 def furthest(found: Tensor, expected: Tensor) -> float:
@@ -162,8 +112,8 @@ class TestForward:
 class TestDiffusion:
     def test_the_schedule_is_that_of_the_original(self, io: Mapping[str, Tensor]) -> None:
         schedule = cosine_schedule(CONFIG["action_head"]["diffusion_steps"])
-        for name, values in zip(("betas", "alphas", "alpha_hats"), schedule, strict=True):
-            assert furthest(values, io[f"schedule.{name}"]) < 1e-6
+        for name, numbers in zip(("betas", "alphas", "alpha_hats"), schedule, strict=True):
+            assert furthest(numbers, io[f"schedule.{name}"]) < 1e-6
 
     @pytest.mark.parametrize("case", ["w1", "wmax_padhist"])
     @torch.no_grad()
@@ -195,11 +145,6 @@ class TestDiffusion:
             found = dict(network.named_parameters())[name.removeprefix("network.")].grad
             expected = from_flax({key.removeprefix(stored): io[key]})[name]
             assert furthest(cast(Tensor, found), expected) < TIGHT
-
-
-def sampling_noise(io: Mapping[str, Tensor], case: str) -> Tensor:
-    start, added = io[f"sample.{case}.x_init"][:, None], io[f"sample.{case}.z"].transpose(0, 1)
-    return torch.cat([start, added], dim=1)[:, :, -1]  # of the window, the newest step is executed
 
 
 def loss_of(network: OctoNetwork, io: Mapping[str, Tensor], case: str) -> Tensor:
