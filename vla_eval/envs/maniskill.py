@@ -11,14 +11,22 @@ from collections.abc import Mapping
 from typing import Any, get_type_hints  # ManiSkill is untyped: its environments and infos are Any here
 
 import numpy as np
-import sapien
 import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
-from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
+from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes
 from vla_eval.envs.cue_location import boxes_of_cue
-from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
+from vla_eval.envs.scenes import (
+    RENDERING_ADVICE,
+    describe,
+    render_backend,
+    take_human_image,
+    take_images,
+    to_array,
+    to_vector,
+)
+from vla_eval.envs.shaders import use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
@@ -33,10 +41,6 @@ from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.spec import TaskSpec
 
 ROBOT = "robot_uids"
-RENDERING_ADVICE = (
-    "Run `mikasa-vla doctor`; on a machine without GPU, SAPIEN needs Mesa's lavapipe ≥ 24.3, which "
-    "`make setup` installs."
-)
 
 
 # ManiSkill collects garbage whenever it rebuilds a scene, which our tasks do at each reset. With all objects
@@ -82,7 +86,7 @@ class ManiSkillEnv:
             control_hz=CONTROL_HZ,
         )
         self.n_candidates = len(self._envs[0].candidates) if isinstance(self._envs[0], ChoiceEnv) else 0
-        self.device = _describe(self._envs[0], settings)
+        self.device = describe(self._envs[0], settings)
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
         """Begin an episode in each of the given slots; see `SimEnv.reset`."""
@@ -114,7 +118,7 @@ class ManiSkillEnv:
     def hold_action(self, slot: int) -> FloatArray:
         """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
         index, row = divmod(slot, self._slots_per_env)
-        return _array(self._envs[index].hold_action()[row])
+        return to_array(self._envs[index].hold_action()[row])
 
     def cue_boxes(self, slot: int) -> CueBoxes:
         """Return where in the images the cue is; see `CueLocator`."""
@@ -148,9 +152,9 @@ class ManiSkillEnv:
         executed = None if reward is None else env.executed_action
         images = {}
         if render.intersection(slots):
-            images = _take_pictures(env, self._settings.cameras)
+            images = take_images(env, self._settings.cameras)
             if self._shows_human(info, slots):
-                images[HUMAN_CAMERA] = _take_human_picture(env)
+                images[HUMAN_CAMERA] = take_human_image(env)
         state = {
             "tcp_pose": env.agent.tcp.pose.raw_pose,
             "qpos": env.agent.robot.get_qpos(),
@@ -164,30 +168,20 @@ class ManiSkillEnv:
             observation = Observation(
                 step=int(info["elapsed_steps"][row]),
                 images={name: batch[row].copy() for name, batch in images.items()} if slot in render else {},
-                state={name: _array(batch[row]) for name, batch in state.items()},
+                state={name: to_array(batch[row]) for name, batch in state.items()},
                 privileged=_privileged(env, info, row) if self._settings.privileged else None,
             )
             results[slot] = StepResult(
                 observation=observation,
                 status=_status(env, info, row),
                 reward=0.0 if reward is None else float(reward[row]),
-                executed_action=None if executed is None else _array(executed[row]),
+                executed_action=None if executed is None else to_array(executed[row]),
             )
         return results
 
 
-def _take_human_picture(env: Any) -> ImageArray:
-    """Return (B, H, W, 3) uint8 of the camera for viewers; policies' images are not affected."""
-    env.scene.update_render(update_sensors=False, update_human_render_cameras=True)
-    (camera,) = env.scene.human_render_cameras.values()
-    camera.capture()
-    textures = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)
-    image: ImageArray = textures["rgb"].cpu().numpy()
-    return image
-
-
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
-    backend = _render_backend(settings)
+    backend = render_backend(settings)
     if backend != "none":
         use_lean_shaders()
     try:
@@ -219,15 +213,6 @@ def _robot(settings: EnvSettings, kwargs: Mapping[str, Any]) -> str:
             "default arm. Set only one of the two."
         )
     return str(kwargs[ROBOT])
-
-
-def _render_backend(settings: EnvSettings) -> str:
-    """Return the name ManiSkill uses; without cameras no renderer is started at all."""
-    if not settings.cameras:
-        return "none"
-    if settings.render.backend == "auto":
-        return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
-    return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
 
 
 def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: Mapping[str, Any]) -> None:
@@ -269,46 +254,6 @@ def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> in
     return horizon_steps
 
 
-def _describe(env: Any, settings: EnvSettings) -> dict[str, str]:
-    device = {"simulator": str(env.backend.sim_backend)}
-    if settings.cameras:
-        device["render_backend"] = str(env.backend.render_backend)
-        device["render_device"] = _render_device_name()
-    return device
-
-
-def _render_device_name() -> str:
-    """Return the first device's name in SAPIEN's own list, such as `llvmpipe (LLVM 15.0.6, 256 bits)`."""
-    for line in sapien.render.get_device_summary().splitlines():
-        if line.startswith("GPU:"):
-            return str(line.removeprefix("GPU:").strip())
-    return "unknown to SAPIEN"
-
-
-def _take_pictures(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
-    """Return camera name -> (B, H, W, 3) uint8.
-
-    Raises:
-        RenderingError: no camera was declared when the environment was made, or the scene has an environment
-            map.
-    """
-    if not cameras:
-        raise RenderingError(
-            "Images were requested, but this environment was made without cameras and has no renderer. "
-            "Name the cameras in EnvSettings.cameras."
-        )
-    check_no_environment_map(env.scene)
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    sensors = {name: env.scene.sensors[name] for name in cameras}
-    for sensor in sensors.values():  # all are submitted before the first image is waited for
-        sensor.capture()
-    images = {}
-    for name, sensor in sensors.items():
-        textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
-        images[name] = textures["rgb"].cpu().numpy()
-    return images
-
-
 def _status(env: Any, info: Any, row: int) -> TaskStatus:
     is_choice = isinstance(env, ChoiceEnv)
     first = int(info["first_choice"][row]) if is_choice else NO_CHOICE
@@ -331,12 +276,12 @@ def _status(env: Any, info: Any, row: int) -> TaskStatus:
 
 def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
     is_choice = isinstance(env, ChoiceEnv)
-    positions = _vector(env.final_positions_m()[row]) if is_choice else np.zeros((0, 3))
+    positions = to_vector(env.final_positions_m()[row]) if is_choice else np.zeros((0, 3))
     return PrivilegedState(
         phase=PHASES[int(info["phase"][row])],
         response_step=int(info["cue_steps"][row] + info["delay_steps"][row]),
-        tcp_position_m=_vector(env.agent.tcp.pose.p[row]),
-        tcp_velocity_m_s=_vector(env.agent.tcp.linear_velocity[row]),
+        tcp_position_m=to_vector(env.agent.tcp.pose.p[row]),
+        tcp_velocity_m_s=to_vector(env.agent.tcp.linear_velocity[row]),
         gripper_width_m=float(env.agent.robot.get_qpos()[row, -2:].sum()),
         candidate_positions_m=positions,
         target=_only(env.right_candidates(row)) if is_choice else None,
@@ -346,8 +291,8 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
         touched_candidates=env.touched_candidates(row) if is_choice else (),
         bodies={
             name: BodyState(
-                position_m=_vector(body.position_m[row]),
-                velocity_m_s=_vector(body.velocity_m_s[row]),
+                position_m=to_vector(body.position_m[row]),
+                velocity_m_s=to_vector(body.velocity_m_s[row]),
                 yaw_rad=float(body.yaw_rad[row]),
             )
             for name, body in env.moving_bodies().items()
@@ -358,12 +303,3 @@ def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
 
 def _only(right_candidates: tuple[int, ...]) -> int | None:
     return right_candidates[0] if len(right_candidates) == 1 else None
-
-
-def _array(tensor: Any) -> FloatArray:
-    copied: FloatArray = tensor.detach().cpu().numpy().astype(np.float32, copy=True)
-    return copied
-
-
-def _vector(tensor: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()

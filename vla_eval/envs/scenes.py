@@ -1,0 +1,91 @@
+"""What adapters of ManiSkill environments share: images, the renderer's name, tensors as arrays.
+
+Torch ends here. Knows nothing of tasks.
+"""
+
+from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
+
+import numpy as np
+import sapien
+import torch
+
+from vla_eval.config.environment import EnvSettings
+from vla_eval.core import FloatArray, ImageArray
+from vla_eval.envs.shaders import check_no_environment_map
+from vla_eval.errors import RenderingError
+
+RENDERING_ADVICE = (
+    "Run `mikasa-vla doctor`; on a machine without GPU, SAPIEN needs Mesa's lavapipe ≥ 24.3, which "
+    "`make setup` installs."
+)
+
+
+def render_backend(settings: EnvSettings) -> str:
+    """Return the name ManiSkill uses; without cameras no renderer is started at all."""
+    if not settings.cameras:
+        return "none"
+    if settings.render.backend == "auto":
+        return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
+    return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
+
+
+def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
+    """Return the devices of an environment by what they are for."""
+    device = {"simulator": str(env.backend.sim_backend)}
+    if settings.cameras:
+        device["render_backend"] = str(env.backend.render_backend)
+        device["render_device"] = _render_device_name()
+    return device
+
+
+def _render_device_name() -> str:
+    """Return the first device's name in SAPIEN's own list, such as `llvmpipe (LLVM 15.0.6, 256 bits)`."""
+    for line in sapien.render.get_device_summary().splitlines():
+        if line.startswith("GPU:"):
+            return str(line.removeprefix("GPU:").strip())
+    return "unknown to SAPIEN"
+
+
+def take_images(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
+    """Return camera name -> (B, H, W, 3) uint8.
+
+    Raises:
+        RenderingError: no camera was declared when the environment was made, or the scene has an environment
+            map.
+    """
+    if not cameras:
+        raise RenderingError(
+            "Images were requested, but this environment was made without cameras and has no renderer. "
+            "Name the cameras in EnvSettings.cameras."
+        )
+    check_no_environment_map(env.scene)
+    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    sensors = {name: env.scene.sensors[name] for name in cameras}
+    for sensor in sensors.values():  # all are submitted before the first image is waited for
+        sensor.capture()
+    images = {}
+    for name, sensor in sensors.items():
+        textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+        images[name] = textures["rgb"].cpu().numpy()
+    return images
+
+
+def take_human_image(env: Any) -> ImageArray:
+    """Return (B, H, W, 3) uint8 of the camera for viewers; policies' images are not affected."""
+    env.scene.update_render(update_sensors=False, update_human_render_cameras=True)
+    (camera,) = env.scene.human_render_cameras.values()
+    camera.capture()
+    textures = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+    image: ImageArray = textures["rgb"].cpu().numpy()
+    return image
+
+
+def to_array(tensor: Any) -> FloatArray:
+    """Return a tensor as new float32 numbers."""
+    copied: FloatArray = tensor.detach().cpu().numpy().astype(np.float32, copy=True)
+    return copied
+
+
+def to_vector(tensor: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return a tensor as new float64 numbers."""
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()
