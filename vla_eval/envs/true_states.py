@@ -1,0 +1,101 @@
+"""Keep what an environment shows apart from what is, where its `evaluate` writes poses.
+
+The official tasks show and hide objects by writing their poses in `evaluate`. On the GPU simulator such a
+write reaches the renderer and the success rule, but not the physics, which overwrites it at the next step. On
+the CPU simulator it moves the object: what was hidden 1000 m above the table falls, or is inside another body
+when it comes back. Here the true poses are remembered before `evaluate`, and put back before the next physics
+step.
+
+An object whose velocity `evaluate` also writes is not put back: with a pose and a velocity the code places it
+for good, as a battery that is returned to its slot. Knows nothing of single tasks.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from typing import Any  # ManiSkill is untyped: its environments, actors and infos are Any here
+
+import numpy as np
+import torch
+from mani_skill.utils.structs.actor import Actor
+
+Info = dict[str, Any]
+
+
+class TrueStates:
+    """Mixed in before the class of an environment with one scene on the CPU, see `with_true_states`."""
+
+    _evaluated: Info | None = None
+    _true_poses: Mapping[int, Any] = {}  # of what is shown elsewhere: id of the body -> sapien.Pose
+
+    def evaluate(self) -> Info:
+        """Evaluate once per control step; asked again, return the same and change nothing."""
+        if self._evaluated is None:
+            bodies = _movable(self)
+            before = {key: body.pose for key, body in bodies.items()}
+            with _velocity_writes() as placed:
+                self._evaluated = super().evaluate()  # type: ignore[misc]
+            self._true_poses = {
+                key: before[key]
+                for key, body in bodies.items()
+                if key not in placed and not _same(before[key], body.pose)
+            }
+        # Rewards write into what they are given.
+        return {
+            name: value.clone() if torch.is_tensor(value) else value
+            for name, value in self._evaluated.items()
+        }
+
+    def put_back(self) -> None:
+        """Give every object that `evaluate` only showed elsewhere its true pose."""
+        if self._true_poses:
+            bodies = _movable(self)
+            for key, pose in self._true_poses.items():
+                bodies[key].pose = pose
+        self._true_poses = {}
+        self._evaluated = None
+
+    def reset(self, *args: Any, **kwargs: Any) -> Any:
+        """Begin an episode with nothing evaluated."""
+        self._true_poses = {}
+        self._evaluated = None
+        return super().reset(*args, **kwargs)  # type: ignore[misc]
+
+    def _step_action(self, action: Any) -> Any:
+        self.put_back()
+        return super()._step_action(action)  # type: ignore[misc]
+
+
+def with_true_states(cls: Any) -> Any:
+    """Return the environment's class with its physics separated from what `evaluate` shows."""
+    return type(cls.__name__, (TrueStates, cls), {"__module__": cls.__module__})
+
+
+def _movable(env: Any) -> dict[int, Any]:
+    """Return the bodies that can move, by their ids; a view of several actors has the ids of theirs."""
+    return {
+        entity.per_scene_id: entity
+        for actor in env.scene.actors.values()
+        if actor.px_body_type != "static"
+        for entity in actor._objs
+    }
+
+
+def _same(one: Any, other: Any) -> bool:
+    return np.array_equal(one.p, other.p) and np.array_equal(one.q, other.q)
+
+
+@contextlib.contextmanager
+def _velocity_writes() -> Iterator[set[int]]:
+    """Give the ids of the bodies whose linear velocity is written within."""
+    placed: set[int] = set()
+    original = Actor.set_linear_velocity
+
+    def noting(actor: Any, velocity: Any) -> None:
+        placed.update(entity.per_scene_id for entity in actor._objs)
+        original(actor, velocity)
+
+    Actor.set_linear_velocity = noting
+    try:
+        yield placed
+    finally:
+        Actor.set_linear_velocity = original
