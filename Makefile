@@ -3,7 +3,7 @@
 # If it is set, each of the many test processes compiles torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-all rehearse gpu-check lint docs bench clean
+.PHONY: help setup demo suite90 test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
 # Each takes about 2 GB, and 10 s to start.
@@ -11,7 +11,7 @@ TEST_PROCESSES ?= 2
 PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 help:  ## list these verbs
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
 setup:  ## create .venv and install a Vulkan driver if there is none
 	@bash scripts/setup.sh
@@ -20,11 +20,16 @@ demo: setup  ## evaluate scripted policies and two learned ones, print the table
 	$(BIN)/mikasa-vla eval configs/demo.yaml --html runs/demo-report
 	$(BIN)/mikasa-vla eval configs/demo_memory.yaml --html runs/demo-memory-report
 
+suite90: setup  ## install the official package of 90 tasks beside this one, without its pins
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --ignore-requires-python \
+		--require-hashes --requirement scripts/suite90.txt
+	$(BIN)/mikasa-vla list tasks --suite mikasa_vla_90
+
 test: setup  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)
 
 test-all: setup  ## run every test this machine can run
-	$(PYTEST) -m "not network and not parity and not peer and not full_size"
+	$(PYTEST) -m "not network and not parity and not peer and not full_size and not suite90"
 
 rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory, 30 GB of disk
 	$(BIN)/python scripts/rehearse.py

@@ -9,7 +9,7 @@ value is keyed by it. An episode is a function of (task, seed, actions) alone, w
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -104,12 +104,15 @@ class StepResult:
         reward: the reward of the step; 0 for a reset.
         executed_action: (A,) the action as it was carried out: clipped to the action space, and replaced
             by holding still while the task freezes the arm. None for a reset.
+        wording: of a reset: what to put in place of the words in braces of the instruction, where it differs
+            per episode.
     """
 
     observation: Observation
     status: TaskStatus
     reward: float = 0.0
     executed_action: FloatArray | None = None
+    wording: Mapping[str, str] = field(default_factory=dict)
 
 
 class SimEnv(Protocol):

@@ -81,7 +81,7 @@ class CueView:
         """Return whether the images of a step are shown again at later ones."""
         return self.settings.kind == "first_frame" and step == self.settings.begins_at
 
-    def seen(self, observation: Observation, phase: Phase) -> Observation:
+    def seen(self, observation: Observation, phase: Phase | None) -> Observation:
         """Return what the policy is given in place of an observation.
 
         Raises:

@@ -72,6 +72,14 @@ class _Running:
         return self.log.n_steps
 
 
+def _worded(episode: EpisodeStart, reset: StepResult) -> EpisodeStart:
+    """Return the episode with the words in its instruction that differ per episode."""
+    instruction = episode.instruction
+    for word, value in reset.wording.items():
+        instruction = instruction.replace(f"{{{word}}}", value)
+    return episode if instruction == episode.instruction else replace(episode, instruction=instruction)
+
+
 def _ignore(_stage: Stage) -> None:
     """Stand in for a heartbeat that nobody listens to."""
 
@@ -140,6 +148,7 @@ class _Loop:
         self.heartbeat("reset")
         render = bool(self.policy.spec.cameras) or any(o.wants_images(0) for o in self.observers)
         results = self.env.reset({e.slot: e.seed for e in episodes}, render=render)
+        episodes = [_worded(episode, results[episode.slot]) for episode in episodes]
         self.policy.reset(episodes)
         for start in episodes:
             for observer in self.observers:

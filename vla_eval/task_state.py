@@ -19,7 +19,7 @@ class TaskStatus:
     """What the task says of the episode so far; reading it changes nothing.
 
     Attributes:
-        phase: the phase at this step.
+        phase: the phase at this step; None where the environment does not show it.
         success: the success rule holds at this very step.
         fail: the episode is lost for good (`strict_choice`, first wrong candidate).
         target: index of the right candidate; None for a task without candidates or with several right ones.
@@ -36,7 +36,7 @@ class TaskStatus:
         turned_rad: how far the object of the task is turned from its first orientation; None without one.
     """
 
-    phase: Phase
+    phase: Phase | None
     success: bool
     fail: bool
     target: int | None

@@ -14,7 +14,8 @@ from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.tasks.catalog import FAMILIES, TASKS
+from vla_eval.tasks.catalog import FAMILIES, SUITES
+from vla_eval.tasks.spec import Suite, TaskSpec
 
 Row = Sequence[str]
 Groups = Mapping[str, Sequence[Row]]
@@ -40,6 +41,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         allow_abbrev=False,
     )
     parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
+    parser.add_argument(
+        "--suite",
+        choices=tuple(SUITES),
+        default="paper",
+        help="which tasks: this package's (paper), or the official package's 90 or original ones",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     for kind in kinds:
         if len(kinds) > 1:
             print(f"{kind}:")
-        for line in _lines(_LISTS[kind]()):
+        for line in _lines(_tasks(args.suite) if kind == "tasks" else _LISTS[kind]()):
             print(f"  {line}" if len(kinds) > 1 else line)
     return 0
 
@@ -65,18 +72,17 @@ def _lines(groups: Groups) -> Iterator[str]:
             yield f"  {line}" if heading else line
 
 
-def _tasks() -> Groups:
-    rows = [
-        (
-            spec.id,
-            f"{spec.horizon_steps} steps",
-            f"{spec.memory} memory",
-            f"chance {_chance(spec.chance_success)}",
-            f"“{instruction_for(spec)}”",
-        )
-        for spec in TASKS.values()
-    ]
-    return {UNGROUPED: rows}
+def _tasks(suite: Suite = "paper") -> Groups:
+    groups: dict[str, list[Row]] = {}
+    for spec in SUITES[suite].values():
+        groups.setdefault(spec.split or UNGROUPED, []).append(_task(spec))
+    return groups
+
+
+def _task(spec: TaskSpec) -> Row:
+    cells = (spec.id, f"{spec.horizon_steps} steps", f"{spec.memory} memory")
+    chance = () if spec.split else (f"chance {_chance(spec.chance_success)}",)
+    return (*cells, *chance, f"“{instruction_for(spec)}”")
 
 
 def _families() -> Groups:

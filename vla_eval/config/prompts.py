@@ -37,6 +37,10 @@ class Instructed(Protocol):
     def instruction_key(self) -> str:
         """Under which key a prompt set has its sentences."""
 
+    @property
+    def instruction(self) -> str | None:
+        """Its own sentence, for prompt sets that have none; None for most tasks."""
+
 
 def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
     """Return a set of instructions by name or path; errors as `load_recipe`."""
@@ -49,12 +53,14 @@ def instructions_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> 
 
 
 def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, ...]:
-    """Return a task's sentences in a set: the sentence, then its paraphrases.
+    """Return a task's sentences in a set: the sentence, then its paraphrases; else the task's own sentence.
 
     Raises:
         MissingInstructionError: the set has no sentence for this task, or an empty one.
     """
     sentences = prompts.value.instructions.get(spec.instruction_key, ())
+    if not sentences and spec.instruction is not None:
+        return (spec.instruction,)
     if not sentences or not all(sentence.strip() for sentence in sentences):
         known = sorted(prompts.value.instructions)
         raise MissingInstructionError(

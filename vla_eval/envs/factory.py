@@ -10,6 +10,7 @@ from typing import cast
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import SimEnv
 from vla_eval.errors import MissingDependencyError, unknown_name
+from vla_eval.tasks.catalog import task_spec
 
 __all__ = ["EnvSettings", "RenderSettings", "describe_device", "make_env"]
 
@@ -17,6 +18,8 @@ SIMULATORS = {
     "maniskill": "vla_eval.envs.maniskill:make_maniskill_env",
     "fake": "vla_eval.envs.fake:make_fake_env",
 }
+OFFICIAL = "vla_eval.envs.official:make_official_env"
+"""In place of `maniskill` for the tasks of the official package, which are its own ManiSkill environments."""
 
 
 def make_env(settings: EnvSettings) -> SimEnv:
@@ -29,7 +32,10 @@ def make_env(settings: EnvSettings) -> SimEnv:
     """
     if settings.simulator not in SIMULATORS:
         raise unknown_name("simulator", settings.simulator, SIMULATORS)
-    module_name, _, attribute = SIMULATORS[settings.simulator].partition(":")
+    factory_name = SIMULATORS[settings.simulator]
+    if settings.simulator == "maniskill" and task_spec(settings.task).suite != "paper":
+        factory_name = OFFICIAL
+    module_name, _, attribute = factory_name.partition(":")
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as exc:

@@ -28,8 +28,17 @@ def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArra
 
 
 def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts have a protocol of their own
-    """Return the scripted expert that the catalogue names for the task of the context."""
+    """Return the scripted expert that the catalogue names for the task of the context.
+
+    Raises:
+        SpecMismatchError: there is none, as for the tasks of the official package.
+    """
     module, _, name = task_spec(context.env.task).oracle.partition(":")
+    if not module:
+        raise SpecMismatchError(
+            f"policy '{context.name}' needs a scripted expert, and {context.env.task} has none. Leave this "
+            "task out for this policy; `random` and `hold` run on every task."
+        )
     return getattr(importlib.import_module(module), name)
 
 

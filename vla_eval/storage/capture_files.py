@@ -8,9 +8,9 @@ from vla_eval.storage.folders import RRDS, VIDEOS
 
 def capture_stem(record: EpisodeRecord) -> str:
     """Return `RememberColor3-v0_oracle_K1_run0_seed7_success`."""
+    task = record.task.replace("/", "_")  # ids of official tasks have a namespace
     return (
-        f"{record.task}_{record.policy}_K{record.n_action_steps}_run{record.run}_seed{record.seed}"
-        f"_{record.outcome}"
+        f"{task}_{record.policy}_K{record.n_action_steps}_run{record.run}_seed{record.seed}_{record.outcome}"
     )
 
 

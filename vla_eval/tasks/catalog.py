@@ -3,11 +3,19 @@
 Horizons, phases and instructions: the paper, appendix "VLA experiments", and `docs/tasks.md`.
 """
 
+from typing import get_args
+
 from vla_eval.errors import unknown_name
 from vla_eval.tasks.families import make_families
+from vla_eval.tasks.official_catalog import (
+    MIKASA_VLA_90,
+    NAMESPACE_90,
+    NAMESPACE_ORIGINAL,
+    original_tasks,
+)
 from vla_eval.tasks.sequence_catalog import SEQUENCE_TASKS
 from vla_eval.tasks.spatial_catalog import SPATIAL_TASKS
-from vla_eval.tasks.spec import TaskSpec
+from vla_eval.tasks.spec import Suite, TaskSpec
 
 _REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."
 
@@ -128,23 +136,35 @@ TASKS: dict[str, TaskSpec] = {
 FAMILIES = make_families(TASKS)
 """Family id -> its row: tasks that are specified by arguments, such as `RememberColor` with `n_items=4`."""
 
+OFFICIAL_TASKS: dict[str, TaskSpec] = {**MIKASA_VLA_90, **original_tasks(TASKS.values())}
+"""The tasks of the official package, which run only where it is installed."""
+
+SUITES: dict[Suite, dict[str, TaskSpec]] = {
+    suite: {spec.id: spec for spec in (*TASKS.values(), *OFFICIAL_TASKS.values()) if spec.suite == suite}
+    for suite in get_args(Suite)
+}
+
 
 def find_task(task_id: str) -> TaskSpec | None:
     """Return the row of a task or a family, or None if there is none of this id."""
     name = task_id.removeprefix("vla_eval/")
-    return TASKS.get(name) or FAMILIES.get(name)
+    return TASKS.get(name) or FAMILIES.get(name) or OFFICIAL_TASKS.get(name)
 
 
 def task_spec(task_id: str) -> TaskSpec:
     """Return the row of a task or a family.
 
     Args:
-        task_id: `RememberColor3-v0` or `RememberColor`, with or without the `vla_eval/` namespace.
+        task_id: `RememberColor3-v0` or `RememberColor`, with or without the `vla_eval/` namespace; of the
+            official package `mikasa_vla/RememberColor3-VLA-v0` or `mikasa_official/RememberColor3-v0`.
 
     Raises:
         UnknownNameError: there is no such task; the message suggests the closest one.
     """
     spec = find_task(task_id)
     if spec is None:
-        raise unknown_name("task", task_id.removeprefix("vla_eval/"), [*TASKS, *FAMILIES])
+        known = [*TASKS, *FAMILIES]
+        if task_id.startswith((NAMESPACE_90, NAMESPACE_ORIGINAL)):
+            known = list(OFFICIAL_TASKS)
+        raise unknown_name("task", task_id.removeprefix("vla_eval/"), known)
     return spec

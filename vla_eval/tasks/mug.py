@@ -27,7 +27,7 @@ MASS_KG = 0.118
 TERRACOTTA_RGBA = (0.76, 0.38, 0.24, 1.0)
 
 
-def _boxes() -> list[tuple[sapien.Pose, list[float]]]:
+def mug_boxes() -> list[tuple[sapien.Pose, list[float]]]:
     """Return (pose, half sizes) of wall and handle of an upright mug, origin in the middle of its height."""
     boxes = []
     radius = OUTER_RADIUS_M - WALL_M / 2
@@ -50,8 +50,9 @@ BOTTOM_RADIUS_M = OUTER_RADIUS_M - WALL_M / 2
 BOTTOM_POSE = sapien.Pose([0, 0, -HEIGHT_M / 2 + WALL_M / 2], [math.sqrt(0.5), 0, math.sqrt(0.5), 0])
 
 
-def _volume_m3() -> float:
-    walls_and_handle = float(sum(np.prod([2 * half for half in halves]) for _, halves in _boxes()))
+def mug_volume_m3() -> float:
+    """Return the volume of the mug's material."""
+    walls_and_handle = float(sum(np.prod([2 * half for half in halves]) for _, halves in mug_boxes()))
     return walls_and_handle + math.pi * BOTTOM_RADIUS_M**2 * WALL_M
 
 
@@ -59,8 +60,8 @@ def primitive_mug_builder(scene: ManiSkillScene) -> ActorBuilder:
     """Return a builder for a terracotta mug with the real mug's size and mass."""
     builder = scene.create_actor_builder()
     material = sapien.render.RenderMaterial(base_color=TERRACOTTA_RGBA) if scene.can_render() else None
-    density = MASS_KG / _volume_m3()
-    for pose, halves in _boxes():
+    density = MASS_KG / mug_volume_m3()
+    for pose, halves in mug_boxes():
         builder.add_box_collision(pose, halves, density=density)
         builder.add_box_visual(pose, halves, material=material)
     bottom = {"pose": BOTTOM_POSE, "radius": BOTTOM_RADIUS_M, "half_length": WALL_M / 2}

@@ -4,8 +4,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-MemoryType = Literal["object", "spatial", "sequential", "capacity"]
-"""The paper's four types of memory (section on task classification)."""
+MemoryType = Literal[
+    "object",
+    "spatial",
+    "sequential",
+    "capacity",
+    "tracking",
+    "negative",
+    "temporal",
+    "procedural",
+    "prospective",
+    "checklist",
+]
+"""The paper's four types of memory (section on task classification), then six that only the official 90 tasks
+have."""
+
+Suite = Literal["paper", "mikasa_vla_90", "mikasa_official"]
+"""This package's own tasks; the official package's 90 tasks; its original ones."""
+
+Split = Literal["short", "medium", "long"]
+LONGEST_SHORT_STEPS, LONGEST_MEDIUM_STEPS = 200, 600  # of the official splits
+
+PhaseSource = Literal["cue_and_delay", "cue", "none"]
+"""Which of its phases an official environment shows to the outside: it has numbers of their steps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +53,11 @@ class TaskSpec:
         cue_marks_place: the cue is shown where the right candidate will be.
         shows_one_by_one: the cue is `n_shown` items one after another, each for `cue_steps`.
         open_arguments: arguments required to make a task of this row; empty except for a family.
+        suite: the set of tasks that it belongs to.
+        instruction: its sentence where no prompt set has one under `instruction_key`; a word in braces is
+            filled in by the environment, per episode.
+        phase_source, waits_for_choice: of an official task: which phases can be read from it, and whether the
+            official wrapper replaces actions by zeros until the choice.
         min_response_steps: of a family: the horizon grows with cue and delay so that at least this many
             steps remain for the response. None: the horizon is fixed by the id.
     """
@@ -54,12 +80,25 @@ class TaskSpec:
     cue_marks_place: bool = False
     shows_one_by_one: bool = False
     open_arguments: tuple[str, ...] = ()
+    suite: Suite = "paper"
+    instruction: str | None = None
+    phase_source: PhaseSource = "none"
+    waits_for_choice: bool = False
     min_response_steps: int | None = None
 
     @property
     def gym_id(self) -> str:
         """The id under which Gymnasium knows the task."""
         return f"vla_eval/{self.id}"
+
+    @property
+    def split(self) -> Split | None:
+        """The official split of the 90 tasks, by horizon; None for the others."""
+        if self.suite != "mikasa_vla_90":
+            return None
+        if self.horizon_steps <= LONGEST_SHORT_STEPS:
+            return "short"
+        return "medium" if self.horizon_steps <= LONGEST_MEDIUM_STEPS else "long"
 
     def default_horizon_steps(self, longest_wait_steps: int) -> int:
         """Return the default length of an episode, given the maximum length of cue and delay."""

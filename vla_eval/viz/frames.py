@@ -23,10 +23,11 @@ MARGIN_PX = 10
 STRIP_PX = 12
 PAPER, INK, FAINT = (21, 23, 27), (232, 234, 238), (163, 169, 181)
 # Okabe and Ito, as on the report page.
-PHASE_COLORS: dict[Phase, tuple[int, int, int]] = {
+PHASE_COLORS: dict[Phase | None, tuple[int, int, int]] = {
     "cue": (230, 159, 0),
     "delay": (110, 116, 128),
     "response": (86, 180, 233),
+    None: (86, 180, 233),  # not shown by the environment
 }
 SUCCESS_COLOR, FAILURE_COLOR = (47, 196, 154), (255, 138, 61)
 SWATCH_PX = 12
@@ -97,7 +98,7 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held:
     status, start = taped.result.status, tape.start
     n_inferences = sum(chunk.step <= taped.step for chunk in tape.chunks)
     is_new = any(chunk.step == taped.step for chunk in tape.chunks)
-    texts = [f"step {taped.step}/{start.horizon_steps}", status.phase, f"inference {n_inferences}"]
+    texts = [f"step {taped.step}/{start.horizon_steps}", status.phase or "—", f"inference {n_inferences}"]
     texts += ["new chunk"] if is_new else []
     texts += [f"held {n_held} x"] if n_held > 1 else []
     parts = [Part(text=text) for text in texts]

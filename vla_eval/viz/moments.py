@@ -32,7 +32,7 @@ def find_moments(tape: EpisodeTape) -> Moments:
     """Return the moments of an episode of which at least one step has images."""
     captured = tape.captured()
     response = [one for one in captured if one.result.status.phase == "response"]
-    has_phases = captured[0].result.status.phase != "response"
+    has_phases = captured[0].result.status.phase in ("cue", "delay")
     reveal = response[0] if has_phases and response else captured[len(captured) // 2]
     # Where several candidates are right, the first touch is not the answer yet.
     touched = [one for one in captured if _has_one_target(one) and one.result.status.first_choice is not None]

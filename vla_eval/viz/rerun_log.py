@@ -183,7 +183,7 @@ def events(tape: EpisodeTape, record: EpisodeRecord) -> Iterable[tuple[int, str]
     before: Sequence[TapedStep | None] = [None, *tape.steps[:-1]]
     for earlier, one in zip(before, tape.steps, strict=True):
         status, last = one.result.status, earlier.result.status if earlier else None
-        if last is None or last.phase != status.phase:
+        if status.phase is not None and (last is None or last.phase != status.phase):
             yield one.step, f"phase {status.phase}"
         if status.first_choice is not None and (last is None or last.first_choice is None):
             is_right = status.first_choice in status.right_first_choices

@@ -1,0 +1,128 @@
+"""The adapter of the official tasks, on a small environment in place of an official one."""
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.envs.hiding_env import HidingEnv
+from vla_eval.config.environment import EnvSettings
+from vla_eval.core import EpisodeStart, StepResult
+from vla_eval.envs import official
+from vla_eval.envs.factory import make_env
+from vla_eval.envs.official import official_class
+from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
+from vla_eval.rollout import _worded
+from vla_eval.tasks.catalog import task_spec
+
+TASK = "mikasa_vla/RememberColor3-VLA-v0"
+CUE_STEPS, DELAY_STEPS = 2, 1
+
+
+class SmallTask(HidingEnv):
+    """With an arm, and with a cue and a delay of fixed lengths."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        own = ("num_envs", "obs_mode", "robot_uids", "sim_backend", "render_backend")
+        super().__init__(**{name: value for name, value in kwargs.items() if name not in own})
+
+    def _initialize_episode(self, env_idx: Any, options: Any) -> None:
+        super()._initialize_episode(env_idx, options)
+        self.cue_steps_per_env = torch.tensor([CUE_STEPS])
+        self.empty_steps_per_env = torch.tensor([DELAY_STEPS])
+        qpos = np.array([0, 0, 0, -np.pi * 2 / 3, 0, np.pi * 2 / 3, np.pi / 4, 0.04, 0.04])
+        qpos[:7] += self._episode_rng.normal(0, 0.02, 7)
+        self.agent.reset(qpos)
+
+
+@pytest.fixture(scope="module")
+def env() -> Any:
+    patch = pytest.MonkeyPatch()
+    patch.setattr(official, "official_class", lambda row: SmallTask)
+    made = make_env(EnvSettings(task=TASK, n_slots=2))
+    yield made
+    made.close()
+    patch.undo()
+
+
+def run(env: Any, seed: int, *, slot: int = 0) -> list[StepResult]:
+    """Open the gripper and move along +x for 4 steps."""
+    action = np.array([1, 0, 0, 0, 0, 0, 1], dtype=np.float32)
+    results = [env.reset({slot: seed}, render=False)[slot]]
+    return results + [env.step({slot: action}, render=frozenset())[slot] for _ in range(4)]
+
+
+def test_actions_are_replaced_by_zeros_until_the_choice(env: Any) -> None:
+    executed = [result.executed_action for result in run(env, 4242424242)[1:]]
+    # As the official wrapper: while the elapsed steps are fewer than those of cue and delay, 2 + 1.
+    assert [bool(np.any(action)) for action in executed] == [False, False, False, True]
+
+
+def test_phases_are_those_that_the_environment_has_drawn(env: Any) -> None:
+    assert [result.status.phase for result in run(env, 1)] == ["cue", "cue", "delay", "response", "response"]
+
+
+def test_an_episode_depends_on_its_seed_alone(env: Any) -> None:
+    alone = run(env, 4242424242)
+    run(env, 3)
+    reused, elsewhere = run(env, 4242424242), run(env, 4242424242, slot=1)
+    for other in (reused, elsewhere):
+        for one, two in zip(alone, other, strict=True):
+            for name, value in one.observation.state.items():
+                np.testing.assert_array_equal(value, two.observation.state[name])
+
+
+def test_observations_hold_neither_prompt_nor_oracle(env: Any) -> None:
+    observation = run(env, 1)[0].observation
+    assert set(observation.state) == {"tcp_pose", "qpos", "qvel"}
+    assert observation.privileged is None
+
+
+def test_the_largest_seed_is_that_of_numpy(env: Any) -> None:
+    env.reset({0: 2**32 - 1}, render=False)
+    with pytest.raises(TaskArgumentError, match="seed 4294967296: the official environments take 0 to"):
+        env.reset({0: 2**32}, render=False)
+
+
+def test_holding_keeps_the_width_of_the_gripper(env: Any) -> None:
+    env.reset({0: 1}, render=False)
+    # 0.04 m per finger is the end of the range -0.01 to 0.04 m: action 1.
+    np.testing.assert_allclose(env.hold_action(0), [0, 0, 0, 0, 0, 0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        (
+            {"sim_backend": "gpu"},
+            TaskArgumentError,
+            "sim_backend=gpu: the official environments run on the CPU",
+        ),
+        ({"kwargs": {"cue_steps": 5}}, UnknownNameError, "no argument 'cue_steps'"),
+        ({"kwargs": {"horizon_steps": 0}}, TaskArgumentError, "horizon_steps=0: expected a number ≥ 1"),
+        ({"cameras": ("top",)}, UnknownNameError, "no camera 'top'"),
+    ],
+)
+def test_what_the_official_tasks_cannot_do_is_refused(
+    settings: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make_env(EnvSettings(task=TASK, **settings))
+
+
+def test_without_the_package_the_message_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mikasa_robo_suite", None)
+    with pytest.raises(MissingDependencyError, match="Run `make suite90`"):
+        official_class(task_spec(TASK))
+
+
+def test_the_angle_of_an_episode_is_put_into_its_instruction() -> None:
+    start = EpisodeStart(
+        slot=0, task=TASK, seed=1, run=0, instruction="Rotate by {angle_deg} degrees.", horizon_steps=60
+    )
+    status: Any = None
+    observation: Any = None
+    reset = StepResult(observation=observation, status=status, wording={"angle_deg": "44"})
+    assert _worded(start, reset).instruction == "Rotate by 44 degrees."

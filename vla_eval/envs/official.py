@@ -1,0 +1,270 @@
+"""The adapter of the official package's environments, which has to be installed (`make suite90`).
+
+Each slot is one official environment on the CPU simulator, reset and stepped as the official runner does,
+with the no-ops of its wrapper until the choice; `true_states` makes right what is right only on the GPU
+simulator. Images are rendered only on request. The official prompts and oracle information (`task_cue`,
+`oracle_info`) are in no observation. Knows nothing of policies or records.
+"""
+
+import gc
+import importlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple  # ManiSkill and the package are untyped: environments, infos are Any here
+
+import numpy as np
+import torch
+
+from vla_eval.config.appearance import AS_DESIGNED
+from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.core import FloatArray, Observation, StepResult
+from vla_eval.envs.official_mug import provide_mug
+from vla_eval.envs.scenes import (
+    RENDERING_ADVICE,
+    describe,
+    render_backend,
+    take_human_image,
+    take_images,
+    to_array,
+)
+from vla_eval.envs.shaders import use_lean_shaders
+from vla_eval.envs.true_states import with_true_states
+from vla_eval.errors import (
+    MissingDependencyError,
+    RenderingError,
+    TaskArgumentError,
+    check_names,
+)
+from vla_eval.specs import EnvSpec
+from vla_eval.task_state import Phase, TaskStatus
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, CONTROL_MODE, states
+from vla_eval.tasks.spec import TaskSpec
+
+PACKAGE = "mikasa_robo_suite"
+ROBOT = "panda_wristcam"
+ARGUMENTS = ("horizon_steps", "mug")
+LARGEST_SEED = (
+    2**32 - 1
+)  # of numpy's RandomState, which ManiSkill draws from; the official runner fails beyond
+FIRST_CLOSED, FIRST_OPEN = -0.01, 0.04  # m per finger at gripper actions -1 and 1 (ManiSkill's Panda)
+
+# See `maniskill.py`.
+gc.freeze()
+
+
+def make_official_env(settings: EnvSettings) -> "OfficialEnv":
+    """Make the environment of an official task.
+
+    Raises:
+        UnknownNameError: no such task, argument or camera.
+        TaskArgumentError: the settings ask for what the official environments cannot do.
+        MissingDependencyError: the package, or the asset of the shell game's mug, is not installed.
+        RenderingError: cameras are wanted and the renderer does not start.
+    """
+    return OfficialEnv(settings)
+
+
+class _Waiting(NamedTuple):
+    """The steps of an episode before the choice, as the environment has drawn them."""
+
+    cue_steps: int
+    delay_steps: int
+
+
+class OfficialEnv:
+    """`SimEnv` on the official package; see the module docstring."""
+
+    def __init__(self, settings: EnvSettings) -> None:
+        """Build the scenes."""
+        row = task_spec(settings.task)
+        check_names("argument", settings.kwargs, ARGUMENTS, where=row.id)
+        check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
+        _check_possible(settings, row)
+        cls = _adapted(official_class(row))
+        self._row, self._settings = row, settings
+        self.device: dict[str, str] = {}
+        if "/ShellGame" in row.id:
+            self.device["mug"] = provide_mug(settings.kwargs.get("mug", "ycb"), task=row.id)
+        self._envs = [_build(cls, settings) for _ in range(settings.n_slots)]
+        self.device |= describe(self._envs[0], settings)
+        self.spec = EnvSpec(
+            task=row.id,
+            cameras=CAMERAS,
+            states=states(),
+            action=ACTION,
+            horizon_steps=settings.kwargs.get("horizon_steps", row.horizon_steps),
+            control_hz=CONTROL_HZ,
+        )
+
+    def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
+        """Begin an episode in each of the given slots; see `SimEnv.reset`."""
+        return {slot: self._begin(slot, seed, render=render) for slot, seed in seeds.items()}
+
+    def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
+        """Execute one control step in each of the given slots; see `SimEnv.step`."""
+        return {slot: self._advance(slot, action, render=slot in render) for slot, action in actions.items()}
+
+    def hold_action(self, slot: int) -> FloatArray:
+        """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
+        finger_m = float(self._envs[slot].agent.robot.get_qpos()[0, -2:].mean())
+        action = np.zeros(len(ACTION.dims), dtype=np.float32)
+        action[-1] = np.clip((finger_m - FIRST_CLOSED) / (FIRST_OPEN - FIRST_CLOSED) * 2 - 1, -1, 1)
+        return action
+
+    def close(self) -> None:
+        """Release the simulator."""
+        for env in self._envs:
+            env.close()
+        self._envs = []
+
+    def _begin(self, slot: int, seed: int, *, render: bool) -> StepResult:
+        if not 0 <= seed <= LARGEST_SEED:
+            raise TaskArgumentError(
+                f"{self._row.id}: seed {seed}: the official environments take 0 to {LARGEST_SEED}. Choose "
+                "another seed_start."
+            )
+        env = self._envs[slot]
+        _, info = env.reset(seed=seed)
+        return StepResult(
+            observation=self._observation(env, info, render=render),
+            status=self._status(env, info),
+            wording=_wording(self._row, info),
+        )
+
+    def _advance(self, slot: int, action: FloatArray, *, render: bool) -> StepResult:
+        env = self._envs[slot]
+        executed = np.clip(action, ACTION.low, ACTION.high).astype(np.float32)
+        if self._row.waits_for_choice and int(env.elapsed_steps[0]) < sum(_waiting(env)):
+            executed = np.zeros_like(executed)
+        _, reward, _, _, info = env.step(torch.as_tensor(executed[None], device=env.device))
+        return StepResult(
+            observation=self._observation(env, info, render=render),
+            status=self._status(env, info),
+            reward=float(reward[0]),
+            executed_action=executed,
+        )
+
+    def _observation(self, env: Any, info: Any, *, render: bool) -> Observation:
+        step = int(info["elapsed_steps"][0])
+        images = {}
+        if render:
+            for hidden in env._hidden_objects:
+                hidden.hide_visual()
+            images = take_images(env, self._settings.cameras)
+            stride = self._settings.human_camera_stride
+            if stride is not None and (step % stride == 0 or step == self.spec.horizon_steps):
+                images[HUMAN_CAMERA] = take_human_image(env)
+        robot = env.agent.robot
+        state = {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
+        return Observation(
+            step=step,
+            images={name: batch[0].copy() for name, batch in images.items()},
+            state={name: to_array(batch[0]) for name, batch in state.items()},
+        )
+
+    def _status(self, env: Any, info: Any) -> TaskStatus:
+        return TaskStatus(
+            phase=self._phase(env, int(info["elapsed_steps"][0])),
+            success=bool(info["success"][0]),
+            fail=False,
+            target=None,
+            n_candidates=0,
+            first_choice=None,
+            n_wrong_choices=0,
+        )
+
+    def _phase(self, env: Any, step: int) -> Phase | None:
+        if self._row.phase_source == "none":
+            return None
+        waiting = _waiting(env)
+        if step < waiting.cue_steps:
+            return "cue"
+        return "delay" if step < sum(waiting) else "response"
+
+
+def official_class(row: TaskSpec) -> Any:
+    """Return the official class of a task.
+
+    Raises:
+        MissingDependencyError: the package is not installed.
+    """
+    part = "vla" if row.suite == "mikasa_vla_90" else "rl"
+    try:
+        importlib.import_module(f"{PACKAGE}.{part}.memory_envs")
+    except ModuleNotFoundError as exc:
+        raise MissingDependencyError(
+            f"{row.id} runs in the official package, of which the module '{exc.name}' is not installed. Run "
+            "`make suite90`, which installs mikasa-robo-suite 1.0.0 beside this package."
+        ) from exc
+    registered = importlib.import_module("mani_skill.utils.registration").REGISTERED_ENVS
+    return registered[row.id.split("/", 1)[1]].cls
+
+
+def _adapted(cls: Any) -> Any:
+    """Return the class with its true states, and without observations of its own."""
+
+    def get_obs(env: Any, info: Any = None, *_args: Any, **_kwargs: Any) -> dict[str, Any]:
+        env._get_obs_extra(info)  # some tasks compute there what their rewards read
+        return {}
+
+    return type(cls.__name__, (with_true_states(cls),), {"__module__": cls.__module__, "get_obs": get_obs})
+
+
+def _check_possible(settings: EnvSettings, row: TaskSpec) -> None:
+    asked = {
+        "sim_backend=gpu": settings.sim_backend == "gpu",
+        "appearance": settings.appearance != AS_DESIGNED,
+        f"render.wrist_mesh={settings.render.wrist_mesh}": settings.render.wrist_mesh == "simplified",
+    }
+    for what, is_asked in asked.items():
+        if is_asked:
+            raise TaskArgumentError(
+                f"{row.id}: {what}: the official environments run on the CPU simulator and look as they are. "
+                "Leave this setting out for them."
+            )
+    horizon_steps = settings.kwargs.get("horizon_steps", row.horizon_steps)
+    if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
+        raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
+
+
+def _build(cls: Any, settings: EnvSettings) -> Any:
+    backend = render_backend(settings)
+    if backend != "none":
+        use_lean_shaders()
+    try:
+        # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
+        return cls(
+            num_envs=1,
+            obs_mode="none",
+            reward_mode="normalized_dense",
+            control_mode=CONTROL_MODE,
+            robot_uids=ROBOT,
+            sim_backend="physx_cpu",
+            render_backend=backend,
+            reconfiguration_freq=1,
+        )
+    except RuntimeError as exc:
+        if backend == "none":
+            raise
+        raise RenderingError(
+            f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
+        ) from exc
+
+
+def _waiting(env: Any) -> _Waiting:
+    """Return the steps of cue and delay: drawn per episode in the 90 tasks, else constants."""
+    if hasattr(env, "cue_steps_per_env"):
+        delay = env.empty_steps_per_env if hasattr(env, "empty_steps_per_env") else [0]
+        return _Waiting(int(env.cue_steps_per_env[0]), int(delay[0]))
+    if hasattr(env, "TIME_OFFSET"):
+        return _Waiting(int(env.TIME_OFFSET), int(getattr(env, "DELTA_TIME", 0)))
+    return _Waiting(int(env.STEP_DURATION), int(env.EMPTY_DURATION))
+
+
+def _wording(row: TaskSpec, info: Any) -> dict[str, str]:
+    """Return the angle of a Rotate task, which the official sentence of each episode states."""
+    if row.instruction is None or "{angle_deg}" not in row.instruction:
+        return {}
+    before, after = row.instruction.split("{angle_deg}")
+    sentence = info["language_instruction"][0]
+    return {"angle_deg": sentence.removeprefix(before).removesuffix(after)}

@@ -1,0 +1,123 @@
+"""The mug of the official shell games: YCB's `025_mug`, or a stand-in of the same size in the same files.
+
+ManiSkill looks for the asset in its own folder. The stand-in is written into this package's cache, and the
+modules that read the asset are given that folder; ManiSkill's folder is not touched, so that no other task
+takes it for the YCB object set.
+"""
+
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any  # trimesh and ManiSkill's modules are untyped
+
+import numpy as np
+import sapien
+import trimesh as trimesh_library
+from mani_skill import ASSET_DIR
+from mani_skill.utils.building.actors import ycb
+
+from vla_eval.errors import MissingDependencyError, TaskArgumentError
+from vla_eval.storage.cache import cache_dir
+from vla_eval.tasks.mug import (
+    BOTTOM_POSE,
+    BOTTOM_RADIUS_M,
+    HEIGHT_M,
+    MASS_KG,
+    TERRACOTTA_RGBA,
+    WALL_M,
+    mug_boxes,
+    mug_volume_m3,
+)
+
+trimesh: Any = trimesh_library  # half of its functions have no types
+ASSET = "025_mug"
+FOLDER = "assets/mani_skill2_ycb"
+YCB, STAND_IN = "ycb", "stand_in"
+READERS = "mikasa_robo_suite."
+
+
+def provide_mug(mug: object, *, task: str) -> str:
+    """Make the mug's files findable, and return what it is, for the run's description.
+
+    Args:
+        mug: `ycb` or `stand_in`.
+        task: for messages.
+
+    Raises:
+        TaskArgumentError: another value.
+        MissingDependencyError: the YCB asset is not installed.
+    """
+    if mug not in (YCB, STAND_IN):
+        raise TaskArgumentError(f"{task}: mug={mug!r}: expected '{YCB}' or '{STAND_IN}'.")
+    if mug == STAND_IN:
+        _read_from(_stand_in())
+        return "stand-in of this package, not the YCB object"
+    _read_from(ASSET_DIR)
+    if not (ASSET_DIR / FOLDER / "models" / ASSET).is_dir():
+        raise MissingDependencyError(
+            f"{task} needs the YCB asset '{ASSET}', expected in {ASSET_DIR / FOLDER}. Install it with "
+            "`python -m mani_skill.utils.download_asset ycb`, or use a mug of the same size made by this "
+            f"package: --set env.mug={STAND_IN}."
+        )
+    return f"YCB {ASSET}"
+
+
+def _read_from(root: Path) -> None:
+    """Let ManiSkill and the official tasks read assets from another folder."""
+    readers: list[Any] = [ycb]
+    readers += [module for name, module in sys.modules.items() if name.startswith(READERS)]
+    for module in readers:
+        if hasattr(module, "ASSET_DIR"):
+            module.ASSET_DIR = root
+
+
+def _stand_in() -> Path:
+    """Return the folder that stands in for ManiSkill's; write it if it is not there."""
+    root = cache_dir() / "official_mug"
+    if root.is_dir():
+        return root
+    draft = root.with_name(f"{root.name}.{os.getpid()}.tmp")
+    models = draft / FOLDER / "models" / ASSET
+    models.mkdir(parents=True, exist_ok=True)
+    parts = [_placed(trimesh.creation.box(2 * np.asarray(halves)), pose) for pose, halves in mug_boxes()]
+    parts.append(_placed(_bottom(), BOTTOM_POSE))
+    # Each connected part becomes one convex collision shape.
+    whole = trimesh.util.concatenate(parts)
+    whole.export(models / "collision.ply")
+    colour = np.round(np.asarray(TERRACOTTA_RGBA) * 255).astype(np.uint8)
+    whole.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.SimpleMaterial(diffuse=colour)
+    )
+    whole.export(models / "textured.obj")
+    half = HEIGHT_M / 2
+    low, high = whole.bounds[0].tolist(), whole.bounds[1].tolist()
+    facts = {
+        ASSET: {
+            "bbox": {"min": [*low[:2], -half], "max": [*high[:2], half]},
+            "scales": [1.0],
+            "density": MASS_KG / mug_volume_m3(),
+        }
+    }
+    (draft / FOLDER / "info_pick_v0.json").write_text(json.dumps(facts), encoding="utf-8")
+    try:
+        draft.rename(root)
+    except OSError:
+        if not root.is_dir():  # otherwise another worker was faster
+            raise
+        shutil.rmtree(draft)
+    return root
+
+
+def _bottom() -> Any:
+    # Along z in trimesh, along x in SAPIEN.
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0))
+    cylinder = trimesh.creation.cylinder(radius=BOTTOM_RADIUS_M, height=WALL_M)
+    cylinder.apply_transform(turn)
+    return cylinder
+
+
+def _placed(mesh: Any, pose: sapien.Pose) -> Any:
+    mesh.apply_transform(pose.to_transformation_matrix())
+    return mesh
