@@ -83,9 +83,12 @@ def is_name(text: str) -> bool:
     return 0 < len(text) <= MAX_NAME and text.isprintable() and not {"/", "\\"} & set(text)
 
 
-def _is_name_rule(name: str) -> Rule:
-    expected = f"a name of 1 to {MAX_NAME} printable characters without '/' and '\\'"
-    return Rule((name,), expected, lambda record: is_name(getattr(record, name)))
+def is_task_id(text: str) -> bool:
+    """Whether this can be a task's id: a name, or a namespace and a name with `/` between."""
+    return len(text) <= MAX_NAME and text.count("/") <= 1 and all(map(is_name, text.split("/")))
+
+
+_NAME = f"1 to {MAX_NAME} printable characters without '/' and '\\'"
 
 
 def _choice_is_right(record: "EpisodeRecord") -> bool:
@@ -98,8 +101,12 @@ def _choice_is_right(record: "EpisodeRecord") -> bool:
 
 
 ALWAYS = (
-    _is_name_rule("task"),
-    _is_name_rule("policy"),
+    Rule(
+        ("task",),
+        f"a name of {_NAME}, or a namespace, '/' and a name",
+        lambda record: is_task_id(record.task),
+    ),
+    Rule(("policy",), f"a name of {_NAME}", lambda record: is_name(record.policy)),
     Rule(
         ("outcome", "error"),
         "an error with the outcome 'error', and with no other",

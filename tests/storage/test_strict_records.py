@@ -89,6 +89,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no task": ({"task": None}, "task None .expected text"),
     "a task without letters": ({"task": ""}, "a name of 1 to 255"),
     "a task of two lines": ({"task": "A\nB"}, "printable characters"),
+    "a task with two namespaces": ({"task": "a/b/C-v0"}, "or a namespace, '/' and a name"),
+    "a task without a name": ({"task": "mikasa_vla/"}, "or a namespace, '/' and a name"),
     "a policy that is a path": ({"policy": "../oracle"}, "without '/'"),
     "text in n_steps": ({"n_steps": "60"}, "n_steps '60' .expected a whole number"),
     "K of 0": ({"n_action_steps": 0}, "greater than or equal to 1"),
