@@ -1,15 +1,17 @@
 """Generate pages of the documentation from the code when the site is built; a hook of MkDocs.
 
 They are not committed, so they cannot be out of date: the command line from its argparse parsers, the
-tasks from the catalogue, the tables of recipes from the READMEs beside them, the changelog. The pages
-`docs/reference/api/*.md` name modules; mkdocstrings fills them from docstrings. It knows nothing of how
-pages look, and imports neither torch nor a simulator.
+tasks from the catalogue, the tables of recipes from the READMEs beside them, the list of modules from their
+first lines, the changelog. The pages `docs/reference/api/*.md` name modules; mkdocstrings fills them from
+docstrings. It knows nothing of how pages look, and imports neither torch nor a simulator.
 """
 
 import argparse
+import ast
 import contextlib
 import io
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -24,6 +26,8 @@ from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FOLDERS = ("configs", "policies", "datasets", "prompts", "protocols")
+API_FOLDER = "reference/api"
+DOCUMENTED = re.compile(r"^::: (vla_eval[\w.]*)$", re.MULTILINE)
 HELP_COLUMNS = "82"  # what the column of a page shows without scrolling
 
 
@@ -39,6 +43,7 @@ def generated_pages() -> dict[str, str]:
     return {
         "reference/cli.md": _command_line(),
         "reference/tasks.md": _tasks(),
+        f"{API_FOLDER}/rooms.md": _rooms(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
         **{f"reference/{folder}.md": _recipes(folder) for folder in RECIPE_FOLDERS},
     }
@@ -77,6 +82,42 @@ def _tasks() -> str:
                 show.run(argparse.Namespace(task=name, prompt_set=DEFAULT_PROMPT_SET))
             lines += [f"### {name}", "", *_printed(printed.getvalue())]
     return "\n".join(lines)
+
+
+def _rooms() -> str:
+    """Return every module of the package with the first line of its docstring, room by room."""
+    pages = {
+        module: page.name
+        for page in sorted((ROOT / "docs" / API_FOLDER).glob("*.md"))
+        for module in DOCUMENTED.findall(page.read_text(encoding="utf-8"))
+    }
+    lines = [
+        "# Every module, by room",
+        "",
+        "A room is a folder of `vla_eval` with one subject. Modules with a link are for use from Python and "
+        "have a reference; the others may change in any version.",
+        "",
+    ]
+    package = ROOT / "vla_eval"
+    rooms = sorted(path.parent for path in package.rglob("__init__.py"))
+    for room in rooms:
+        name = ".".join(room.relative_to(ROOT).parts)
+        files = [file for file in sorted(room.glob("*.py")) if not file.name.startswith("__")]
+        if not files:
+            continue
+        lines += [f"## `{name}`", "", _first_line(room / "__init__.py"), "", "| module | what it does |"]
+        lines += ["|---|---|"]
+        for file in files:
+            module = f"{name}.{file.stem}"
+            linked = f"[`{file.stem}`]({pages[module]}#{module})" if module in pages else f"`{file.stem}`"
+            lines.append(f"| {linked} | {_first_line(file)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _first_line(file: Path) -> str:
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
+    return (docstring or "").partition("\n")[0].replace("|", "\\|").replace("<", "&lt;")
 
 
 def _printed(text: str) -> list[str]:

@@ -4,12 +4,18 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from scripts.site_figures import drawn
+from tests.page import test_report_browser
+from tests.page.test_report_browser import CHROMIUM, Browser
 from vla_eval.cli.main import VERBS
 from vla_eval.tasks.catalog import FAMILIES, TASKS
+
+browser = test_report_browser.browser
 
 ROOT = Path(__file__).parents[2]
 QUIET = {"NO_MKDOCS_2_WARNING": "1"}  # an advertisement, printed before the build
@@ -40,6 +46,48 @@ def test_the_reference_has_what_the_contract_is_made_of(site: Path) -> None:
     page = (site / "reference" / "api" / "episodes.html").read_text(encoding="utf-8")
     for name in ("core.Policy.act", "core.ActionChunk", "specs.PolicySpec", "rollout.rollout"):
         assert f'id="vla_eval.{name}"' in page
+
+
+def test_every_module_is_listed_in_its_room(site: Path) -> None:
+    page = (site / "reference" / "api" / "rooms.html").read_text(encoding="utf-8")
+    rooms = [path.parent for path in (ROOT / "vla_eval").rglob("__init__.py")]
+    modules = [file for room in rooms for file in room.glob("*.py") if not file.name.startswith("__")]
+    assert page.count("<tr>") >= len(modules) > 300
+    assert 'href="episodes.html#vla_eval.core"' in page
+
+
+def test_each_table_of_results_has_its_figure(site: Path) -> None:
+    for name in ("results", "chunk_sizes", "tutorial"):
+        source = (ROOT / f"docs/{name}.md").read_text(encoding="utf-8")
+        page = (site / f"{name}.html").read_text(encoding="utf-8")
+        n_tables = sum(line.startswith("|") and "success once" in line for line in source.split("\n"))
+        assert page.count('<figure class="rates">') == n_tables > 0
+
+
+def test_a_figure_says_what_its_table_says() -> None:
+    header = {"policy": "a", "K": "4", "success once": "0.50 [0.25, 0.75]", "chance": "0.33†"}
+    rows = [header, {**header, "policy": "b", "success once": "0.40 ± 0.10 [0.20, 0.60]"}]
+    figure = drawn(rows)
+    assert figure is not None and "ceiling" not in figure and "dashed: chance" in figure
+    labels = re.findall(r"<text[^>]*>([^<]+)</text>", figure)
+    assert [label for label in labels if not label[0].isdigit()] == ["a", "b"] * 2  # wide and narrow; one K
+    assert drawn([{**header, "success once": "250/250"}] * 2) is None
+    assert drawn([{"rule": "x"}] * 2) is None
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_pages_from_the_disk_are_searched(site: Path, browser: Browser) -> None:
+    browser.call("Emulation.setFocusEmulationEnabled", {"enabled": True})
+    browser.open(site / "results.html")
+    browser.ask("document.querySelector('.md-search__input').focus()")
+    browser.call("Input.insertText", {"text": "wilson"})
+    deadline = time.monotonic() + 60
+    while not browser.ask("document.querySelectorAll('.md-search-result__link').length"):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert browser.complaints == []
+    assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
 
 
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:

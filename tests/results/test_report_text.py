@@ -230,3 +230,23 @@ def test_without_a_measured_chance_the_verdict_begins_with_the_best_and_keeps_th
     (verdict,) = verdicts(build_table([stored(records)]))
 
     assert [text.partition(" succeeds")[0] for text in verdict.sentences] == ["good, K=1", "good, K=8", "bad"]
+
+
+def test_a_verdict_is_said_once_for_all_n_action_steps_at_which_it_is_the_same() -> None:
+    won = {1: 30, 4: 28, 8: 12}  # of 30; chance wins the first 10
+    records = [
+        record
+        for k, n in won.items()
+        for record in (
+            *episodes("p", "+" * n + "-" * (30 - n), n_action_steps=k),
+            *episodes("cue_blind", "+" * 10 + "-" * 20, n_action_steps=k),
+        )
+    ]
+
+    (verdict,) = verdicts(build_table([stored(records)]))
+
+    beats, not_shown = verdict.sentences
+    # 28/30 less 10/30, and 12/30 less 10/30.
+    assert beats.startswith("p beats chance at K = 1 and 4; the smallest difference, at K = 4, is +0.60 [")
+    assert "p < 0.001" in beats
+    assert not_shown.startswith("p, K=8 is not shown to beat chance: +0.07 [")

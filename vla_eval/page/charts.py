@@ -84,19 +84,20 @@ class Chart(NamedTuple):
     narrow: Markup | None = None
 
 
-def forest(bars: Sequence[Bar], *, title: str, description: str) -> Chart:
+def forest(bars: Sequence[Bar], *, title: str, description: str, width_px: float = FOREST_WIDTH_PX) -> Chart:
     """Draw rates with intervals, one below the other, chance and ceiling as ticks.
 
     Args:
         bars: from the top; a rate of None is said in words.
         title: of the plot.
         description: what it shows, for screen readers.
+        width_px: of the axis, where the screen is not narrow.
     """
     label = f"{title}. {description}"
     with own_style():
         return Chart(
             title,
-            inline_svg(_forest(bars, FOREST_WIDTH_PX), label=label, css_class="wide"),
+            inline_svg(_forest(bars, width_px), label=label, css_class="wide"),
             inline_svg(_forest(bars, NARROW_FOREST_WIDTH_PX), label=label, css_class="narrow"),
         )
 

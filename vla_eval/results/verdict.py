@@ -1,8 +1,9 @@
 """Say in sentences what a table shows: which policies beat chance. Computes no number."""
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 from vla_eval.results.comparison import CHANCE_POLICY
 from vla_eval.results.latex_preset import CONTROLS
@@ -12,12 +13,23 @@ LEVEL = 0.05
 SMALLEST_SAID_P = 0.001
 
 
+Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
+
+VERBS: Mapping[Finding, str] = MappingProxyType(
+    {
+        "beats": "beats chance",
+        "not shown": "is not shown to beat chance",
+        "worse": "is worse than chance",
+    }
+)
+
+
 class Verdict(NamedTuple):
     """What a table shows of one task.
 
     Attributes:
         task: its id.
-        sentences: one per policy, the best first.
+        sentences: the best policy first; one for all n_action_steps of a policy at which the same was found.
     """
 
     task: str
@@ -34,7 +46,12 @@ def verdicts(table: Table) -> list[Verdict]:
         rows = [row for row in table.rows if row.task == task]
         learned = [row for row in rows if row.policy not in CONTROLS]
         told = learned or [row for row in rows if row.policy == "oracle"]
-        sentences = [_sentence(row, rows) for row in sorted(told, key=_rank)]
+        groups: dict[object, list[Row]] = {}
+        for row in sorted(told, key=_rank):
+            finding = _finding(row)
+            key = (row.policy, row.variant, finding, None if finding in VERBS else row.n_action_steps)
+            groups.setdefault(key, []).append(row)
+        sentences = [_sentence(group, rows) for group in groups.values()]
         if sentences:
             found.append(Verdict(task, tuple(sentences)))
     return found
@@ -47,28 +64,53 @@ def _rank(row: Row) -> tuple[float, float]:
     return difference, success
 
 
-def _sentence(row: Row, rows: Sequence[Row]) -> str:
-    name = _name(row, rows)
+def _finding(row: Row) -> Finding:
     if row.success_once is None:
-        return f"{name} has no result yet."
+        return "no result"
     if row.baseline != CHANCE_POLICY or row.paired_difference is None or row.paired_p is None:
+        return "chance unknown"
+    if row.paired_p >= LEVEL:
+        return "not shown"
+    return "beats" if row.paired_difference > 0 else "worse"
+
+
+def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
+    """Say what was found of a policy at one or several K; the group has the largest difference first."""
+    name, finding, row = _name(group, rows), _finding(group[0]), group[0]
+    if finding == "no result":
+        return f"{name} has no result yet."
+    if finding == "chance unknown":
         known = "not measured" if row.chance is None else f"{row.chance:.2f} by arithmetic"
         return (
             f"{name} succeeds in {row.success_once:.2f} of its episodes. Chance is {known}: without "
             f"{CHANCE_POLICY} on the same episodes, nothing is said of memory{_choice(row)}."
         )
+    verb = VERBS[finding]
+    if len(group) == 1:
+        return f"{name} {verb}{' by' if finding == 'beats' else ':'} {_said(row)}."
+    which, row = ("smallest", group[-1]) if finding == "beats" else ("largest", group[0])
+    steps = _listed(sorted(one.n_action_steps for one in group))
+    return (
+        f"{name} {verb} at K = {steps}; the {which} difference, at K = {row.n_action_steps}, is {_said(row)}."
+    )
+
+
+def _said(row: Row) -> str:
+    assert row.paired_p is not None  # as in every row whose chance was measured
     difference = f"{row.paired_difference:+.2f} [{row.paired_low:+.2f}, {row.paired_high:+.2f}]"
-    said = f"{difference}, {_p(row.paired_p)}{_choice(row)}"
-    if row.paired_p >= LEVEL:
-        return f"{name} is not shown to beat chance: {said}."
-    return f"{name} {'beats chance by' if row.paired_difference > 0 else 'is worse than chance:'} {said}."
+    return f"{difference}, {_p(row.paired_p)}{_choice(row)}"
 
 
-def _name(row: Row, rows: Sequence[Row]) -> str:
+def _listed(numbers: Sequence[int]) -> str:
+    return f"{', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
+
+
+def _name(group: Sequence[Row], rows: Sequence[Row]) -> str:
     """Return the policy, with its K and its settings if the same policy has other rows."""
+    row = group[0]
     others = [other for other in rows if other.policy == row.policy]
     parts = [row.policy]
-    if len({other.n_action_steps for other in others}) > 1:
+    if len(group) == 1 and len({other.n_action_steps for other in others}) > 1:
         parts.append(f"K={row.n_action_steps}")
     if row.variant and len({other.variant for other in others}) > 1:
         parts.append(row.variant)
