@@ -167,6 +167,7 @@ class TestRefusals:
             MikasaEnvConfig(wrist_mesh="simple").create_envs(1)
 
 
+@pytest.mark.usefixtures("no_network")
 class TestCommands:
     """lerobot's own entry points, in this process."""
 

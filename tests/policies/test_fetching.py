@@ -9,8 +9,11 @@ from typing import Any
 
 import huggingface_hub.constants
 import pytest
+import torch
+import torchvision
 from huggingface_hub import HfApi
 from safetensors.torch import load_file, save_file
+from torchvision.models.resnet import BasicBlock
 
 from tests.policies.hub_stand_in import COMMIT, Hub, serving
 from tests.policies.openvla import openvla_golden as golden
@@ -19,6 +22,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.policy import load_policy
 from vla_eval.errors import CheckpointError, UnknownNameError
 from vla_eval.policies import fetching
+from vla_eval.policies.backbones import fetched_backbones
 from vla_eval.policies.bases import BASES, OF_RECIPES, Base, Source, find_base
 from vla_eval.policies.checkpoint import BASE_FILE, checkpoint_sha256, find_checkpoint
 from vla_eval.policies.conversion import published
@@ -96,6 +100,53 @@ def test_a_base_that_is_there_is_checked_without_the_hub(hub: Hub, tmp_path: Pat
     save_file(weights, out / WEIGHTS_FILE)
     with pytest.raises(CheckpointError, match="1 missing"):
         fetch(hub, out)
+
+
+@pytest.fixture
+def resnet_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    """Serve a ResNet-18 of few channels; the weights of torchvision's own are 47 MB."""
+    monkeypatch.setattr(torchvision.models.resnet, "resnet18", thin_resnet)
+    monkeypatch.setattr(torchvision.models, "resnet18", thin_resnet)
+    repository = tmp_path / "timm"
+    repository.mkdir()
+    save_file(thin_resnet().state_dict(), repository / WEIGHTS_FILE)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.chdir(tmp_path)
+    with serving(Hub({BASES["resnet18"].weights.repo_id: repository})) as served:
+        yield served
+
+
+def thin_resnet(*, weights: Any = None) -> torch.nn.Module:
+    network: Any = torchvision.models.ResNet(BasicBlock, [1, 1, 1, 1], num_classes=2, width_per_group=64)
+    if weights is not None:
+        network.load_state_dict(torchvision.models.ResNet18_Weights.verify(weights).get_state_dict())
+    return network
+
+
+def test_a_backbone_is_fetched_by_the_same_door_and_only_then_a_policy_starts_from_it(
+    resnet_hub: Hub, tmp_path: Path
+) -> None:
+    weights = "ResNet18_Weights.IMAGENET1K_V1"
+    with (
+        fetched_backbones(),
+        pytest.raises(
+            CheckpointError,
+            match=r"checkpoint fetch resnet18\. .*--set policy\.pretrained_backbone_weights=null",
+        ),
+    ):
+        torchvision.models.resnet18(weights=weights)
+    fetch(resnet_hub, Path("elsewhere"), BASES["resnet18"])  # the folder's name says nothing
+    out = Path("checkpoints") / "resnet18"
+    lines = fetch(resnet_hub, out, BASES["resnet18"])
+    assert "names and shapes of torchvision's network" in lines[-1]
+    published = load_file(tmp_path / "timm" / WEIGHTS_FILE)
+    with fetched_backbones():
+        made = torchvision.models.resnet18(weights=weights).state_dict()
+    assert all(torch.equal(made[name], x) for name, x in published.items())
+    published.pop("layer1.0.conv1.weight")
+    save_file(published, out / WEIGHTS_FILE)
+    with pytest.raises(CheckpointError, match=r"found others: layer1\.0\.conv1\.weight\."):
+        fetch(resnet_hub, out, BASES["resnet18"])
 
 
 def test_a_connection_that_is_cut_resumes_where_it_was(hub: Hub, tmp_path: Path) -> None:

@@ -46,6 +46,7 @@ class Base:
         terms: the licence, as its authors state it; what the Hub says of it is shown, too.
         parts: what is fetched, small parts first: one that is refused is then known before the large ones.
         converter: how the files become a LeRobot checkpoint; None: they are one.
+        is_backbone: they are none, but weights of a part of a policy; the name is torchvision's.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Base:
     terms: str
     parts: tuple[Source, ...]
     converter: Converter | None = None
+    is_backbone: bool = False
 
     @property
     def weights(self) -> Source:
@@ -175,6 +177,19 @@ _ALL = (
             ),
         ),
         converter="spatialvla",
+    ),
+    Base(
+        name="resnet18",
+        title="ResNet-18 of torchvision, trained on ImageNet (IMAGENET1K_V1)",
+        terms="BSD-3-Clause",
+        parts=(
+            Source(
+                repo_id="timm/resnet18.tv_in1k",
+                revision="bbd144b3e5565108aad885f145491d11bc6ce807",
+                patterns=("model.safetensors",),
+            ),
+        ),
+        is_backbone=True,
     ),
 )
 BASES: Mapping[str, Base] = MappingProxyType({base.name: base for base in _ALL})

@@ -78,7 +78,7 @@ def fetch_base(
             not of this model.
     """
     if out.exists():
-        say(f"{out} is there: {_check(find_checkpoint(out))}")
+        say(f"{out} is there: {_check(base, out)}")
         return out
     api = api or HfApi()
     downloads = out.parent / DOWNLOADS / out.name
@@ -96,7 +96,7 @@ def fetch_base(
                 _download(api, part, remote.n_bytes, name, folder / name)
         _check_files(part, folder)
     made = _publish(base, parts, downloads, out)
-    say(f"{made}: {_check(made)}")
+    say(f"{made}: {_check(base, made)}")
     return made
 
 
@@ -217,11 +217,15 @@ def _noted(part: RemotePart) -> dict[str, object]:
     }
 
 
-def _check(folder: Path) -> str:
-    from vla_eval.policies.verify import check_structure  # see `_publish`
+def _check(base: Base, folder: Path) -> str:
+    # Here and not above: see `_publish`.
+    from vla_eval.policies.backbones import check_backbone
+    from vla_eval.policies.verify import check_structure
 
     with _offline():
-        return check_structure(folder).line()
+        if base.is_backbone:
+            return check_backbone(folder, base.name)
+        return check_structure(find_checkpoint(folder)).line()
 
 
 @contextlib.contextmanager

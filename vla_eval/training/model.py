@@ -13,6 +13,7 @@ import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 
 from vla_eval.errors import RecipeError, TrainingError
+from vla_eval.policies.backbones import WITHOUT, fetched_backbones
 from vla_eval.policies.checkpoint import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
 from vla_eval.policies.foreign_code import no_foreign_code
 from vla_eval.policies.lerobot_loading import (
@@ -50,11 +51,12 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
     config = job.policy
     try:
         # A map that renames nothing: the names of the cameras are checked in `policy_config`.
-        model = make_policy(cfg=config, ds_meta=meta, rename_map=job.recipe.rename_cameras or {"": ""})
+        with fetched_backbones():
+            model = make_policy(cfg=config, ds_meta=meta, rename_map=job.recipe.rename_cameras or {"": ""})
     except URLError as exc:
         raise TrainingError(
             f"the policy asks for weights that are not on this machine, and they could not be downloaded "
-            f"({exc.reason}). Without them: --set policy.pretrained_backbone_weights=null"
+            f"({exc.reason}). {WITHOUT}"
         ) from exc
     except (OSError, RuntimeError) as exc:
         raise_plainly(exc, config.type)
