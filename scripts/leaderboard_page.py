@@ -31,6 +31,8 @@ Read before you compare:
 - **Demonstrations may show the evaluation's episodes.** The official collector seeds them by batch, from 0
   on. The authors of GMP write that the success rate at seed 0 is much higher for that reason
   ([their page](https://github.com/real-stanford/gated-memory-policy/blob/b82598f/mikasa-robo-env/README.md)).
+  `mikasa-vla dataset check-leak` [compares a dataset with our
+  seeds](dataset_tools.md#do-demonstrations-show-the-evaluations-episodes).
 - The tasks here are written again, with [stated differences](tasks.md#differences-from-the-official-code).
 
 A [protocol](protocols.md) gives your own runs the figure that stands in the column *mean*.

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ from vla_eval.data.dataset_folder import check_dataset, open_recorded
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.frame_table import read_columns
+from vla_eval.data.initial_states import read_initial_states
+from vla_eval.data.leak import check_leak
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
 from vla_eval.data.recording import RecordedDataset, record
 from vla_eval.data.recording_folder import LOCK_FILE, STATE_FOLDER
@@ -38,6 +41,7 @@ from vla_eval.data.replay_report import require_passed
 from vla_eval.data.shard_writer import ShardWriter
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
 from vla_eval.storage.durable import FolderLock
+from vla_eval.training import held_out
 from vla_eval.training.dataset import training_dataset
 from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import Failed
@@ -133,6 +137,19 @@ class TestDataset:
     def test_a_changed_recipe_is_refused_and_says_what_changed(self, recorded: RecordedDataset) -> None:
         with pytest.raises(RunChangedError, match=r"config.steps_after_success: 5 -> 3"):
             record(recipe(steps_after_success=3), out=recorded.path.parent)
+
+    def test_its_seeds_are_found_among_those_of_an_evaluation(
+        self, recorded: RecordedDataset, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        report = check_leak(read_initial_states(recorded.path), task=TASK, seeds=range(998, 1002))
+        found = [(one.episode, one.dataset_seed, one.evaluation_seed) for one in report.shared]
+        assert found == [("episode 0", 1000, 1000), ("episode 1", 1001, 1001)]
+        dataset: Any = SimpleNamespace(root=recorded.path)
+        assert held_out.shared_seeds_warning(dataset) is None
+        monkeypatch.setattr(held_out, "EVALUATION_SEEDS", range(1004, 1050))
+        assert "2 seeds that tables are made from (1004 … 1005)" in str(
+            held_out.shared_seeds_warning(dataset)
+        )
 
     def test_two_processes_cannot_record_into_one_folder(self, tmp_path: Path) -> None:
         (tmp_path / STATE_FOLDER).mkdir()

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from vla_eval.bounds import check_seeds
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import Shard
@@ -70,6 +71,19 @@ def add_allow_environment_change(parser: argparse.ArgumentParser, *, consequence
         action="store_true",
         help=f"resume although package versions or the machine have changed{consequence}",
     )
+
+
+def seeds_argument(text: str) -> range:
+    """Read the value of `--seeds`: `1-100`, or one seed."""
+    first, _, last = text.partition("-")
+    try:
+        seeds = range(int(first), int(last or first) + 1)
+        check_seeds(int(first), max(1, len(seeds)), name="--seeds")
+    except (ValueError, RecipeError) as exc:
+        raise argparse.ArgumentTypeError(f"expected seeds such as 1-100, found '{text}'") from exc
+    if not seeds:
+        raise argparse.ArgumentTypeError(f"expected the lower seed first, found '{text}'")
+    return seeds
 
 
 def shard_argument(text: str) -> Shard:

@@ -1,9 +1,11 @@
-"""`mikasa-vla dataset …`: convert demonstrations, describe them, share them."""
+"""`mikasa-vla dataset …`: convert, check, describe and share demonstrations."""
 
 import argparse
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from vla_eval.cli.arguments import seeds_argument
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -19,6 +21,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     convert.add_argument(
         "--state", choices=("eef", "joints"), default="eef", help="what observation.state is (%(default)s)"
     )
+
+    leak = actions.add_parser(
+        "check-leak",
+        help="whether demonstrations begin as the evaluation's episodes do (exit code 1 if any does)",
+        allow_abbrev=False,
+    )
+    leak.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, or what `convert` reads")
+    leak.add_argument("--task", metavar="T", help="task id, for datasets that name none")
+    leak.add_argument("--seeds", metavar="A-B", type=seeds_argument, help="seeds of the evaluation (1-100)")
 
     card = actions.add_parser("card", help="write README.md and a contact sheet", allow_abbrev=False)
     card.add_argument("dataset", metavar="DIR", type=Path, help="a complete dataset")
@@ -61,6 +72,42 @@ def _convert(args: argparse.Namespace) -> int:
     return 0
 
 
+def _check_leak(args: argparse.Namespace) -> int:
+    from vla_eval.config.dataset import EVALUATION_SEEDS
+    from vla_eval.data.initial_states import read_initial_states
+    from vla_eval.data.leak import check_leak
+    from vla_eval.errors import DatasetError
+    from vla_eval.results.table_formats import markdown_table
+    from vla_eval.tasks.catalog import task_spec
+
+    if args.task is not None:
+        task_spec(args.task)  # a mistyped name must not wait for the dataset
+    dataset = read_initial_states(args.dataset)
+    task = args.task or dataset.task
+    if task is None:
+        raise DatasetError(f"{args.dataset}: names no task. Add --task (`mikasa-vla list tasks`).")
+    report = check_leak(dataset, task=task, seeds=args.seeds or EVALUATION_SEEDS)
+    what = {"state": "the arm's initial state", "frames": "first frames"}[report.evidence]
+    compared = (
+        f"{report.n_episodes} episodes with seeds {report.seeds[0]} to {report.seeds[-1]} of {report.task}, "
+        f"by {what}"
+    )
+    if not report.shared:
+        print(f"No episode begins as the evaluation's do: compared {compared}.")
+        return 0
+    rows = [
+        [one.episode, "—" if one.dataset_seed is None else str(one.dataset_seed), str(one.evaluation_seed)]
+        for one in report.shared
+    ]
+    print(markdown_table(["demonstration", "its own seed", "evaluation seed"], rows, [False, True, True]))
+    n_shared = len({one.episode for one in report.shared})
+    raise DatasetError(
+        f"{args.dataset}: {n_shared} of {report.n_episodes} demonstrations begin as an evaluation's episode "
+        f"does (compared {compared}). A policy trained on them would be tested on what it was shown: leave "
+        "these episodes out, or evaluate on other seeds (--seed-start)."
+    )
+
+
 def _card(args: argparse.Namespace) -> int:
     from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
 
@@ -86,6 +133,7 @@ def _pull(args: argparse.Namespace) -> int:
 
 _ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
     "convert": _convert,
+    "check-leak": _check_leak,
     "card": _card,
     "push": _push,
     "pull": _pull,

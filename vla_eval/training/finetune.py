@@ -15,7 +15,7 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.estimate import RateWatch, estimate
-from vla_eval.training.held_out import HeldOut
+from vla_eval.training.held_out import HeldOut, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
@@ -70,6 +70,9 @@ def _describe(job: TrainingJob, say: Say) -> None:
         f"dataset: {dataset.name} {dataset.sha256[:12]}, {frames.n_used} of {frames.n_frames} frames as "
         "starts"
     )
+    warning = shared_seeds_warning(dataset)
+    if warning is not None:
+        say(warning)
     if not masks_padding(job.policy):
         say(
             "padded actions: this policy does not mask them; chunks that go beyond an episode's end are left "

@@ -153,6 +153,21 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
     return task_spec(task).id
 
 
+def shared_seeds_warning(dataset: TrainingDataset) -> str | None:
+    """Return a warning if demonstrations are of seeds that tables are made from; None if none is.
+
+    Recording refuses such seeds; a dataset from elsewhere, or of an earlier version, may have them.
+    """
+    shown = sorted(_seeds_of(dataset) & set(EVALUATION_SEEDS))
+    if not shown:
+        return None
+    return (
+        f"warning: demonstrations are of {len(shown)} seeds that tables are made from ({shown[0]} … "
+        f"{shown[-1]}). Evaluate on others (--seed-start), or leave them out: mikasa-vla dataset check-leak "
+        f"{dataset.root}"
+    )
+
+
 def _seeds_of(dataset: TrainingDataset) -> set[int]:
     """Return the seeds that demonstrations were tried at; none for an import, whose seeds are not ours."""
     if not (dataset.root / MANIFEST_FILE).is_file():
