@@ -1,7 +1,6 @@
 """`mikasa-vla audit`: which tasks can be won without remembering?"""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from vla_eval.cli.arguments import (
     add_shard,
     add_verb,
     add_workers,
-    typed_command,
 )
 from vla_eval.cli.cluster import add_cluster, backend_of
 from vla_eval.config.decoding import decode
@@ -67,33 +65,20 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
+    from vla_eval.cli.evaluations import evaluate_each
     from vla_eval.cli.output import print_shard
-    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
 
     configs = _configs(args)
-    out, command = shard_folder(args.out, args.shard), typed_command()
-    with backend_of(args) as backend, stop_on_signals() as stop:
-        n_errors = 0
-        for config in configs:
-            summary = evaluate_with_progress(
-                config,
-                out=out / config.name,
-                command=command,
-                stop=stop,
-                allow_environment_change=args.allow_environment_change,
-                shard=args.shard,
-                backend=backend,
-                json_progress=args.json_progress,
-            )
-            n_errors += summary.n_errors
-            if summary.was_stopped:
-                print(f"Stopped. To resume: {command}", file=sys.stderr)
-                return stop.exit_code
+    out = shard_folder(args.out, args.shard)
+    with backend_of(args) as backend:
+        done = evaluate_each(((out / config.name, config) for config in configs), args, backend=backend)
+    if done.stopped is not None:
+        return done.stopped
     if args.shard is not None:
         print_shard(out, args.out, args.shard)
     else:
         print(render_audit(read_audit(configs, args.out), args.format))
-    return EXIT_EPISODE_ERRORS if n_errors else 0
+    return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:

@@ -122,38 +122,26 @@ def evaluate_table(args: argparse.Namespace) -> int:
 
 
 def _evaluate(work: _Work, backend: Backend, args: argparse.Namespace) -> int:
+    from vla_eval.cli.evaluations import evaluate_each
     from vla_eval.cli.output import hint_merge, print_table, write_html
-    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
     from vla_eval.storage.run_folder import read_run
 
-    command = typed_command()
-    n_errors, folders = 0, []
-    with stop_on_signals() as stop, _tiny_models(work):
-        for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
-            folder = shard_folder(folder.parent, args.shard) / folder.name
-            config = replace(config, workers=args.workers or (1 if args.tiny else config.workers))
-            summary = evaluate_with_progress(
-                config,
-                out=folder,
-                command=command,
-                stop=stop,
-                allow_environment_change=args.allow_environment_change,
-                shard=args.shard,
-                backend=backend,
-                json_progress=args.json_progress,
-            )
-            if summary.was_stopped:
-                print(f"Stopped. To resume: {command}", file=sys.stderr)
-                return stop.exit_code
-            n_errors += summary.n_errors
-            folders.append(folder)
-    runs = [read_run(folder) for folder in folders]
+    planned = []
+    for folder, config in evaluations(work.table, work.out, adapters=work.adapters):
+        workers = args.workers or (1 if args.tiny else config.workers)
+        folder = shard_folder(folder.parent, args.shard) / folder.name
+        planned.append((folder, replace(config, workers=workers)))
+    with _tiny_models(work):
+        done = evaluate_each(planned, args, backend=backend)
+    if done.stopped is not None:
+        return done.stopped
+    runs = [read_run(folder) for folder, _ in planned]
     print_table(runs, args)
     if args.html is not None:
         write_html(runs, args)
     if args.shard is not None:
         hint_merge(work.out / EVALUATION_FOLDER, args.shard)
-    return EXIT_EPISODE_ERRORS if n_errors else 0
+    return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 
 def _work(args: argparse.Namespace, *, rows: Sequence[str] | None) -> _Work:

@@ -49,10 +49,16 @@ class Material:
         return self.grouping.groups[key_of(row)]
 
     def name_of(self, row: Row, *, with_task: bool = False) -> str:
-        """Return the name of a row within its task: policy, K, and its variant if there are several."""
+        """Return the name of a row within its task: policy, K, and the letter of its variant."""
         parts = [row.task] if with_task else []
-        parts += [row.policy, f"K={row.n_action_steps}"]
-        return " · ".join([*parts, row.variant] if row.variant else parts)
+        name = " · ".join([*parts, row.policy, f"K={row.n_action_steps}"])
+        return f"{name} ({self.variants[row.variant]})" if row.variant else name
+
+    @property
+    def variants(self) -> dict[str, str]:
+        """The settings in which run folders differ, each with its letter."""
+        told = dict.fromkeys(row.variant for row in self.table.rows if row.variant)
+        return {variant: chr(ord("a") + i) for i, variant in enumerate(told)}
 
 
 def key_of(row: Row) -> RowKey:
