@@ -18,6 +18,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.policies.fast_tokens import load_fast_tokenizer
 from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.policies.weight_file import write_weights
+from vla_eval.testing import rehearsal
 from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsal import RehearsalOptions, rehearse, rehearse_checkpoint
 from vla_eval.training.job import load_finetune_recipe
@@ -75,6 +76,10 @@ def test_a_checkpoint_that_is_there_is_loaded_and_stays(tmp_path: Path) -> None:
     config, tokenizer = stand_in_config(recipe, tmp_path, dtype=None, tiny=False)
     policy = make_unfilled_policy(config)
     write_checkpoint(folder, config, policy, tokenizer)
+    on_a_gpu = rehearsal._estimate(policy, "cuda", 100, trained=5)
+    n_weights = BYTES_PER_NUMBER * sum(x.numel() for x in policy.parameters())
+    assert set(on_a_gpu.peak_rss_bytes) == {"write"}  # the weights are in the device's memory
+    assert on_a_gpu.peak_device_bytes is not None and on_a_gpu.peak_device_bytes > n_weights
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     found = rehearse_checkpoint(folder, options)
     assert found.parameters == sum(x.numel() for x in policy.parameters()) and found.trained is None

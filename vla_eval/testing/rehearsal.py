@@ -79,6 +79,7 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
     if options.folder.exists():
         raise CheckpointError(f"{options.folder} exists already. Name another folder with --out.")
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
+    reset_peak()  # of what this process rehearsed before
     before = peak_rss_bytes()
     options.folder.mkdir(parents=True)
     try:
@@ -99,6 +100,7 @@ def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Seque
     Raises:
         CheckpointError: it is incomplete, or memory is too small.
     """
+    reset_peak()
     before, folder = peak_rss_bytes(), find_checkpoint(path)
     if (folder / ADAPTER_CONFIG_FILE).is_file():
         raise CheckpointError(
@@ -106,7 +108,7 @@ def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Seque
             f"mikasa-vla checkpoint merge {path} --out DIR"
         )
     config = read_config(folder, LoadOptions(device=options.device, dtype=options.dtype))
-    estimated = _estimate(make_unfilled_policy(config), config, before, trained=None)
+    estimated = _estimate(make_unfilled_policy(config), options.device, before, trained=None)
     written = _Written(recipe=None, peaks={}, seconds={}, estimated=estimated)
     return _measured(str(path), folder, config, options, written, before, batches)
 
@@ -118,7 +120,7 @@ def _rehearse(
     trained = describe_model(unfilled_model(config, recipe)).n_trained
     config.pretrained_path = None
     policy = make_unfilled_policy(config)
-    estimated = _estimate(policy, config, before, trained=trained)
+    estimated = _estimate(policy, options.device, before, trained=trained)
     folder = options.folder / "model"
     folder.mkdir()
     reset_peak()
@@ -173,7 +175,7 @@ def _measured(
     )
 
 
-def _estimate(policy: Any, config: Any, before: int, *, trained: int | None) -> Estimated:
+def _estimate(policy: Any, device: str, before: int, *, trained: int | None) -> Estimated:
     """Estimate from shapes what is about to be measured.
 
     While it writes, a process holds a part of the numbers, in float32 and in the file's type. Loaded, it
@@ -181,24 +183,24 @@ def _estimate(policy: Any, config: Any, before: int, *, trained: int | None) -> 
 
     Args:
         policy: its weights need no memory.
-        config: of the policy.
+        device: on which it will act.
         before: see `Rehearsed`.
         trained: what the recipe trains; None: nothing is written.
     """
     weights = {id(x): x for x in policy.state_dict(keep_vars=True).values()}.values()
     n_bytes = sum(x.numel() * x.element_size() for x in weights)
-    cost = sample_cost(policy, config)
+    cost = sample_cost(policy, policy.config)
     acting = {} if cost is None else {"act": n_bytes + round(cost.inference_bytes)}
     in_parts = PART * sum({torch.float32.itemsize, *(x.element_size() for x in weights)})
     peaks = {"write": in_parts} if trained is not None else {}
-    if config.device == "cpu":
+    if device == "cpu":
         peaks |= {"load": n_bytes, **acting}
     return Estimated(
         parameters=sum(x.numel() for x in policy.parameters()),
         trained=trained,
         bytes=n_bytes,
         peak_rss_bytes={stage: before + added for stage, added in peaks.items()},
-        peak_device_bytes=acting.get("act") if config.device != "cpu" else None,
+        peak_device_bytes=acting.get("act") if device != "cpu" else None,
     )
 
 
