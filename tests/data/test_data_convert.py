@@ -16,6 +16,7 @@ from vla_eval.data.layouts import npz_files, read_npz
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.testing.synthetic import write_synthetic_dataset
+from vla_eval.training.dataset import training_dataset
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 TASK = "RememberColor3-v0"
@@ -191,7 +192,12 @@ def test_the_rotation_of_position_and_angles_is_that_of_the_elementary_rotations
     assert [*state[:3], state[9]] == pytest.approx([0.1, 0.2, 0.3, 0.08])
 
 
-def write_official_lerobot(root: Path) -> Path:
+OFFICIAL_CAMERAS = ("observation.image", "observation.wrist_image")
+SUITE90_CAMERAS = ("observation.images.top", "observation.images.wrist")
+
+
+def write_official_lerobot(root: Path, cameras: tuple[str, str] = OFFICIAL_CAMERAS) -> Path:
+    base, wrist = cameras
     vector = {"dtype": "float32", "shape": (7,), "names": None}
     image = {"dtype": "video", "shape": (128, 128, 3), "names": ["height", "width", "channel"]}
     dataset = LeRobotDataset.create(
@@ -200,8 +206,8 @@ def write_official_lerobot(root: Path) -> Path:
         root=root,
         streaming_encoding=True,
         features={
-            "observation.image": image,
-            "observation.wrist_image": image,
+            base: image,
+            wrist: image,
             "observation.state": vector,
             "action": vector,
         },
@@ -210,8 +216,8 @@ def write_official_lerobot(root: Path) -> Path:
     for step in range(N_FRAMES[0]):
         dataset.add_frame(
             {
-                "observation.image": arrays["rgb"][step, ..., :3],
-                "observation.wrist_image": arrays["rgb"][step, ..., 3:],
+                base: arrays["rgb"][step, ..., :3],
+                wrist: arrays["rgb"][step, ..., 3:],
                 "observation.state": arrays["proprio"][step],
                 "action": arrays["action"][step],
                 "task": "touch the cube",
@@ -235,6 +241,21 @@ def test_the_official_lerobot_release_gets_our_names_and_no_invented_fields(tmp_
     assert {BASE, WRIST} <= sample.keys()
     assert facts.absent == ("proprio.joints", "next.reward", "next.success", "next.done")
     assert facts.episodes[0].success is None
+
+
+def test_a_dataset_of_the_90_tasks_can_be_trained_on(tmp_path: Path) -> None:
+    root = write_official_lerobot(tmp_path / "remember_color_3_vla_v0", SUITE90_CAMERAS)
+    task = "mikasa_vla/RememberColor3-VLA-v0"
+    assert json.loads((root / "meta/info.json").read_text())["codebase_version"] == "v3.0"
+
+    convert_to_lerobot(find_source(root), tmp_path / "ours", task=task, state="eef")
+
+    with pytest.raises(DatasetError, match="--allow-unreplayed"):
+        training_dataset(tmp_path / "ours", allow_unreplayed=False)
+    found = training_dataset(tmp_path / "ours", allow_unreplayed=True)
+    assert (found.task, found.control_mode, found.state) == (task, "pd_ee_delta_pose", "eef")
+    assert {BASE, WRIST} <= set(found.meta.features)
+    assert load(tmp_path / "ours")[1]["task"] == "touch the cube"
 
 
 def test_a_recorded_dataset_becomes_the_papers_layout(tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ HIDDEN_STEPS, PLACED_STEP = 6, 8
 
 
 class HidingEnv(BaseEnv):  # type: ignore[misc]
-    """A cube that is shown 1000 m up for the first steps; another that is placed elsewhere at one step."""
+    """A cube that is shown 1000 m up for the first steps; another that is placed elsewhere at one
+    step; a third that is parked."""
 
     def __init__(self, **kwargs: Any) -> None:
         backends = {"sim_backend": "physx_cpu", "render_backend": "none"}
@@ -31,6 +32,9 @@ class HidingEnv(BaseEnv):  # type: ignore[misc]
         self.hidden = actors.build_cube(
             self.scene, **cube, name="hidden", initial_pose=sapien.Pose([0, 0, HALF_M])
         )
+        self.parked = actors.build_cube(
+            self.scene, **cube, name="parked", initial_pose=sapien.Pose([0, 1, HIDDEN_M])
+        )
         self.placed = actors.build_cube(
             self.scene, **cube, name="placed", initial_pose=sapien.Pose([1, 0, HALF_M])
         )
@@ -38,8 +42,13 @@ class HidingEnv(BaseEnv):  # type: ignore[misc]
     def _initialize_episode(self, env_idx: Any, options: dict[str, Any]) -> None:
         self.n_evaluated = 0
         self.task_cue, self.oracle_info = None, torch.tensor([1])
-        for cube, x_m in ((self.hidden, 0.0), (self.placed, 1.0)):
-            cube.set_pose(Pose.create_from_pq([x_m, 0, HALF_M]))
+        places_m = {
+            self.hidden: (0.0, 0.0, HALF_M),
+            self.placed: (1.0, 0.0, HALF_M),
+            self.parked: (0.0, 1.0, HIDDEN_M),
+        }
+        for cube, place_m in places_m.items():
+            cube.set_pose(Pose.create_from_pq(list(place_m)))
             cube.set_linear_velocity(torch.zeros(1, 3))
             cube.set_angular_velocity(torch.zeros(1, 3))
 

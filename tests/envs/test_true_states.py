@@ -61,6 +61,13 @@ def test_an_object_that_is_placed_with_a_velocity_stays_there(env: Any) -> None:
     np.testing.assert_allclose(position(env.placed), PLACED_M, atol=1e-3)
 
 
+def test_a_parked_object_does_not_fall(env: Any) -> None:
+    env.reset(seed=1)
+    steps(env, 20)
+    # In the 0.05 s of the last control step it falls by 9.81 / 2 * 0.05² = 0.012 m.
+    np.testing.assert_allclose(position(env.parked), [0, 1, HIDDEN_M], atol=0.02)
+
+
 def test_evaluating_twice_changes_nothing(env: Any) -> None:
     env.reset(seed=1)
     steps(env, 2)

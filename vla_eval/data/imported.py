@@ -42,7 +42,7 @@ class ImportFacts:
 
     Attributes:
         complete: written as true, after everything else.
-        source_layout: `npz_joints`, `npz_proprio` or `lerobot_official` (see `layouts`).
+        source_layout: `npz_joints`, `npz_proprio`, `lerobot_official` or `lerobot_suite90` (see `layouts`).
         task: the task id that the user named; None if none was.
         instruction_source: where the instruction comes from: `source`, or the prompt set of that task.
         state: which proprioception `observation.state` is.

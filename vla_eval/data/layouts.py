@@ -4,7 +4,8 @@
   then wrist camera; `joints (T, 25)`; `action (T, 7 or 8)`; `reward`, `success`, `done` (T,).
 - `npz`, as the authors' later recordings for vision-language-action models have it: instead of `joints`,
   `proprio (T, 7)`, position, roll, pitch, yaw, gripper width; besides `language_instruction`, `episode_seed`.
-- `lerobot`, ours, or the authors' release with `observation.image` and `observation.wrist_image`.
+- `lerobot`, ours, or the authors' releases: with `observation.image` and `observation.wrist_image`, or, of
+  their 90 tasks, with `observation.images.top` and `observation.images.wrist`.
 
 Files are never unpickled.
 """
@@ -23,7 +24,7 @@ from vla_eval.core import FloatArray, ImageArray
 from vla_eval.errors import DatasetError, did_you_mean
 from vla_eval.features import IMAGE_SHAPE
 
-Layout = Literal["npz_joints", "npz_proprio", "lerobot_mikasa", "lerobot_official"]
+Layout = Literal["npz_joints", "npz_proprio", "lerobot_mikasa", "lerobot_official", "lerobot_suite90"]
 
 N_JOINT_NUMBERS = 25  # pose of the tool centre point 7, joint positions 9, joint velocities 9
 N_PROPRIO_NUMBERS = 7  # position 3, roll, pitch, yaw, gripper width
@@ -143,7 +144,7 @@ def read_npz(path: Path) -> tuple[SourceEpisode, Sequence[str]]:
 
 
 def read_lerobot(dataset: Any, layout: Layout) -> Iterator[SourceEpisode]:  # Any: LeRobotDataset
-    """Yield the episodes of an opened LeRobotDataset of one of the two layouts."""
+    """Yield the episodes of an opened LeRobotDataset of one of the layouts."""
     from vla_eval.data.decoded_frames import frame_layout, read_columns
     from vla_eval.data.frame_cache import decode_camera
 
@@ -176,23 +177,22 @@ def read_lerobot(dataset: Any, layout: Layout) -> Iterator[SourceEpisode]:  # An
 LEROBOT_CAMERAS: Mapping[Layout, tuple[str, str]] = {
     "lerobot_mikasa": ("observation.images.base", "observation.images.wrist"),
     "lerobot_official": ("observation.image", "observation.wrist_image"),
+    "lerobot_suite90": ("observation.images.top", "observation.images.wrist"),
 }
 
 
 def lerobot_layout(features: Mapping[str, Any], *, where: Path) -> Layout:  # Any: lerobot's plain data
-    """Return which of the two layouts a LeRobotDataset has.
+    """Return which of the layouts a LeRobotDataset has.
 
     Raises:
-        DatasetError: neither; or its numbers are not as long as they must be.
+        DatasetError: none; or its numbers are not as long as they must be.
     """
     found: list[Layout] = [key for key, cameras in LEROBOT_CAMERAS.items() if set(cameras) <= set(features)]
     if not found:
-        raise DatasetError(
-            f"{where}: expected the cameras {' and '.join(LEROBOT_CAMERAS['lerobot_mikasa'])}, or "
-            f"{' and '.join(LEROBOT_CAMERAS['lerobot_official'])}; its fields are {', '.join(features)}."
-        )
+        pairs = ", or ".join(" and ".join(cameras) for cameras in LEROBOT_CAMERAS.values())
+        raise DatasetError(f"{where}: expected the cameras {pairs}; its fields are {', '.join(features)}.")
     expected = {"action": tuple(CONTROL_MODES)}
-    if found[0] == "lerobot_official":
+    if found[0] != "lerobot_mikasa":
         expected["observation.state"] = (N_PROPRIO_NUMBERS,)
     for name, lengths in expected.items():
         shape = tuple(features[name]["shape"]) if name in features else None

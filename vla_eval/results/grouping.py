@@ -11,7 +11,7 @@ from itertools import chain
 from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.planned import bare_name
+from vla_eval.storage.planned import bare_name, bare_task
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 
@@ -262,7 +262,8 @@ def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     names = config.get(field) if names is None else names
     if isinstance(names, str) or not isinstance(names, Sequence):
         return ()
-    return tuple(bare_name(str(name)) for name in names)
+    bare = bare_task if field == "tasks" else bare_name
+    return tuple(bare(str(name)) for name in names)
 
 
 def _in_order(groups: Iterable[RowEpisodes], runs: Sequence[StoredRun]) -> list[RowEpisodes]:

@@ -108,7 +108,9 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
             "`cue_blind` has no result there at this n_action_steps."
         )
     missing = _unique(
-        f"{row.task} K={row.n_action_steps}" for row in rows if row.chance is None and row.n_episodes
+        f"{row.task} K={row.n_action_steps}"
+        for row in rows
+        if row.chance is None and row.n_episodes and _has_controls(row.task)
     )
     if missing:
         notes.append(
@@ -116,6 +118,12 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
             "same n_action_steps."
         )
     return notes
+
+
+def _has_controls(task: str) -> bool:
+    """Whether chance can be measured by `cue_blind`; the official package's tasks have no scripted arm."""
+    spec = find_task(task)
+    return spec is None or bool(spec.oracle)
 
 
 def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:

@@ -120,11 +120,16 @@ class PlannedEpisodes:
 
 
 def bare_name(name: str) -> str:
-    """Return what records call a policy given as a file, or a task given with its namespace."""
+    """Return what records call a policy given as a file."""
     return PurePath(name).name.removesuffix(".yaml").removesuffix(".yml")
+
+
+def bare_task(name: str) -> str:
+    """Return what records call a task given with this package's namespace; others are part of its id."""
+    return name.removeprefix("vla_eval/")
 
 
 def _known(versions: Mapping[str, int] | None, tasks: Collection[str] | None) -> Collection[str] | None:
     if versions is not None:
         return versions
-    return None if tasks is None else [bare_name(task) for task in tasks]
+    return None if tasks is None else [bare_task(task) for task in tasks]
