@@ -76,6 +76,7 @@ def test_a_figure_says_what_its_table_says() -> None:
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_pages_from_the_disk_are_searched(site: Path, browser: Browser) -> None:
     browser.call("Emulation.setFocusEmulationEnabled", {"enabled": True})
