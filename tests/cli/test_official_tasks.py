@@ -33,3 +33,12 @@ def test_each_suite_has_its_list(capsys: pytest.CaptureFixture[str]) -> None:
     headings = [line for line in lines if not line.startswith(" ")]
     assert headings == ["short:", "medium:", "long:"]
     assert len(lines) - len(headings) == 90
+
+
+def test_a_task_is_shown_with_its_phases_and_where_it_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", TASK]) == 0
+    shown = capsys.readouterr().out
+    assert "(rules version 1, object memory, short split)" in shown
+    assert "every action is replaced by zeros" in shown
+    assert main(["show", "mikasa_vla/TimedTransferEasy-VLA-v0"]) == 0
+    assert "phases        — (not to be read from the environment)" in capsys.readouterr().out

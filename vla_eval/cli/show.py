@@ -14,11 +14,16 @@ from typing import Any, NamedTuple
 
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.spec import TaskSpec
+from vla_eval.tasks.spec import PhaseSource, TaskSpec
 
 WIDTH = 100
 INDENT = 14
 OWN_PACKAGE = "vla_eval."
+OFFICIAL_PHASES: dict[PhaseSource, str] = {
+    "cue_and_delay": "cue, delay, response; lengths as the package has or draws them",
+    "cue": "cue, response; lengths as the package has or draws them",
+    "none": "— (not to be read from the environment)",
+}
 NOT_FOR_USERS = ("instruction", "reconfiguration_freq")  # chosen by other options or not at all
 
 
@@ -42,6 +47,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what is known of the task without starting a simulator."""
     spec = task_spec(args.task)
+    if spec.suite != "paper":
+        return _show_official(spec, args.prompt_set)
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
     _print("asks", spec.description)
     _print("instruction", f"“{instruction_for(spec, args.prompt_set)}” (prompts/{args.prompt_set})")
@@ -63,6 +70,21 @@ def run(args: argparse.Namespace) -> int:
         if default is None:  # given by a class to its base, not by a user
             continue
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
+    return 0
+
+
+def _show_official(spec: TaskSpec, prompt_set: str) -> int:
+    """Print what is known of a task of the official package, which need not be installed."""
+    split = f", {spec.split} split" if spec.split else ""
+    _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory{split})")
+    _print("instruction", f"“{instruction_for(spec, prompt_set)}”")
+    _print("success", spec.success)
+    _print("horizon", _horizon(spec))
+    _print("phases", OFFICIAL_PHASES[spec.phase_source])
+    if spec.waits_for_choice:
+        _print("waits", "until the choice, every action is replaced by zeros")
+    _print("arguments", "env.horizon_steps; env.mug = ycb or stand_in, in the shell games")
+    _print("runs in", "the official package: `make suite90`, docs/official_suite.md")
     return 0
 
 

@@ -8,6 +8,7 @@ simulator. Images are rendered only on request. The official prompts and oracle 
 
 import gc
 import importlib
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple  # ManiSkill and the package are untyped: environments, infos are Any here
 
@@ -31,9 +32,11 @@ from vla_eval.envs.true_states import with_true_states
 from vla_eval.errors import (
     MissingDependencyError,
     RenderingError,
+    SpecMismatchError,
     TaskArgumentError,
     check_names,
 )
+from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import Phase, TaskStatus
 from vla_eval.tasks.catalog import task_spec
@@ -43,10 +46,7 @@ from vla_eval.tasks.spec import TaskSpec
 PACKAGE = "mikasa_robo_suite"
 ROBOT = "panda_wristcam"
 ARGUMENTS = ("horizon_steps", "mug")
-LARGEST_SEED = (
-    2**32 - 1
-)  # of numpy's RandomState, which ManiSkill draws from; the official runner fails beyond
-FIRST_CLOSED, FIRST_OPEN = -0.01, 0.04  # m per finger at gripper actions -1 and 1 (ManiSkill's Panda)
+LARGEST_SEED = 2**32 - 1  # of numpy's RandomState, which ManiSkill draws from
 
 # See `maniskill.py`.
 gc.freeze()
@@ -108,7 +108,8 @@ class OfficialEnv:
         """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
         finger_m = float(self._envs[slot].agent.robot.get_qpos()[0, -2:].mean())
         action = np.zeros(len(ACTION.dims), dtype=np.float32)
-        action[-1] = np.clip((finger_m - FIRST_CLOSED) / (FIRST_OPEN - FIRST_CLOSED) * 2 - 1, -1, 1)
+        command = (finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1
+        action[-1] = np.clip(command, -1, 1)
         return action
 
     def close(self) -> None:
@@ -262,9 +263,19 @@ def _waiting(env: Any) -> _Waiting:
 
 
 def _wording(row: TaskSpec, info: Any) -> dict[str, str]:
-    """Return the angle of a Rotate task, which the official sentence of each episode states."""
+    """Return the angle of a Rotate task, which the official sentence of each episode states.
+
+    Raises:
+        SpecMismatchError: the environment's sentence is another one.
+    """
     if row.instruction is None or "{angle_deg}" not in row.instruction:
         return {}
     before, after = row.instruction.split("{angle_deg}")
     sentence = info["language_instruction"][0]
-    return {"angle_deg": sentence.removeprefix(before).removesuffix(after)}
+    found = re.fullmatch(rf"{re.escape(before)}(-?\d+){re.escape(after)}", sentence)
+    if found is None:
+        raise SpecMismatchError(
+            f"{row.id}: expected the sentence '{row.instruction}', found '{sentence}'. Is another version of "
+            "the official package installed? `make suite90` installs 1.0.0."
+        )
+    return {"angle_deg": found[1]}

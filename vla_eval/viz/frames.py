@@ -98,7 +98,9 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held:
     status, start = taped.result.status, tape.start
     n_inferences = sum(chunk.step <= taped.step for chunk in tape.chunks)
     is_new = any(chunk.step == taped.step for chunk in tape.chunks)
-    texts = [f"step {taped.step}/{start.horizon_steps}", status.phase or "—", f"inference {n_inferences}"]
+    texts = [f"step {taped.step}/{start.horizon_steps}"]
+    texts += [status.phase] if status.phase else []
+    texts += [f"inference {n_inferences}"]
     texts += ["new chunk"] if is_new else []
     texts += [f"held {n_held} x"] if n_held > 1 else []
     parts = [Part(text=text) for text in texts]
