@@ -17,6 +17,7 @@ MAX_STEPS = 10_000  # control steps of anything: 500 s
 MAX_SECONDS = 7 * 24 * 3600.0
 MAX_TRAINING_STEPS = 1_000_000_000
 MAX_BATCH = 1_000_000
+MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX = 16, 2048  # height and width of an image that is rendered
 
 Bounds = tuple[float, float]
 """(least, most), both allowed."""

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vla_eval.bounds import MAX_STEPS
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.core import FloatArray, StepResult
 from vla_eval.errors import RecipeError, SpecMismatchError
 
@@ -19,7 +20,8 @@ FPS = 20  # control steps per second; every frame is one control step
 
 CAMERA_KEYS = {"base_camera": "observation.images.base", "hand_camera": "observation.images.wrist"}
 """Camera of the environment -> field of the dataset."""
-IMAGE_SHAPE = (128, 128, 3)  # height, width, channels
+IMAGE_SIZE_PX = 128  # height and width of images for which nothing else is said
+IMAGE_SHAPE = (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3)  # height, width, channels
 
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
@@ -34,7 +36,7 @@ PROPRIO_STATES = ("tcp_pose", "qpos", "qvel")
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 JOINT_NAMES = (*(f"joint{i}" for i in range(1, 8)), "finger1", "finger2")  # of the Panda
-ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
+ACTION_NAMES = CONTROL_MODES[EE_DELTA_POSE].dims
 STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
     # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
     # ±π for a gripper that points down, and unlike a quaternion, which may flip its sign.
@@ -69,11 +71,18 @@ class EncoderSettings:
             )
 
 
-def dataset_features(state: StateKind) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
+def dataset_features(
+    state: StateKind,
+    *,
+    action_names: tuple[str, ...] = ACTION_NAMES,
+    image_size_px: int = IMAGE_SIZE_PX,
+) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
     """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them.
 
     Args:
         state: which proprioception `observation.state` is.
+        action_names: the numbers of an action.
+        image_size_px: height and width of images.
     """
 
     def vector(names: tuple[str, ...]) -> dict[str, Any]:  # Any: as above
@@ -82,11 +91,12 @@ def dataset_features(state: StateKind) -> dict[str, dict[str, Any]]:  # Any: ler
     def scalar(dtype: str, name: str) -> dict[str, Any]:  # Any: as above
         return {"dtype": dtype, "shape": (1,), "names": [name]}
 
-    image = {"dtype": "video", "shape": IMAGE_SHAPE, "names": ["height", "width", "channels"]}
+    shape = (image_size_px, image_size_px, 3)
+    image = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
     return {
         **{key: dict(image) for key in CAMERA_KEYS.values()},
         STATE_KEY: vector(STATE_NAMES[state]),
-        ACTION_KEY: vector(ACTION_NAMES),
+        ACTION_KEY: vector(action_names),
         **{key: vector(STATE_NAMES[kind]) for kind, key in PROPRIO_KEYS.items()},
         REWARD_KEY: scalar("float32", "reward"),
         SUCCESS_KEY: scalar("bool", "success"),
@@ -139,7 +149,7 @@ def frame_values(
     Args:
         before: what was observed before the action; it has images of all cameras.
         after: the result of the action.
-        action: (7,) the action to store.
+        action: (A,) the action to store.
         state: which proprioception `observation.state` is.
         is_last: whether this is the last frame of the episode.
     """

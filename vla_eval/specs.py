@@ -6,6 +6,9 @@ Knows nothing of simulators or models.
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vla_eval.errors import SpecMismatchError, did_you_mean
 
 
@@ -31,14 +34,18 @@ class StateSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionSpec:
-    """The action vector: one entry per name in `dims`, each in [low, high]; beyond that it is clipped."""
+    """The action vector: one entry per name in `dims`, each within its bounds; beyond that it is clipped."""
 
     dims: tuple[str, ...]
-    low: float
-    high: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     control_mode: str
     gripper_open: float
     """Value of the last entry that opens the gripper; the opposite sign closes it."""
+
+    def clipped(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions (…, A), float32, with each number within its bounds."""
+        return np.clip(actions, self.low, self.high).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -80,11 +80,11 @@ def recorded(one: Attempt) -> RecordedEpisode:
 class TestManifest:
     def test_actions_are_kept_exactly(self) -> None:
         actions = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
-        assert np.array_equal(decode_actions(encode_actions(actions)), actions)
+        assert np.array_equal(decode_actions(encode_actions(actions), n_dims=7), actions)
 
     def test_damaged_actions_are_an_error(self) -> None:
         with pytest.raises(DatasetError, match="expected base64 of float32 rows of 7"):
-            decode_actions("AAAA")
+            decode_actions("AAAA", n_dims=7)
 
     def test_an_entry_comes_back_as_it_was_written(self) -> None:
         episode = recorded(attempt_once())
@@ -105,7 +105,7 @@ class TestDemonstrations:
     def test_an_attempt_ends_some_steps_after_success(self) -> None:
         one = attempt_once(steps_after_success=3)
         assert one.success_step is not None
-        assert one.n_steps == one.success_step + 3 == len(decode_actions(one.actions))
+        assert one.n_steps == one.success_step + 3 == len(decode_actions(one.actions, n_dims=7))
         assert (one.cue_steps, one.delay_steps) == (5, 5)
         assert one.intended_actions is None
 
@@ -133,17 +133,22 @@ class TestDemonstrations:
         one, again, clean = attempt_once(noise=0.1), attempt_once(noise=0.1), attempt_once()
         assert one == again  # noise is the episode's own
         assert one.intended_actions is not None
-        executed, intended = decode_actions(one.actions), decode_actions(one.intended_actions)
+        executed, intended = (
+            decode_actions(one.actions, n_dims=7),
+            decode_actions(one.intended_actions, n_dims=7),
+        )
         assert np.array_equal(executed[:, -1], intended[:, -1])
         assert (executed[:, :6] != intended[:, :6]).any(axis=0).all()
         assert np.abs(executed).max() <= 1
         assert one.success_step is not None
-        assert not np.array_equal(intended[: clean.n_steps], decode_actions(clean.actions)[: one.n_steps])
+        assert not np.array_equal(
+            intended[: clean.n_steps], decode_actions(clean.actions, n_dims=7)[: one.n_steps]
+        )
 
 
 class TestEpisodeCheck:
     def log_and_rows(self, one: Attempt) -> tuple[Any, dict[str, Any]]:
-        actions = decode_actions(one.actions)
+        actions = decode_actions(one.actions, n_dims=7)
         log = replay_actions(
             make_env(),
             start(one.seed, horizon_steps=one.n_steps),

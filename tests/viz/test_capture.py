@@ -28,6 +28,7 @@ from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.interface import env_spec
 from vla_eval.viz.arm_figure import arm_points_m
 from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX
 from vla_eval.viz.frames import FAILURE_COLOR, PANEL_PX, PHASE_COLORS, SUCCESS_COLOR, VIEW_PX, compose
@@ -194,7 +195,7 @@ def test_a_video_that_cannot_be_written_says_where_and_of_what(tmp_path: Path) -
 def test_a_rerun_file_holds_what_was_seen_done_and_chosen(tmp_path: Path) -> None:
     _, record, tapes = play(captured=True, stride=4)
     path = tmp_path / "rrd" / "a.rrd"
-    write_rrd(tapes.episodes[0], record, path, control_hz=20.0)
+    write_rrd(tapes.episodes[0], record, path, env=env_spec())
 
     reader = RrdReader(path)
     schema = reader.store().schema()

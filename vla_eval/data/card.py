@@ -73,8 +73,10 @@ def _introduction(summary: DatasetSummary) -> str:
     task = find_task(summary.facts.task) if summary.facts else None
     about = f"{task.description} " if task else ""
     sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
+    height_px, width_px = summary.image_size_px
+    size = f"{height_px} × {width_px}"
     return (
-        f"{about}Two cameras of 128 × 128 pixels, 20 frames per second, one frame per control step, as a "
+        f"{about}Two cameras of {size} pixels, 20 frames per second, one frame per control step, as a "
         f"LeRobotDataset v3.\n\nInstruction:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
     )
 
@@ -171,8 +173,8 @@ def _import(summary: DatasetSummary) -> str:
     ]
     if not facts.executable_by_pd_ee_delta_pose:
         lines.append(
-            "- **not executable by `pd_ee_delta_pose`**: a policy trained on these actions cannot be "
-            "evaluated in this project's environments"
+            "- **not executable by `pd_ee_delta_pose`**: a policy trained on these actions is evaluated with "
+            f"{markdown_code(f'env.control_mode={facts.control_mode}')}"
         )
     return "\n".join([*lines, ""])
 

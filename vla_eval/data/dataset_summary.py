@@ -57,6 +57,7 @@ class DatasetSummary:
         instructions: every sentence that occurs.
         fields: field -> `float32 (7)`.
         action: over all frames.
+        image_size_px: height and width of the images.
     """
 
     facts: DatasetFacts | None
@@ -69,6 +70,7 @@ class DatasetSummary:
     instructions: tuple[str, ...]
     fields: dict[str, str]
     action: ActionStatistics
+    image_size_px: tuple[int, int]
 
 
 def summarize(root: Path) -> DatasetSummary:
@@ -102,6 +104,7 @@ def summarize(root: Path) -> DatasetSummary:
             low=action.min(axis=0),
             high=action.max(axis=0),
         ),
+        image_size_px=tuple(features[next(iter(CAMERA_KEYS.values()))]["shape"][:2]),
     )
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vla_eval.chunking import ChunkingSpec
+from vla_eval.control_modes import ABSOLUTE_MODES, DELTA_RAD
 from vla_eval.core import (
     ActionChunk,
     EpisodeStart,
@@ -32,7 +33,6 @@ from vla_eval.strict_json import Count, Positive
 
 SLOT = 0
 ONE_BY_ONE = ChunkingSpec(n_action_steps=1)
-N_ARM_DIMS = 6  # of the action; the last one is the gripper
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,12 +118,14 @@ class NoisyEnv:
 
     Args:
         env: the environment.
-        std: standard deviation of the noise in each dimension of the arm, in units of the action.
+        std: standard deviation of the noise in each dimension of the arm, in units of a delta action; in a
+            mode that is given m and rad, a tenth of it.
     """
 
     def __init__(self, env: SimEnv, std: float) -> None:
         self._env = env
-        self._std = std
+        is_absolute = env.spec.action.control_mode in ABSOLUTE_MODES
+        self._std = std * DELTA_RAD if is_absolute else std
         self._rng: dict[int, np.random.Generator] = {}
 
     @property
@@ -150,8 +152,9 @@ class NoisyEnv:
 
     def _pushed(self, slot: int, action: FloatArray) -> FloatArray:
         pushed = action.copy()
-        pushed[:N_ARM_DIMS] += self._rng[slot].normal(0, self._std, N_ARM_DIMS).astype(np.float32)
-        return np.clip(pushed, self.spec.action.low, self.spec.action.high)
+        n_arm_dims = len(pushed) - 1  # the last one is the gripper
+        pushed[:n_arm_dims] += self._rng[slot].normal(0, self._std, n_arm_dims).astype(np.float32)
+        return self.spec.action.clipped(pushed)
 
 
 def states_digest(results: Sequence[StepResult]) -> str:
@@ -186,8 +189,7 @@ def attempt(
     log = EpisodeLog()
     (record,) = rollout(env, expert, [start], settings, observers=[log], heartbeat=heartbeat)
     executed = log.executed()
-    low, high = env.spec.action.low, env.spec.action.high
-    intended = np.clip(np.stack(log.asked), low, high).astype(np.float32)
+    intended = env.spec.action.clipped(np.stack(log.asked))
     phases = [result.status.phase for result in log.results]
     cue_steps = next((i for i, phase in enumerate(phases) if phase != "cue"), len(phases))
     response_step = next((i for i, phase in enumerate(phases) if phase == "response"), len(phases))
@@ -237,7 +239,7 @@ def replay_attempt(
     Raises:
         RecordingError: the states are not those of the attempt.
     """
-    actions = decode_actions(attempt.actions)
+    actions = decode_actions(attempt.actions, n_dims=len(env.spec.action.dims))
     log = replay_actions(env, start, actions, heartbeat=heartbeat, with_pictures=True)
     if states_digest(log.results) != attempt.states_sha256:
         raise RecordingError(

@@ -13,7 +13,7 @@ from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.demonstrations import EpisodeLog, images_digests, states_digest
 from vla_eval.data.frame_table import Columns
-from vla_eval.data.manifest import RecordedEpisode, decode_actions
+from vla_eval.data.manifest import RecordedEpisode
 from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY, proprioception
 
 STATE_TOLERANCE = 1e-2  # m, rad, rad/s; for machines whose arithmetic differs in the last bits
@@ -37,8 +37,8 @@ def check_rows(episode: RecordedEpisode, rows: Columns, log: EpisodeLog) -> list
     if len(rows[ACTION_KEY]) != episode.n_steps:
         return [f"the table has {len(rows[ACTION_KEY])} frames, the manifest {episode.n_steps}"]
     found = []
-    known = [decode_actions(text) for text in (episode.actions, episode.intended_actions) if text is not None]
-    if not any(np.array_equal(rows[ACTION_KEY], actions) for actions in known):
+    known = (episode.action_rows(), episode.intended_rows())
+    if not any(np.array_equal(rows[ACTION_KEY], actions) for actions in known if actions is not None):
         found.append("the actions of the table are not those of the manifest")
     successes = np.array([result.status.success for result in log.results[1:]])
     if not np.array_equal(rows[SUCCESS_KEY].reshape(-1), successes):

@@ -7,11 +7,12 @@ import numpy as np
 
 from vla_eval import __version__
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
+from vla_eval.control_modes import EE_DELTA_POSE, action_spec
 from vla_eval.core import FloatArray
 from vla_eval.data.dataset_folder import digest_file, digest_files
 from vla_eval.data.exact_statistics import count_levels, empty_histogram
 from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.layouts import CONTROL_MODES, EE_DELTA, Source, SourceEpisode
+from vla_eval.data.layouts import SOURCE_MODES, Source, SourceEpisode
 from vla_eval.data.shard_writer import MIN_FRAMES, new_dataset, write_exact_statistics
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
@@ -31,7 +32,6 @@ from vla_eval.tasks.catalog import task_spec
 
 SOURCE_PROPRIO_KEY = "proprio.xyz_rpy"
 SOURCE_PROPRIO_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper_width")
-JOINT_DELTA_NAMES = (*(f"joint{i}_delta" for i in range(1, 8)), "gripper")
 MAX_FRAMES = 2048  # lerobot drops frames without an error where its queue is full: room for a whole episode
 
 
@@ -96,7 +96,7 @@ class ImportWriter:
         """Close the dataset and write what it is."""
         self._dataset.finalize()
         write_exact_statistics(self._draft, self._histograms)
-        control_mode = CONTROL_MODES[self._features[ACTION_KEY]["shape"][0]]
+        control_mode = SOURCE_MODES[self._features[ACTION_KEY]["shape"][0]]
         root = self._source.path
         facts = ImportFacts(
             complete=True,
@@ -105,7 +105,7 @@ class ImportWriter:
             instruction_source=f"prompts/{DEFAULT_PROMPT_SET}" if self._uses_prompts else "source",
             state=self._state,
             control_mode=control_mode,
-            executable_by_pd_ee_delta_pose=control_mode == EE_DELTA,
+            executable_by_pd_ee_delta_pose=control_mode == EE_DELTA_POSE,
             absent=tuple(key for key in dataset_features(self._state) if key not in self._features),
             left_out=tuple(sorted(self._source.left_out)),
             n_frames=sum(episode.n_steps for episode in self._episodes),
@@ -179,10 +179,9 @@ def _columns(episode: SourceEpisode, state: StateKind, *, where: Path) -> dict[s
 
 
 def _features(columns: dict[str, Any], state: StateKind) -> dict[str, Any]:
-    features = {key: value for key, value in dataset_features(state).items() if key in columns}
-    if columns[ACTION_KEY].shape[1] == len(JOINT_DELTA_NAMES):
-        names = list(JOINT_DELTA_NAMES)
-        features[ACTION_KEY] = {"dtype": "float32", "shape": (len(names),), "names": names}
+    action = action_spec(SOURCE_MODES[columns[ACTION_KEY].shape[1]])
+    known = dataset_features(state, action_names=action.dims)
+    features = {key: value for key, value in known.items() if key in columns}
     if SOURCE_PROPRIO_KEY in columns:
         names = list(SOURCE_PROPRIO_NAMES)
         features[SOURCE_PROPRIO_KEY] = {"dtype": "float32", "shape": (len(names),), "names": names}

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.control_modes import EE_DELTA_POSE, JOINT_DELTA_POS
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.errors import DatasetError, did_you_mean
 from vla_eval.features import IMAGE_SHAPE
@@ -28,8 +29,7 @@ Layout = Literal["npz_joints", "npz_proprio", "lerobot_mikasa", "lerobot_officia
 
 N_JOINT_NUMBERS = 25  # pose of the tool centre point 7, joint positions 9, joint velocities 9
 N_PROPRIO_NUMBERS = 7  # position 3, roll, pitch, yaw, gripper width
-EE_DELTA, JOINT_DELTA = "pd_ee_delta_pose", "pd_joint_delta_pos"
-CONTROL_MODES = {7: EE_DELTA, 8: JOINT_DELTA}
+SOURCE_MODES = {7: EE_DELTA_POSE, 8: JOINT_DELTA_POS}
 """Length of an action -> the control mode it is for, as the authors' two recorders write them."""
 
 NPZ_NEEDED = ("rgb", "action")
@@ -121,7 +121,7 @@ def read_npz(path: Path) -> tuple[SourceEpisode, Sequence[str]]:
         raise DatasetError(f"{path}: there is neither 'joints' (T, 25) nor 'proprio' (T, 7).")
     actions = _numbers(path, arrays, "action", None)
     n_frames = len(actions)
-    if actions.ndim != 2 or actions.shape[1] not in CONTROL_MODES:
+    if actions.ndim != 2 or actions.shape[1] not in SOURCE_MODES:
         raise DatasetError(f"{path}: action is {actions.shape}, expected (T, 7) or (T, 8).")
     rgb = arrays["rgb"]
     shape = (n_frames, *IMAGE_SHAPE[:2], 6)
@@ -191,7 +191,7 @@ def lerobot_layout(features: Mapping[str, Any], *, where: Path) -> Layout:  # An
     if not found:
         pairs = ", or ".join(" and ".join(cameras) for cameras in LEROBOT_CAMERAS.values())
         raise DatasetError(f"{where}: expected the cameras {pairs}; its fields are {', '.join(features)}.")
-    expected = {"action": tuple(CONTROL_MODES)}
+    expected = {"action": tuple(SOURCE_MODES)}
     if found[0] != "lerobot_mikasa":
         expected["observation.state"] = (N_PROPRIO_NUMBERS,)
     for name, lengths in expected.items():

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import FloatArray
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
@@ -59,7 +60,7 @@ class RecordedEpisode:
         cue_steps, delay_steps: lengths of the first two phases, in control steps.
         n_steps: number of frames, one per control step.
         success_step: control steps executed when the success rule first held; None if it never did.
-        actions: the executed actions, (n_steps, 7) float32, as `encode_actions` writes them.
+        actions: the executed actions, (n_steps, A) float32, as `encode_actions` writes them.
         intended_actions: what the expert asked for before noise was added; None without noise.
         states_sha256: digest of all states from reset to the end, see `states_digest` in `demonstrations`.
         images_sha256: camera -> digest of its raw frames, (n_steps, H, W, 3) uint8, before encoding.
@@ -83,8 +84,18 @@ class RecordedEpisode:
     images_sha256: dict[str, str]
 
     def action_rows(self) -> FloatArray:
-        """Return the executed actions, (n_steps, 7) float32."""
-        return decode_actions(self.actions)
+        """Return the executed actions, (n_steps, A) float32."""
+        return decode_actions(self.actions, n_dims=self._n_action_dims)
+
+    def intended_rows(self) -> FloatArray | None:
+        """Return the actions before noise was added, (n_steps, A) float32; None without noise."""
+        if self.intended_actions is None:
+            return None
+        return decode_actions(self.intended_actions, n_dims=self._n_action_dims)
+
+    @property
+    def _n_action_dims(self) -> int:
+        return len(action_spec(control_mode_of(self.env_kwargs)).dims)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +148,12 @@ class DatasetFacts:
     device: dict[str, str]
     files: dict[str, FileDigest]
 
+    @property
+    def control_mode(self) -> str:
+        """What the actions mean."""
+        env = self.recipe.get("env")
+        return control_mode_of(env if isinstance(env, dict) else {})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayReport:
@@ -169,11 +186,11 @@ type Entry = RecordedEpisode | FailedSeed | DatasetFacts | ReplayReport
 
 
 def encode_actions(actions: FloatArray) -> str:
-    """Return (n, 7) float32 as text: base64 of the little-endian bytes, row by row; exact."""
+    """Return (n, A) float32 as text: base64 of the little-endian bytes, row by row; exact."""
     return base64.b64encode(np.ascontiguousarray(actions, dtype="<f4").tobytes()).decode("ascii")
 
 
-def decode_actions(text: str, *, n_dims: int = 7) -> FloatArray:
+def decode_actions(text: str, *, n_dims: int) -> FloatArray:
     """Return what `encode_actions` was given.
 
     Raises:

@@ -29,7 +29,6 @@ from vla_eval.data.manifest import (
     MIKASA_FOLDER,
     RECORDING_FILE,
     RecordedEpisode,
-    decode_actions,
     write_entry,
     write_lines,
 )
@@ -108,7 +107,13 @@ class RecordingRunner:
     def _write_shard(self, job: ShardJob) -> ShardWritten:
         plan = job.plan
         env = self._make_env(dataclasses.replace(plan.group.env, cameras=tuple(CAMERA_KEYS)))
-        form = Format(state=plan.recipe.state, encoder=plan.recipe.encoder, max_frames=env.spec.horizon_steps)
+        form = Format(
+            state=plan.recipe.state,
+            encoder=plan.recipe.encoder,
+            max_frames=env.spec.horizon_steps,
+            action_names=env.spec.action.dims,
+            image_size_px=env.spec.cameras[0].height_px,
+        )
         with ShardWriter(job.path, form) as writer:
             for index, one in enumerate(job.attempts, start=job.first_index):
                 start = plan.start(one.seed, horizon_steps=one.n_steps)
@@ -186,9 +191,8 @@ def frames_of(
 
 def stored_actions(recipe: DatasetRecipe, episode: RecordedEpisode) -> FloatArray:
     """Return the actions of the field `action`: the executed ones, or those without noise."""
-    if recipe.stored_action == "intended" and episode.intended_actions is not None:
-        return decode_actions(episode.intended_actions)
-    return episode.action_rows()
+    intended = episode.intended_rows()
+    return intended if recipe.stored_action == "intended" and intended is not None else episode.action_rows()
 
 
 def _explained(exc: BaseException, job: RecordingJob) -> BaseException:

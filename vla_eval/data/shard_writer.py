@@ -23,7 +23,15 @@ from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import DatasetError
-from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings, StateKind, dataset_features
+from vla_eval.features import (
+    ACTION_NAMES,
+    CAMERA_KEYS,
+    FPS,
+    IMAGE_SIZE_PX,
+    EncoderSettings,
+    StateKind,
+    dataset_features,
+)
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
 ROBOT_TYPE = "panda_wristcam"
@@ -42,11 +50,15 @@ class Format:
         state: which proprioception `observation.state` is.
         encoder: how frames become video.
         max_frames: no episode has more.
+        action_names: the numbers of an action.
+        image_size_px: height and width of images.
     """
 
     state: StateKind
     encoder: EncoderSettings
     max_frames: int
+    action_names: tuple[str, ...] = ACTION_NAMES
+    image_size_px: int = IMAGE_SIZE_PX
 
 
 class ShardWriter:
@@ -108,7 +120,9 @@ class ShardWriter:
 
 def create_dataset(root: Path, format: Format) -> Any:  # Any: lerobot is untyped
     """Return a new LeRobotDataset for recordings of a format."""
-    features = dataset_features(format.state)
+    features = dataset_features(
+        format.state, action_names=format.action_names, image_size_px=format.image_size_px
+    )
     return new_dataset(root, features, encoder=format.encoder, max_frames=format.max_frames)
 
 

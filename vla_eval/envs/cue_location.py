@@ -9,7 +9,6 @@ import numpy as np
 from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
-from vla_eval.tasks.interface import CAMERA_SIZE_PX
 
 MARGIN_PX = 1  # an edge's pixel may show some of the object
 NEAR_M = 0.01  # what is nearer to the camera, or behind it, is not seen
@@ -30,12 +29,13 @@ def boxes_of_cue(env: Any, row: int, cameras: tuple[str, ...]) -> CueBoxes:  # A
         # (3, 4) world to camera in OpenCV's axes (z forward), and (3, 3) camera to pixels.
         extrinsic = camera.get_extrinsic_matrix()[row if env.gpu_sim_enabled else 0].cpu().numpy()
         intrinsic = camera.get_intrinsic_matrix()[row if env.gpu_sim_enabled else 0].cpu().numpy()
-        boxes = (_box(place, size, intrinsic @ extrinsic) for place in places)
+        edge_px = env.scene.sensors[name].config.width  # images are square
+        boxes = (_box(place, size, intrinsic @ extrinsic, edge_px=edge_px) for place in places)
         found[name] = tuple(box for box in boxes if box is not None)
     return found
 
 
-def _box(place: Place, size: CueSize, projection: np.ndarray[Any, Any]) -> PixelBox | None:
+def _box(place: Place, size: CueSize, projection: np.ndarray[Any, Any], *, edge_px: int) -> PixelBox | None:
     """Return the box of the eight corners; None where nothing of it is in the image."""
     half, (x, y, z) = size.half_width_m, place
     corners = itertools.product((x - half, x + half), (y - half, y + half), (z, z + size.height_m))
@@ -44,12 +44,12 @@ def _box(place: Place, size: CueSize, projection: np.ndarray[Any, Any]) -> Pixel
     if not len(points):
         return None
     columns, rows = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    top, bottom = _range(rows)
-    left, right = _range(columns)
+    top, bottom = _range(rows, edge_px)
+    left, right = _range(columns, edge_px)
     return PixelBox(top, bottom, left, right) if top < bottom and left < right else None
 
 
-def _range(values: np.ndarray[Any, Any]) -> tuple[int, int]:
+def _range(values: np.ndarray[Any, Any], edge_px: int) -> tuple[int, int]:
     """Return the first pixel and the one after the last, within the image."""
     first, last = math.floor(values.min()) - MARGIN_PX, math.ceil(values.max()) + MARGIN_PX
-    return min(max(first, 0), CAMERA_SIZE_PX), min(max(last, 0), CAMERA_SIZE_PX)
+    return min(max(first, 0), edge_px), min(max(last, 0), edge_px)

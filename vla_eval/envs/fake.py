@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 
 from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.errors import TaskArgumentError, check_names
+from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_argument, check_arguments
-from vla_eval.tasks.interface import ACTION, CAMERA_SIZE_PX, CAMERAS, CONTROL_HZ, states
+from vla_eval.tasks.interface import ACTION, CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
@@ -83,7 +85,7 @@ class FakeEnv:
         task = task_spec(settings.task)
         check_arguments(task, settings.kwargs, TASKS.values())
         defaults = _defaults(task)
-        known = ("horizon_steps", *defaults)
+        known = ("horizon_steps", CONTROL_MODE, IMAGE_SIZE, *defaults)
         check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
         for name, value in settings.kwargs.items():
@@ -110,13 +112,19 @@ class FakeEnv:
                 f"appearance: {task.id}: the fake simulator has no lights and no colours. Use the simulator "
                 "'maniskill', or remove this setting."
             )
+        if control_mode_of(settings.kwargs) != ACTION.control_mode:
+            raise TaskArgumentError(
+                f"{CONTROL_MODE}={control_mode_of(settings.kwargs)!r}: {task.id}: the fake simulator has no "
+                f"joints and takes {ACTION.control_mode}. Use the simulator 'maniskill', or remove this."
+            )
+        self._image_size_px: int = arguments.get(IMAGE_SIZE, IMAGE_SIZE_PX)
         self._settings = settings
         self._episodes: dict[int, _Episode] = {}
         self.n_renders = 0
         self.device = {"simulator": "fake"}
         self.spec = EnvSpec(
             task=task.id,
-            cameras=CAMERAS,
+            cameras=cameras(self._image_size_px),
             states=states(),
             action=ACTION,
             horizon_steps=arguments.get("horizon_steps", task.default_horizon_steps(self._response_step)),
@@ -157,7 +165,7 @@ class FakeEnv:
 
     def cue_boxes(self, slot: int) -> CueBoxes:
         """Return the first rows of each image; see `CueLocator`."""
-        return {camera.name: (PixelBox(0, CUE_ROWS, 0, CAMERA_SIZE_PX),) for camera in CAMERAS}
+        return {name: (PixelBox(0, CUE_ROWS, 0, self._image_size_px),) for name in CAMERA_NAMES}
 
     def close(self) -> None:
         """Forget all episodes."""
@@ -287,11 +295,11 @@ class FakeEnv:
 
     def _image(self, episode: _Episode, camera: str) -> ImageArray:
         """Return an image that shows the cue in its first rows and otherwise depends only on the state."""
-        view = [*(known.name for known in CAMERAS), HUMAN_CAMERA].index(camera)
+        view = [*CAMERA_NAMES, HUMAN_CAMERA].index(camera)
         rng = np.random.default_rng(
             [episode.seed, episode.step, view, *np.abs(episode.tcp_m * 1e6).astype(int)]
         )
-        image = rng.integers(0, 256, (CAMERA_SIZE_PX, CAMERA_SIZE_PX, 3), dtype=np.uint8)
+        image = rng.integers(0, 256, (self._image_size_px, self._image_size_px, 3), dtype=np.uint8)
         in_view = self._is_in_view(episode) and episode.targets
         shown = episode.targets[1 if self._shuffles_cue else 0] if in_view else 0
         image[:CUE_ROWS] = 20 * (shown + 1) if in_view else 0
@@ -326,6 +334,8 @@ class FakeEnv:
 def _argument_type(name: str) -> Any:  # Any: a type annotation
     if name == "velocity_range_m_s":
         return tuple[float, ...]
+    if name == CONTROL_MODE:
+        return str
     return bool if isinstance(SEVERAL_DEFAULTS.get(name), bool) else int
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes
 from vla_eval.envs.cue_location import boxes_of_cue
@@ -28,13 +29,15 @@ from vla_eval.envs.scenes import (
 )
 from vla_eval.envs.shaders import use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
+from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
 from vla_eval.tasks.appearance import with_appearance
+from vla_eval.tasks.arms import ARMS
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_argument, check_arguments
-from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, CONTROL_MODE, states
+from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
@@ -69,7 +72,8 @@ class ManiSkillEnv:
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
         _check_arguments(env_class(row), kwargs, row.id, given=settings.kwargs)
-        check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
+        check_names("camera", settings.cameras, CAMERA_NAMES, where=row.id)
+        action = action_spec(control_mode_of(kwargs))
         self._settings = settings
         self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
         batched = settings.sim_backend == "gpu"
@@ -79,9 +83,9 @@ class ManiSkillEnv:
         ]
         self.spec = EnvSpec(
             task=row.id,
-            cameras=CAMERAS,
+            cameras=cameras(kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX)),
             states=states(self._envs[0].arm.joints, env_class(row).PROMPT_DIMS),
-            action=ACTION,
+            action=action,
             horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
         )
@@ -116,9 +120,14 @@ class ManiSkillEnv:
         return results
 
     def hold_action(self, slot: int) -> FloatArray:
-        """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
+        """Return the (A,) action that moves nothing; see `SimEnv.hold_action`."""
         index, row = divmod(slot, self._slots_per_env)
         return to_array(self._envs[index].hold_action()[row])
+
+    def joint_targets(self, slot: int) -> FloatArray:
+        """Return the (J,) joint positions, rad, at which the arm's controller aims since the last action."""
+        index, row = divmod(slot, self._slots_per_env)
+        return to_array(self._envs[index].agent.controller.controllers["arm"]._target_qpos[row])
 
     def cue_boxes(self, slot: int) -> CueBoxes:
         """Return where in the images the cue is; see `CueLocator`."""
@@ -181,7 +190,12 @@ class ManiSkillEnv:
 
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
-    backend = render_backend(settings)
+    backend, robot, mode = render_backend(settings), _robot(settings, kwargs), control_mode_of(kwargs)
+    if robot in ARMS and mode not in ARMS[robot].control_modes:
+        raise TaskArgumentError(
+            f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
+            f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
+        )
     if backend != "none":
         use_lean_shaders()
     try:
@@ -189,10 +203,9 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
             num_envs=num_envs,
             obs_mode="none",
             reward_mode="normalized_dense",
-            control_mode=CONTROL_MODE,
             sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
             render_backend=backend,
-            **{**kwargs, ROBOT: _robot(settings, kwargs)},
+            **{**kwargs, ROBOT: robot, CONTROL_MODE: mode},
         )
     except RuntimeError as exc:
         if backend == "none" or settings.sim_backend == "gpu":

@@ -40,7 +40,7 @@ from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import Phase, TaskStatus
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, CONTROL_MODE, states
+from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, states
 from vla_eval.tasks.spec import TaskSpec
 
 PACKAGE = "mikasa_robo_suite"
@@ -134,7 +134,7 @@ class OfficialEnv:
 
     def _advance(self, slot: int, action: FloatArray, *, render: bool) -> StepResult:
         env = self._envs[slot]
-        executed = np.clip(action, ACTION.low, ACTION.high).astype(np.float32)
+        executed = ACTION.clipped(action)
         if self._row.waits_for_choice and int(env.elapsed_steps[0]) < sum(_waiting(env)):
             executed = np.zeros_like(executed)
         _, reward, _, _, info = env.step(torch.as_tensor(executed[None], device=env.device))
@@ -238,7 +238,7 @@ def _build(cls: Any, settings: EnvSettings) -> Any:
             num_envs=1,
             obs_mode="none",
             reward_mode="normalized_dense",
-            control_mode=CONTROL_MODE,
+            control_mode=ACTION.control_mode,
             robot_uids=ROBOT,
             sim_backend="physx_cpu",
             render_backend=backend,

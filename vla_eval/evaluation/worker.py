@@ -135,9 +135,7 @@ class EpisodeRunner:
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         if self._capture and tapes:
-            self._capture.write(
-                batch.jobs, tapes, named, control_hz=env.spec.control_hz, heartbeat=self._heartbeat
-            )
+            self._capture.write(batch.jobs, tapes, named, env=env.spec, heartbeat=self._heartbeat)
         return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:

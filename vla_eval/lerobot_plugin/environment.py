@@ -18,21 +18,24 @@ from numpy.typing import NDArray
 
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.config.prompts import instruction_for
+from vla_eval.control_modes import control_mode_of
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
 from vla_eval.features import (
     ACTION_KEY,
-    ACTION_NAMES,
     CAMERA_KEYS,
     FPS,
-    IMAGE_SHAPE,
+    IMAGE_SIZE_PX,
     STATE_KEY,
     STATE_NAMES,
     StateKind,
     proprioception,
 )
+from vla_eval.specs import EnvSpec
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.interface import IMAGE_SIZE, checked_image_size, env_spec
+from vla_eval.tasks.spec import TaskSpec
 
 SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments
 PIXELS, AGENT_POS = "pixels", "agent_pos"
@@ -44,8 +47,9 @@ SUITE = "mikasa"
 class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
     """One task as a Gymnasium environment, under the names that lerobot reads.
 
-    Observation: `pixels` with `base` and `wrist`, (128, 128, 3) uint8 RGB; `agent_pos`, (10,) or (25,)
-    float32, as the recorder computes it. Action: (7,) float32 in [-1, 1] of `pd_ee_delta_pose`.
+    Observation: `pixels` with `base` and `wrist`, (H, W, 3) uint8 RGB, of 128 pixels or the argument
+    `image_size`; `agent_pos`, (10,) or (25,) float32, as the recorder computes it. Action: float32, by
+    default (7,) in [-1, 1] of `pd_ee_delta_pose`; the argument `control_mode` chooses another.
     `is_success` is in each step's info. An episode ends at its first success, when it is lost, or at
     the task's horizon. The simulator is built at the first reset: in the process that needs it.
 
@@ -68,16 +72,18 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         self._result: StepResult | None = None
         self.task = row.id
         self.task_description = instruction_for(row, prompt_set)
+        offered = _offered(row, settings.kwargs)
         self._max_episode_steps = int(settings.kwargs.get("horizon_steps", row.horizon_steps))
         self.render_mode = "rgb_array"
-        image = gym.spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
+        image = gym.spaces.Box(0, 255, _image_shape(offered), np.uint8)
         self.observation_space = gym.spaces.Dict(
             {
                 PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), image)),
                 AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES[state]),), np.float32),
             }
         )
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+        low, high = (np.array(bound, np.float32) for bound in (offered.action.low, offered.action.high))
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -100,7 +106,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         return self._observation(self._result), {"is_success": False}
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Execute one control step; what lies beyond [-1, 1] is clipped."""
+        """Execute one control step; what lies beyond the bounds is clipped."""
         if self._env is None:
             raise gym.error.ResetNeeded(f"{self.task}: call reset() before step().")
         actions = {SLOT: np.asarray(action, dtype=np.float32)}
@@ -115,7 +121,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         )
 
     def render(self) -> NDArray[np.uint8]:
-        """Return the base camera's last image, (128, 128, 3)."""
+        """Return the base camera's last image, (H, W, 3)."""
         if self._result is None:
             raise gym.error.ResetNeeded(f"{self.task}: call reset() before render().")
         return self._result.observation.images[next(iter(CAMERA_NAMES))].copy()
@@ -134,10 +140,24 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         }
 
 
-def _features(state: StateKind) -> dict[str, PolicyFeature]:
-    images = {f"{PIXELS}/{name}": IMAGE_SHAPE for name in CAMERA_NAMES.values()}
+def _offered(row: TaskSpec, env_kwargs: Mapping[str, Any]) -> EnvSpec:
+    """Return what the task offers with these arguments, without making its environment."""
+    return env_spec(
+        row,
+        control_mode=control_mode_of(env_kwargs),
+        image_size_px=checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=row.id),
+    )
+
+
+def _image_shape(offered: EnvSpec) -> tuple[int, int, int]:
+    camera = offered.cameras[0]
+    return (camera.height_px, camera.width_px, 3)
+
+
+def _features(state: StateKind, offered: EnvSpec) -> dict[str, PolicyFeature]:
+    images = {f"{PIXELS}/{name}": _image_shape(offered) for name in CAMERA_NAMES.values()}
     return {
-        ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
+        ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(offered.action.dims),)),
         AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES[state]),)),
         **{name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name, shape in images.items()},
     }
@@ -158,7 +178,7 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
         state: which proprioception `observation.state` is: `eef` (10) or `joints` (25).
         prompt_set: name in `prompts/`.
         seed_offset: added to lerobot's seeds, which otherwise begin with its `--seed`.
-        env_kwargs: arguments of the task, `horizon_steps` among them.
+        env_kwargs: arguments of the task, `horizon_steps`, `control_mode` and `image_size` among them.
         simulator, sim_backend, wrist_mesh, render_backend: see `EvalConfig`.
 
     Raises:
@@ -189,7 +209,8 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
         for task in self._tasks():
             task_spec(task)
         if not self.features:
-            self.features = _features(_state_kind(self.state))
+            offered = _offered(task_spec(self._tasks()[0]), self.env_kwargs)
+            self.features = _features(_state_kind(self.state), offered)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

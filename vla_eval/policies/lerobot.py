@@ -44,6 +44,7 @@ from vla_eval.policies.lerobot_episodes import (
 from vla_eval.policies.lerobot_inputs import (
     InputMap,
     InputOptions,
+    check_control_mode,
     check_training,
     default_cameras,
     input_map,
@@ -242,9 +243,11 @@ def make_lerobot(
     asked = InputOptions(
         cameras=default_cameras() if cameras is None else cameras, state=state, absent_cameras=absent_cameras
     )
+    facts = read_facts(loaded.folder)
+    check_control_mode(facts, context.env, policy=context.name)
     inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
     check_training(
-        read_facts(loaded.folder),
+        facts,
         inputs,
         loaded.config,
         loaded.preprocessor,

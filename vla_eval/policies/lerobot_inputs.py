@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
 from vla_eval.features import (
@@ -119,6 +120,23 @@ def input_map(
     return InputMap(cameras=cameras, state=kind)
 
 
+def check_control_mode(facts: TrainingFacts | None, env: EnvSpec, *, policy: str) -> None:
+    """Raise `SpecMismatchError` if the policy's actions are for another control mode than the environment's.
+
+    Args:
+        facts: what a fine-tuning of ours has noted; None for a checkpoint of another program.
+        env: what the environment offers.
+        policy: its name, for messages.
+    """
+    found = env.action.control_mode
+    if facts is not None and facts.control_mode != found:
+        raise SpecMismatchError(
+            f"policy '{policy}': control mode: expected {facts.control_mode}, found {found} in {env.task}: "
+            f"the policy was trained on actions of the former. Evaluate it with "
+            f"--set env.{CONTROL_MODE}={facts.control_mode}."
+        )
+
+
 def check_training(
     facts: TrainingFacts | None,
     inputs: InputMap,
@@ -158,7 +176,8 @@ def check_training(
         raise SpecMismatchError(
             f"policy '{policy}' would not see on {env.task} what it saw in training:\n"
             + "\n".join(f"  {problem}" for problem in problems)
-            + "\nCorrect `cameras` or `state` in the recipe's args, or fine-tune on a dataset of this form."
+            + "\nCorrect `cameras` or `state` in the recipe's args, set env.image_size, or fine-tune on a "
+            "dataset of this form."
         )
 
 
@@ -170,7 +189,6 @@ def _facts_problems(
         *((f"size of {f}", tuple(facts.images[f]), size) for f, size in seen.items() if f in facts.images),
         ("control steps per second", facts.fps, env.control_hz),
         ("action dimensions", facts.action_names, env.action.dims),
-        ("control mode", facts.control_mode, env.action.control_mode),
     ]
     if inputs.state is not None:
         pairs.append(("state", facts.state, inputs.state))
@@ -256,7 +274,7 @@ def _check_action(config: Any, env: EnvSpec, policy: str) -> None:
         raise SpecMismatchError(
             f"policy '{policy}' gives actions of {found} dimensions; {env.task} expects "
             f"{len(env.action.dims)} ({', '.join(env.action.dims)}, {env.action.control_mode}). Fine-tune it "
-            "on demonstrations of this task."
+            f"on demonstrations of this task, or set env.{CONTROL_MODE} to what it was trained for."
         )
 
 

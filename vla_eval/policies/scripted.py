@@ -23,6 +23,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.candidate_controls import CandidateExpert, ChoicePolicy, Mode, VisitExpert, VisitPolicy
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.in_control_mode import in_any_control_mode
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 from vla_eval.task_state import PrivilegedState
 
@@ -88,30 +89,31 @@ class BallPolicy(ScriptedPolicy):
         return ActionChunk(actions=expert.plan(state, window.last.step, self._n_actions))
 
 
-ExpertPolicy = ChoicePolicy | VisitPolicy | BallPolicy
-
-
 def make_random(context: PolicyContext) -> RandomPolicy:
     """Make the `random` control."""
     return RandomPolicy(context)
 
 
-def make_hold(context: PolicyContext) -> HoldPolicy:
+@in_any_control_mode
+def make_hold(context: PolicyContext) -> ScriptedPolicy:
     """Make the `hold` control."""
     return HoldPolicy(context)
 
 
-def make_oracle(context: PolicyContext) -> ExpertPolicy:
+@in_any_control_mode
+def make_oracle(context: PolicyContext) -> ScriptedPolicy:
     """Make the `oracle` for the task of the context."""
     return _make_expert_policy(context, "oracle")
 
 
-def make_cue_blind(context: PolicyContext) -> ExpertPolicy:
+@in_any_control_mode
+def make_cue_blind(context: PolicyContext) -> ScriptedPolicy:
     """Make the `cue_blind` control for the task of the context."""
     return _make_expert_policy(context, "cue_blind")
 
 
-def make_tour(context: PolicyContext) -> ExpertPolicy:
+@in_any_control_mode
+def make_tour(context: PolicyContext) -> ScriptedPolicy:
     """Make the `tour` control.
 
     Raises:
@@ -125,7 +127,8 @@ def make_tour(context: PolicyContext) -> ExpertPolicy:
     return _make_expert_policy(context, "tour")
 
 
-def make_cue_reader(context: PolicyContext) -> ExpertPolicy:
+@in_any_control_mode
+def make_cue_reader(context: PolicyContext) -> ScriptedPolicy:
     """Make the `cue_reader` control.
 
     Raises:
@@ -139,7 +142,7 @@ def make_cue_reader(context: PolicyContext) -> ExpertPolicy:
     return _make_expert_policy(context, "cue_reader")
 
 
-def _make_expert_policy(context: PolicyContext, mode: Mode) -> ExpertPolicy:
+def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
     expert = task_expert(context)
     if hasattr(expert, "plan_visits"):
         return VisitPolicy(context, cast(VisitExpert, expert), mode)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import EpisodeStart, ObservationWindow
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.policies.context import PolicyContext
@@ -73,6 +73,10 @@ class ScriptedPolicy:
         """Release the generators of these slots."""
         for slot in slots:
             self._rng.pop(slot, None)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Plan a chunk."""
+        raise NotImplementedError
 
     def privileged_state(self, window: ObservationWindow) -> PrivilegedState:
         """Return the true state of the world at the last observation.

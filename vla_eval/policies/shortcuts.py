@@ -27,6 +27,7 @@ from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.candidate_controls import CandidateExpert
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.in_control_mode import in_any_control_mode
 from vla_eval.policies.scripted import BallExpertFactory
 from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows, task_expert
 from vla_eval.task_state import BodyState, PrivilegedState
@@ -62,7 +63,8 @@ class BodyMemoryPolicy(ScriptedPolicy):
         return ActionChunk(actions=rows)
 
 
-def make_body_memory(context: PolicyContext) -> BodyMemoryPolicy:
+@in_any_control_mode
+def make_body_memory(context: PolicyContext) -> ScriptedPolicy:
     """Make the `body_memory` control.
 
     Raises:
@@ -110,7 +112,8 @@ def _nearest(state: PrivilegedState) -> int:
     return int(np.linalg.norm(offsets[:, :2], axis=1).argmin())
 
 
-def make_cue_touch(context: PolicyContext) -> CueTouchPolicy:
+@in_any_control_mode
+def make_cue_touch(context: PolicyContext) -> ScriptedPolicy:
     """Make the `cue_touch` control.
 
     Raises:
@@ -160,7 +163,8 @@ class OneFramePolicy(ScriptedPolicy):
         return np.array([ROLLING_SHARE * np.mean(IMAGINED_VELOCITY_X_M_S), along_y, 0.0])
 
 
-def make_one_frame(context: PolicyContext) -> OneFramePolicy:
+@in_any_control_mode
+def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
     """Make the `one_frame` control.
 
     Raises:

@@ -5,6 +5,7 @@ its own simulator.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any  # Any: arguments of an adapter
 
 from vla_eval.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
@@ -13,6 +14,8 @@ from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
+from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.policies.checkpoint import find_checkpoint, read_facts
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.recipe import load_policy_recipe
@@ -31,6 +34,7 @@ from vla_eval.tasks.interface import ANY_TASK, env_spec
 from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
 
 OWN_PACKAGE = "mikasa-vla-eval"
+LEROBOT_ADAPTER = "lerobot"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +98,7 @@ def host_policy(options: HostOptions) -> HostedPolicy:
             f"policy '{recipe.name}' is behind a socket already. Evaluate it by its own address: mikasa-vla "
             f"eval --policy {options.policy}"
         )
-    env = env_spec(None if options.task is None else task_spec(options.task))
+    env = _environment(recipe, options)
     hashes = checkpoint_hashes(recipe.value.adapter, recipe.value.args, policy=recipe.name)
     policy = _make(recipe, options, env)
     _refuse_privileged(recipe.name, policy.spec.privileged)
@@ -111,6 +115,19 @@ def host_policy(options: HostOptions) -> HostedPolicy:
         reader=reader,
         task=env.task,
     )
+
+
+def _environment(recipe: Recipe[PolicyRecipe], options: HostOptions) -> EnvSpec:
+    """Return what the policy is made for: our tasks, with the control mode and images of its training."""
+    task = None if options.task is None else task_spec(options.task)
+    checkpoint = recipe.value.args.get("checkpoint")
+    is_ours = recipe.value.adapter == LEROBOT_ADAPTER and isinstance(checkpoint, str)
+    facts = read_facts(find_checkpoint(Path(checkpoint))) if is_ours and checkpoint else None
+    if facts is None:
+        return env_spec(task)
+    sizes_px = {shape[0] for shape in facts.images.values()}
+    size_px = sizes_px.pop() if len(sizes_px) == 1 else IMAGE_SIZE_PX
+    return env_spec(task, control_mode=facts.control_mode, image_size_px=size_px)
 
 
 def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> Policy:

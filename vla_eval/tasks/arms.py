@@ -17,8 +17,9 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.fetch import Fetch
 from mani_skill.sensors.camera import CameraConfig
 
-from vla_eval.features import JOINT_NAMES
-from vla_eval.tasks.interface import CAMERA_FOV_RAD, CAMERA_SIZE_PX
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
+from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES
+from vla_eval.tasks.interface import CAMERA_FOV_RAD
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 
 FINGERS = ("finger1", "finger2")
@@ -35,12 +36,14 @@ class Arm:
         arm_joints: indices of those that move the hand.
         rest_qpos: joint positions at the start of an episode, without noise; rad, and m for prismatic joints.
         base_m: position of the root, world frame.
+        control_modes: those that it takes.
     """
 
     joints: tuple[str, ...]
     arm_joints: tuple[int, ...]
     rest_qpos: tuple[float, ...]
     base_m: tuple[float, float, float]
+    control_modes: tuple[str, ...] = (EE_DELTA_POSE,)
 
 
 # Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
@@ -49,6 +52,7 @@ PANDA = Arm(
     arm_joints=tuple(range(7)),
     rest_qpos=(0.0, 0.0, 0.0, -2 * np.pi / 3, 0.0, 2 * np.pi / 3, np.pi / 4, 0.04, 0.04),
     base_m=(-0.615, 0.0, 0.0),
+    control_modes=tuple(CONTROL_MODES),
 )
 # As close to the table as possible (from -1.00 m on they touch). The tool centre point is then at
 # (-0.12, 0, 0.30), and the hand points 30 degrees down: pointing straight down it would not reach the cubes.
@@ -90,8 +94,8 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
             CameraConfig(
                 uid="hand_camera",
                 pose=sapien.Pose(p=[-0.1, 0, 0.1]),
-                width=CAMERA_SIZE_PX,
-                height=CAMERA_SIZE_PX,
+                width=IMAGE_SIZE_PX,
+                height=IMAGE_SIZE_PX,
                 fov=CAMERA_FOV_RAD,
                 near=0.01,
                 far=100,

@@ -10,7 +10,9 @@ from typing import Any
 
 from vla_eval.bounds import MAX_STEPS
 from vla_eval.config.decoding import check_value
+from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.errors import RecipeError, TaskArgumentError
+from vla_eval.tasks.interface import IMAGE_SIZE, checked_image_size
 from vla_eval.tasks.spec import TaskSpec
 
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
@@ -92,7 +94,7 @@ def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
 
 
 def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
-    """Check the names of a task's arguments, and durations, without a simulator.
+    """Check the names of a task's arguments, durations, control mode and image size, without a simulator.
 
     Args:
         spec: a row of the catalogue, or a family.
@@ -101,7 +103,8 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
 
     Raises:
         TaskArgumentError: a required argument of a family is missing; or an argument needs candidates,
-            and this task has none; or a duration is not a number of control steps.
+            and this task has none; or a duration is not a number of control steps; or a size is impossible.
+        UnknownNameError: there is no such control mode.
     """
     missing = [name for name in spec.open_arguments if name not in given]
     if missing:
@@ -117,6 +120,9 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
             f"{', '.join(of_choices)}: {spec.id}: there are no candidates to choose among. Use this task "
             f"without it, in a run of its own."
         )
+    action_spec(control_mode_of(given))
+    if IMAGE_SIZE in given:
+        checked_image_size(given[IMAGE_SIZE], task=spec.id)
     for name, value in given.items():
         if name.endswith("_steps"):
             _check_steps(name, value, task=spec.id)

@@ -5,21 +5,46 @@ Knows nothing of simulators: a server of policies has none.
 
 import numpy as np
 
-from vla_eval.features import ACTION_NAMES, JOINT_NAMES, POSE_NAMES
-from vla_eval.specs import ActionSpec, CameraSpec, EnvSpec, StateSpec
+from vla_eval.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
+from vla_eval.control_modes import EE_DELTA_POSE, action_spec
+from vla_eval.errors import TaskArgumentError
+from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
+from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
 from vla_eval.tasks.spec import TaskSpec
 
-CAMERA_SIZE_PX = 128
+IMAGE_SIZE = "image_size"
+"""Name of the argument in `env`: height and width of the images of both cameras, in pixels."""
 CAMERA_FOV_RAD = np.pi / 2
-CONTROL_MODE = "pd_ee_delta_pose"
+CAMERA_NAMES = ("base_camera", "hand_camera")
 CONTROL_HZ = 20.0
-CAMERAS = tuple(
-    CameraSpec(name=name, height_px=CAMERA_SIZE_PX, width_px=CAMERA_SIZE_PX, fov_rad=CAMERA_FOV_RAD)
-    for name in ("base_camera", "hand_camera")
-)
-ACTION = ActionSpec(dims=ACTION_NAMES, low=-1.0, high=1.0, control_mode=CONTROL_MODE, gripper_open=1.0)
+ACTION = action_spec(EE_DELTA_POSE)
 ANY_TASK = "any task"
 """Stands for the task's id where a policy is made for none in particular."""
+
+
+def checked_image_size(size_px: object, *, task: str) -> int:
+    """Return the argument `image_size`.
+
+    Raises:
+        TaskArgumentError: it is no possible size.
+    """
+    if isinstance(size_px, int) and MIN_IMAGE_SIZE_PX <= size_px <= MAX_IMAGE_SIZE_PX:
+        return size_px
+    raise TaskArgumentError(
+        f"{task}: {IMAGE_SIZE}={size_px!r:.80}: expected a whole number of pixels, {MIN_IMAGE_SIZE_PX} to "
+        f"{MAX_IMAGE_SIZE_PX}."
+    )
+
+
+def cameras(size_px: int = IMAGE_SIZE_PX) -> tuple[CameraSpec, ...]:
+    """Return the cameras of every task, with square images."""
+    return tuple(
+        CameraSpec(name=name, height_px=size_px, width_px=size_px, fov_rad=CAMERA_FOV_RAD)
+        for name in CAMERA_NAMES
+    )
+
+
+CAMERAS = cameras()
 
 
 def states(joints: tuple[str, ...] = JOINT_NAMES, prompt_dims: tuple[str, ...] = ()) -> tuple[StateSpec, ...]:
@@ -34,17 +59,24 @@ def states(joints: tuple[str, ...] = JOINT_NAMES, prompt_dims: tuple[str, ...] =
     return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
-def env_spec(task: TaskSpec | None = None) -> EnvSpec:
+def env_spec(
+    task: TaskSpec | None = None, *, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX
+) -> EnvSpec:
     """Return what a task offers with the Panda, without making its environment.
 
     Args:
         task: its row in the catalogue; None: what all tasks have in common, with an episode of one step.
+        control_mode: what an action means.
+        image_size_px: height and width of images.
+
+    Raises:
+        UnknownNameError: there is no such control mode.
     """
     return EnvSpec(
         task=ANY_TASK if task is None else task.id,
-        cameras=CAMERAS,
+        cameras=cameras(image_size_px),
         states=states(),
-        action=ACTION,
+        action=action_spec(control_mode),
         horizon_steps=1 if task is None else task.default_horizon_steps(0),
         control_hz=CONTROL_HZ,
     )

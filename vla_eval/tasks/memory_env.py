@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
@@ -23,13 +22,14 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.errors import TaskArgumentError, unknown_name
+from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import Phase
+from vla_eval.tasks.arm_control import ArmControl
 from vla_eval.tasks.arms import ARMS, Arm
 from vla_eval.tasks.bodies import Body, yaw_rad
 from vla_eval.tasks.durations import StepRange, step_range
-from vla_eval.tasks.interface import CAMERA_FOV_RAD, CAMERA_SIZE_PX
-from vla_eval.tasks.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, checked_image_size
 from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
@@ -42,7 +42,7 @@ PARK_SPACING_M = 0.3
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
 
 
-class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
+class MemoryTableEnv(ArmControl):
     """A Panda with a wrist camera at a table, with the phases cue, delay and response.
 
     Args:
@@ -59,6 +59,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             the CPU simulator (20 ms), never on the GPU simulator. In a reused scene PhysX keeps contact
             caches, so states differ from those of a new scene (measured: from 1e-7 to 15 rad/s after
             contact).
+        control_mode: what an action means, see `control_modes`. None: ManiSkill's default for the arm.
+        image_size: height and width of the images of both cameras, pixels.
         robot_uids: `panda_wristcam`; `panda_wristcam_seen`, which gives the same images faster;
             `panda_wristcam_light` with a simplified camera mesh; or another arm that the task supports
             (`SUPPORTED_ROBOTS`).
@@ -78,6 +80,8 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         self,
         *args: Any,
         robot_uids: str = "panda_wristcam",
+        control_mode: str | None = None,
+        image_size: int = IMAGE_SIZE_PX,
         cue_steps: StepRange = 5,
         delay_steps: StepRange = 5,
         swap_cue: int = 0,
@@ -108,7 +112,17 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         if reconfiguration_freq is None:
             on_cpu = kwargs.get("sim_backend", "auto") in CPU_BACKENDS and kwargs.get("num_envs", 1) == 1
             reconfiguration_freq = 1 if on_cpu else 0
-        super().__init__(*args, robot_uids=robot_uids, reconfiguration_freq=reconfiguration_freq, **kwargs)
+        if checked_image_size(image_size, task=type(self).__name__) != IMAGE_SIZE_PX:
+            size = {"width": image_size, "height": image_size}
+            kwargs["sensor_configs"] = {**kwargs.get("sensor_configs", {}), **size}
+        super().__init__(
+            *args,
+            robot_uids=robot_uids,
+            control_mode=control_mode,
+            reconfiguration_freq=reconfiguration_freq,
+            **kwargs,
+        )
+        self.check_motion()
 
     def n_swaps(self) -> int:
         """Return how many other cues the same scene could have; `swap_cue` selects one of them."""
@@ -125,7 +139,7 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
         pose = sapien_utils.look_at(eye=[0.3, 0, 0.6], target=[-0.1, 0, 0.1])
-        return [CameraConfig("base_camera", pose, CAMERA_SIZE_PX, CAMERA_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
+        return [CameraConfig("base_camera", pose, IMAGE_SIZE_PX, IMAGE_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -264,44 +278,6 @@ class MemoryTableEnv(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
                 zero = torch.zeros(3, device=self.device)
                 actor.set_linear_velocity(zero)
                 actor.set_angular_velocity(zero)
-
-    # ---------------------------------------------------------------- actions
-
-    def hold_action(self) -> torch.Tensor:
-        """Return the (B, A) action that moves neither arm nor fingers: zero motion, present gripper width.
-
-        Raises:
-            TaskArgumentError: the control mode has no action for that.
-        """
-        if "delta" not in self.control_mode:
-            raise TaskArgumentError(f"control_mode={self.control_mode!r}: only delta modes can hold still.")
-        action = torch.zeros(self.num_envs, self.single_action_space.shape[0], device=self.device)
-        gripper = self.agent.controller.controllers["gripper"]
-        low, high = gripper.config.lower, gripper.config.upper
-        width = self.agent.robot.get_qpos()[:, -2:].mean(dim=1)
-        action[:, -1] = ((width - low) / (high - low) * 2 - 1).clamp(-1, 1)
-        return action
-
-    def _step_action(self, action: Any) -> Any:
-        if (self.freeze_until_choice or self.move_in_delay) and action is not None:
-            given = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.device)
-            action = self._replaced(given.reshape(self.num_envs, -1))
-        executed = super()._step_action(action)
-        self.executed_action = None if executed is None else executed.clamp(-1, 1)
-        return executed
-
-    def _replaced(self, action: torch.Tensor) -> torch.Tensor:
-        """Return the (B, A) action with what holds or moves the arm before the choice in its place."""
-        action, held = action.clone(), self.hold_action()  # not the caller's array
-        if self.freeze_until_choice:
-            action = torch.where((self._elapsed_steps < self._response_step)[:, None], held, action)
-        for env in range(self.num_envs) if self.move_in_delay else ():
-            begins, ends = int(self._cue_end_step[env]), int(self._response_step[env])
-            motion = delay_motion(int(self._elapsed_steps[env]), begins=begins, ends=ends)
-            if motion is not None:
-                action[env] = torch.zeros_like(held[env])
-                action[env, Y_DIMENSION], action[env, GRIPPER_DIMENSION] = motion
-        return action
 
     # ---------------------------------------------------------------- reading
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
+from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.imported import ImportFacts
@@ -15,8 +16,6 @@ from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import CAMERA_KEYS
-
-RECORDED_CONTROL_MODE = "pd_ee_delta_pose"  # of the actions in our demonstrations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,10 +63,11 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
             f"its images show. {way}; or train on it all the same with --allow-unreplayed, which is noted "
             f"in the run."
         )
-    if isinstance(facts, ImportFacts) and not facts.executable_by_pd_ee_delta_pose:
+    if facts.control_mode not in CONTROL_MODES:
         raise DatasetError(
             f"{root}: its actions are for '{facts.control_mode}', which the environments here do not "
-            f"execute. A policy that is trained on it could not be evaluated."
+            f"execute (they take {', '.join(CONTROL_MODES)}). A policy that is trained on it could not be "
+            f"evaluated."
         )
     opened = open_local_dataset(root) if is_import else open_recorded(root)
     missing = [key for key in CAMERA_KEYS.values() if key not in opened.meta.features]
@@ -79,7 +79,7 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
         sha256=files_sha256(facts.files),
         task=facts.task or "",
         state=facts.state,
-        control_mode=facts.control_mode if isinstance(facts, ImportFacts) else RECORDED_CONTROL_MODE,
+        control_mode=facts.control_mode,
         was_replayed=report is not None,
         meta=opened.meta,
     )

@@ -13,6 +13,7 @@ from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
+from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import evaluate
@@ -123,7 +124,7 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
     """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
 
     Raises:
-        RecipeError: the seeds are used for something else, or steps, or the task, do not fit.
+        RecipeError: the seeds are used for something else, or steps, task or control mode do not fit.
         UnknownNameError: there is no such task.
     """
     if settings.every_steps % recipe.save_every_steps:
@@ -144,6 +145,12 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
                 f"of these seeds ({shared[0]} … {shared[-1]}) are seeds that {what}. Held-out seeds serve "
                 f"nothing else: choose another seed_start, or leave it out."
             )
+    if control_mode_of(settings.env) != dataset.control_mode:
+        raise RecipeError(
+            f"held_out.env.{CONTROL_MODE}: expected {dataset.control_mode}, the mode of the actions in "
+            f"{dataset.name}, found {control_mode_of(settings.env)}. Set it: --set "
+            f"held_out.env.{CONTROL_MODE}={dataset.control_mode}."
+        )
     task = settings.task or dataset.task
     if not task:
         raise RecipeError(

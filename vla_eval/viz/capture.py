@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.core import Stage
 from vla_eval.records import EpisodeRecord
+from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.viz.tape import Tapes
 
@@ -70,7 +71,7 @@ class EpisodeCapture:
         tapes: Tapes,
         records: Sequence[EpisodeRecord],
         *,
-        control_hz: float,
+        env: EnvSpec,
         heartbeat: Callable[[Stage], None],
     ) -> None:
         """Write the captures of a finished batch.
@@ -79,7 +80,7 @@ class EpisodeCapture:
             jobs: the batch.
             tapes: what was taped of it.
             records: its results, in the order of the jobs.
-            control_hz: control steps per second.
+            env: what the environment offers.
             heartbeat: called before each file: the watchdog gives each the time of a step.
 
         Raises:
@@ -97,11 +98,11 @@ class EpisodeCapture:
                     video_file(self.folder, record),
                     thumbnail=thumbnail_file(self.folder, record),
                     stills=stills_file(self.folder, record),
-                    frame_rate_hz=control_hz / self.config.frame_stride,
+                    frame_rate_hz=env.control_hz / self.config.frame_stride,
                 )
             if self._wants(self.config.rrd, job, record):
                 heartbeat("step")
-                _import(RRD_WRITER)(tape, record, rrd_file(self.folder, record), control_hz=control_hz)
+                _import(RRD_WRITER)(tape, record, rrd_file(self.folder, record), env=env)
 
     def _wants(self, which: Any, job: Capturable, record: EpisodeRecord) -> bool:
         index = job.seed - self.seed_start

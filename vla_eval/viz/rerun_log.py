@@ -20,6 +20,7 @@ import rerun as rr
 
 from vla_eval.core import FloatArray
 from vla_eval.records import EpisodeRecord
+from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import capture_stem
 from vla_eval.task_state import Phase
 from vla_eval.tasks.item_names import item_names
@@ -28,7 +29,6 @@ from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
-ACTION_DIMS = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
 JPEG_QUALITY = 90
@@ -41,14 +41,14 @@ COLORS = {
 }
 
 
-def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_hz: float) -> None:
+def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvSpec) -> None:
     """Write one episode.
 
     Args:
         tape: the episode.
         record: of the episode.
         path: the file; it is there whole or not at all.
-        control_hz: control steps per second, for the timeline `time`.
+        env: names the numbers of an action, and the control steps per second for the timeline `time`.
 
     Raises:
         ViewingError: the file cannot be written.
@@ -58,17 +58,17 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, control_h
     with rrd_when_whole(
         path,
         recording_id=capture_stem(record),
-        blueprint=layout(cameras, ACTION_DIMS),
+        blueprint=layout(cameras, env.action.dims),
         failed=f"the rerun file of {record.policy} on {record.task}, seed {record.seed}, could not be "
         "written",
         advice="Free some space, or capture less; the same command runs it again.",
     ) as stream:
         _log_facts(stream, tape, record)
         for taped in tape.steps:
-            set_step(stream, taped.step, control_hz)
-            _log_step(stream, taped)
-        _log_chunks(stream, tape, control_hz, n_series)
-        _log_events(stream, tape, record, control_hz)
+            set_step(stream, taped.step, env.control_hz)
+            _log_step(stream, taped, env.action.dims)
+        _log_chunks(stream, tape, env, n_series)
+        _log_events(stream, tape, record, env.control_hz)
 
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
@@ -94,7 +94,7 @@ def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRec
         stream.log("world/tcp_path", strip, static=True)
 
 
-def _log_step(stream: rr.RecordingStream, taped: TapedStep) -> None:
+def _log_step(stream: rr.RecordingStream, taped: TapedStep, action_dims: Sequence[str]) -> None:
     result = taped.result
     for name, image in result.observation.images.items():
         stream.log(f"cameras/{name}", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
@@ -111,9 +111,9 @@ def _log_step(stream: rr.RecordingStream, taped: TapedStep) -> None:
         stream.log(f"phase/{phase}", rr.Scalars(float(result.status.phase == phase)))
     if taped.action is not None:
         stream.log("reward", rr.Scalars(result.reward))
-        _log_action(stream, "asked", taped.action)
+        _log_action(stream, "asked", taped.action, action_dims)
         if result.executed_action is not None:
-            _log_action(stream, "executed", result.executed_action)
+            _log_action(stream, "executed", result.executed_action, action_dims)
 
 
 def log_arm(stream: rr.RecordingStream, qpos: FloatArray, tcp_position_m: FloatArray) -> None:
@@ -142,8 +142,8 @@ def _log_world(stream: rr.RecordingStream, taped: TapedStep) -> None:
         stream.log(f"world/bodies/{name}", point)
 
 
-def _log_action(stream: rr.RecordingStream, kind: str, action: FloatArray) -> None:
-    for name, value in zip(ACTION_DIMS, action, strict=True):
+def _log_action(stream: rr.RecordingStream, kind: str, action: FloatArray, dims: Sequence[str]) -> None:
+    for name, value in zip(dims, action, strict=True):
         stream.log(f"actions/{name}/{kind}", rr.Scalars(float(value)))
 
 
@@ -155,7 +155,7 @@ def n_overlapping(tape: EpisodeTape) -> int:
     return -(-longest // max(min(gaps, default=longest), 1))
 
 
-def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, control_hz: float, n_series: int) -> None:
+def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, env: EnvSpec, n_series: int) -> None:
     """Log each chunk at the steps that it was meant for: the executed part, and what was never executed."""
     for index in range(n_series):
         own = tape.chunks[index::n_series]
@@ -163,8 +163,8 @@ def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, control_hz: float
             continue
         steps = np.concatenate([np.arange(len(one.chunk.actions)) + one.step for one in own])
         values = np.concatenate([one.chunk.actions for one in own])
-        for dim, name in enumerate(ACTION_DIMS):
-            send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], control_hz)
+        for dim, name in enumerate(env.action.dims):
+            send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], env.control_hz)
 
 
 def _log_events(
