@@ -6,7 +6,7 @@ and two of its seeds may be one episode.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -80,19 +80,17 @@ def check_leak(dataset: InitialStates, *, task: str, seeds: range) -> LeakReport
         DatasetError: neither states nor first frames distinguish the evaluation's seeds from each other.
     """
     settings = EnvSettings(task=task_spec(task).id, simulator=dataset.simulator)
-    # A further seed, so that a single one has another to be distinguished from.
-    *starts, other = _starts(settings, [*seeds, seeds[-1] + 1 if seeds[-1] < MAX_SEED else seeds[0] - 1])
+    starts = _starts(settings, _with_another(seeds))
     kind = dataset.episodes[0].kind if dataset.episodes else "eef"
     evidence: Evidence = "state"
-    pairs = combinations((*starts, other), 2)
-    if any(_same_state(one.states[kind], another.states[kind]) for one, another in pairs):
+    if any(_same_state(one.states[kind], other.states[kind]) for one, other in combinations(starts, 2)):
         evidence = "frames"
         shared = _shared_frames(dataset, settings, seeds)
     else:
         shared = [
             SharedStart(episode=episode.name, dataset_seed=episode.seed, evaluation_seed=start.seed)
             for episode in dataset.episodes
-            for start in starts
+            for start in starts[: len(seeds)]
             if _same_state(episode.state, start.states[episode.kind])
         ]
     return LeakReport(
@@ -108,9 +106,8 @@ def _shared_frames(dataset: InitialStates, settings: EnvSettings, seeds: range) 
     """Compare first frames: those that a replay takes for the same frame after video are the same."""
     least_db = MIN_PSNR_DB[settings.simulator]
     cameras = tuple(CAMERA_KEYS)
-    starts = _starts(
-        EnvSettings(task=settings.task, simulator=settings.simulator, cameras=cameras), seeds, render=True
-    )
+    settings = replace(settings, cameras=cameras)
+    starts = _starts(settings, _with_another(seeds), render=True)
     alike = [
         f"{one.seed} and {other.seed}"
         for one, other in combinations(starts, 2)
@@ -133,9 +130,14 @@ def _shared_frames(dataset: InitialStates, settings: EnvSettings, seeds: range) 
     return [
         SharedStart(episode=episode.name, dataset_seed=episode.seed, evaluation_seed=start.seed)
         for episode, frames in zip(dataset.episodes, first_frames, strict=True)
-        for start in starts
+        for start in starts[: len(seeds)]
         if _are_alike(frames, start.frames, least_db)
     ]
+
+
+def _with_another(seeds: range) -> list[int]:
+    """Return the seeds and one more, so that a single one has another to be distinguished from."""
+    return [*seeds, seeds[-1] + 1 if seeds[-1] < MAX_SEED else seeds[0] - 1]
 
 
 def _starts(settings: EnvSettings, seeds: Sequence[int], *, render: bool = False) -> list[_Start]:

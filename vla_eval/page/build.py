@@ -79,7 +79,7 @@ def build_page(
         videos=machine_sections.videos(material),
         reproductions=[machine_sections.reproduction(run) for run in material.runs],
         # `<` is escaped as JSON does it, so that no text in it can end the element.
-        report=Markup(render(material.table, "json").replace("<", "\\u003c")),
+        report=Markup(render(material.table, "json", published=published).replace("<", "\\u003c")),
     )
 
 

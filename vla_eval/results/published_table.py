@@ -1,7 +1,9 @@
 """Published results as tables below a success table: the rates, and how they were measured."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 
+from vla_eval.config.files import to_data
 from vla_eval.results.published import Published, PublishedResult, load_published, paper_figures
 from vla_eval.results.side_table import SideTable
 from vla_eval.results.success_table import Table
@@ -47,16 +49,7 @@ def paper_side_table(table: Table) -> SideTable:
     tasks = dict.fromkeys(row.task for row in table.rows)
     cells = list(paper_figures())
     figures = [figure for task in tasks for figure in cells if figure.task == task]
-    fields = [
-        {
-            "task": one.task,
-            "model": one.model,
-            "n_action_steps": one.n_action_steps,
-            "success_once": one.success_once,
-            "sem": one.sem,
-        }
-        for one in figures
-    ]
+    fields = [asdict(one) for one in figures]
     return SideTable(
         title=f"The paper's figures, not measured here ({PAPER_PROTOCOL})",
         titles=["task", "model (paper)", "K", "success once (paper)"],
@@ -152,8 +145,6 @@ def _csv_rows(published: Published, result: PublishedResult) -> Iterator[dict[st
 
 
 def _json(published: Published, results: Sequence[PublishedResult]) -> list[dict[str, object]]:
-    from vla_eval.config.files import to_data
-
     rows = []
     for one in results:
         reference = to_data(published.sources[one.source])
