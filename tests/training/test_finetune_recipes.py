@@ -42,7 +42,7 @@ class TestPaddedActions:
         assert masks_padding(config)
         assert used_frames(config, dataset) == (55, 55)  # 13 + 14 + 15 + 13
 
-    @pytest.mark.parametrize("name", ["memory", "memoryless", "octo_tiny", "spatialvla_tiny"])
+    @pytest.mark.parametrize("name", ["memory", "memoryless", "recurrent", "octo_tiny", "spatialvla_tiny"])
     def test_so_do_our_own_but_for_openvla(self, name: str, recorded: Path, tmp_path: Path) -> None:
         config = FinetuneConfig(policy=name, dataset=str(recorded), out=str(tmp_path / "o"))
         dataset = training_dataset(recorded, allow_unreplayed=True)

@@ -6,7 +6,8 @@ A training sample is an episode. Knows no network.
 from dataclasses import dataclass
 from typing import Any, ClassVar  # lerobot is untyped
 
-from vla_eval.features import STATE_NAMES
+from vla_eval.errors import RecipeError
+from vla_eval.policies.eef_state import STATE
 from vla_eval.policies.ported_config import PortedConfig
 
 
@@ -55,19 +56,18 @@ class EpisodeConfig(PortedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.window_steps is not None and self.window_steps < 1:
-            raise ValueError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
+            raise RecipeError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
         for name in ("first_action_weight", "waiting_share"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
         if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
             raise ValueError(f"'{self.type}' needs images, observation.state and action")
-        n_numbers = len(STATE_NAMES["eef"])
-        if self.robot_state_feature.shape != (n_numbers,):
+        if self.robot_state_feature.shape != (STATE,):
             raise ValueError(
-                f"'{self.type}' needs the state 'eef' of {n_numbers} numbers, found "
+                f"'{self.type}' needs the state 'eef' of {STATE} numbers, found "
                 f"{self.robot_state_feature.shape}: record with state: eef"
             )
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
 
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
-SPACE = 3  # numbers of a position, the first of the state
 
 
 class Episodes(NamedTuple):

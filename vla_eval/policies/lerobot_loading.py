@@ -26,6 +26,7 @@ from torch import Tensor
 import vla_eval.policies.memory.configuration_memory  # importing it registers
 import vla_eval.policies.octo.configuration_octo
 import vla_eval.policies.openvla.configuration_openvla
+import vla_eval.policies.sequence.configuration_sequence
 import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError, unknown_name
 from vla_eval.policies.adapter_config import read_adapter_config

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.policies.sample_frames import BASE, WRIST, at, between, frames
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.files import load_recipe, to_data
@@ -16,11 +17,11 @@ from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, UnknownNameError
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.eef_state import POSITION_SCALE
 from vla_eval.policies.episode_samples import episodes_of
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone, goals_missed
 from vla_eval.policies.memory.network import Answer
-from vla_eval.policies.memory.sizes import POSITION_SCALE
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
@@ -28,7 +29,6 @@ from vla_eval.training.policy_config import policy_config
 
 TASK = "RememberColor3-v0"
 TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}
-BASE, WRIST = "observation.images.base", "observation.images.wrist"
 
 
 def tiny_policy(recorded: Path, *, remembers: bool = True, **fields: Any) -> Any:
@@ -36,23 +36,6 @@ def tiny_policy(recorded: Path, *, remembers: bool = True, **fields: Any) -> Any
     recipe = FinetuneRecipe(type="mikasa_memory", policy={**TINY, "remembers": remembers, **fields})
     dataset = training_dataset(recorded, allow_unreplayed=True)
     return MikasaMemoryPolicy(policy_config(recipe, dataset, device="cpu")).eval()
-
-
-def frames(n_steps: int, *, n_episodes: int = 1) -> dict[str, torch.Tensor]:
-    draws = torch.Generator().manual_seed(1)
-    return {
-        BASE: torch.rand(n_episodes, n_steps, 3, 128, 128, generator=draws),
-        WRIST: torch.rand(n_episodes, n_steps, 3, 128, 128, generator=draws),
-        "observation.state": torch.rand(n_episodes, n_steps, 10, generator=draws),
-    }
-
-
-def at(batch: dict[str, torch.Tensor], step: int) -> dict[str, torch.Tensor]:
-    return {key: values[:, step] for key, values in batch.items()}
-
-
-def between(batch: dict[str, torch.Tensor], first: int, stop: int) -> dict[str, torch.Tensor]:
-    return {key: values[:, first:stop] for key, values in batch.items()}
 
 
 class TestMemory:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.memory.layers import three_layers
-from vla_eval.policies.memory.sizes import SPACE
 
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
 WAY_HIDDEN = 64

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from lerobot.configs import PreTrainedConfig
 
-from vla_eval.errors import check_names
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.policies.episode_config import EpisodeConfig
 from vla_eval.policies.memory.sizes import SPOTS
@@ -43,7 +43,7 @@ class MikasaMemoryConfig(EpisodeConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.patch_px < 1 or self.patch_px % SPOTS:
-            raise ValueError(
+            raise RecipeError(
                 f"patch_px is {self.patch_px}, expected a multiple of {SPOTS}: so many spots has an edge"
             )
 

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from vla_eval.policies.eef_state import POSITION_SCALE, SPACE
 from vla_eval.policies.memory.layers import three_layers
-from vla_eval.policies.memory.sizes import PLACE, POSITION_SCALE, SPACE
+from vla_eval.policies.memory.sizes import PLACE
 
 MAP_HIDDEN = 64
 EVIDENCE_COUNTS = (3.0, 0.5, 3.0)

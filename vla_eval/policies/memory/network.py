@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.eef_state import POSITION_SCALE, SPACE, STATE
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
 from vla_eval.policies.memory.goal_layer import GoalLayer
-from vla_eval.policies.memory.sizes import KNOWN, PLACE, POSITION_SCALE, SPACE, STATE, NetworkSizes
+from vla_eval.policies.memory.sizes import KNOWN, PLACE, NetworkSizes
 from vla_eval.policies.memory.vision_encoder import Keys, Likeness, Places, StandingOut, VisionEncoder
 from vla_eval.policies.steps.precision import in_float32
 

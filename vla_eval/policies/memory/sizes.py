@@ -2,11 +2,6 @@
 
 from dataclasses import dataclass
 
-from vla_eval.features import STATE_NAMES
-
-STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
-POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
-SPACE = 3  # numbers of a position, and of the translation with which an action begins
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in an image
 APART = 1  # one number: how much a place stands out
 KNOWN = APART + RGB + PLACE  # what is known of a place beside its learned features, in this order

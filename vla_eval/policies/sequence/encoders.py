@@ -1,0 +1,76 @@
+"""Plain encoders of one camera's images: the one of the paper's baselines, and keypoints."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+RGB = 3
+KEYPOINTS = 32
+NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
+
+
+class Nature(nn.Sequential):
+    """The encoder of the paper's sequence baselines: three convolutions, a linear layer, tanh.
+
+    Sizes: Mnih et al. 2015, as in https://github.com/CognitiveAISystems/RATE (commit 5aa88f0, image encoder
+    of the MIKASA-Robo configurations), but for one camera instead of both as six channels.
+
+    Args:
+        image_px: height and width of an image.
+        outputs: numbers that are returned.
+    """
+
+    def __init__(self, *, image_px: int, outputs: int) -> None:
+        edge = image_px
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):
+            edge = (edge - kernel) // stride + 1
+        super().__init__(
+            nn.Conv2d(RGB, 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(64 * edge**2, outputs),
+            nn.Tanh(),
+        )
+
+
+class Keypoints(nn.Module):
+    """Convolutions and a spatial softmax: where each feature is, and how strong it is there.
+
+    Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies", section 5.1; the strength, which
+    says whether the feature is in the image at all, is ours.
+
+    Args:
+        image_px: height and width of an image, a multiple of 4.
+        outputs: numbers that are returned.
+    """
+
+    line: Tensor
+
+    def __init__(self, *, image_px: int, outputs: int) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(RGB, 32, 8, stride=4, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 32, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(32, KEYPOINTS, 1),
+        )
+        self.sharpness = nn.Parameter(torch.full((KEYPOINTS,), 4.0).log())
+        self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * KEYPOINTS, outputs)
+        self.register_buffer("line", torch.linspace(-1, 1, image_px // 4), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (N, outputs) of images (N, 3, H, W) in [-1, 1]."""
+        features = self.features(images)
+        relative = functional.instance_norm(features)
+        shares = (relative * self.sharpness.exp()[:, None, None]).flatten(2).softmax(dim=-1)
+        strong = (shares * features.flatten(2)).sum(dim=-1)
+        shares = shares.unflatten(-1, features.shape[-2:])
+        x = (shares.sum(dim=-2) * self.line).sum(dim=-1)
+        y = (shares.sum(dim=-1) * self.line).sum(dim=-1)
+        read: Tensor = self.reads(torch.cat([x, y, strong], dim=-1))
+        return read
