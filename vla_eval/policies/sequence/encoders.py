@@ -69,7 +69,7 @@ class Keypoints(nn.Module):
         relative = functional.instance_norm(features)
         shares = (relative * self.sharpness.exp()[:, None, None]).flatten(2).softmax(dim=-1)
         strong = (shares * features.flatten(2)).sum(dim=-1)
-        shares = shares.unflatten(-1, features.shape[-2:])
+        shares = shares.reshape(features.shape)
         x = (shares.sum(dim=-2) * self.line).sum(dim=-1)
         y = (shares.sum(dim=-1) * self.line).sum(dim=-1)
         read: Tensor = self.reads(torch.cat([x, y, strong], dim=-1))

@@ -42,8 +42,8 @@ class Gated(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return (…, outputs) of (…, inputs)."""
-        gates: Tensor = functional.silu(self.gates(inputs))
-        return gates * self.values(inputs)
+        gated: Tensor = functional.silu(self.gates(inputs)) * self.values(inputs)
+        return gated
 
 
 class SequenceNetwork(nn.Module):
