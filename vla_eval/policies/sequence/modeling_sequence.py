@@ -145,10 +145,12 @@ class MikasaSequencePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot i
         predicted = network.predict(tokens, answers)
         errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
-        real = (episodes.counts.sum(dim=-1) > 0).float()
+        # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
+        # at which the choice has to be made from memory would count for little.
+        weights = episodes.counts.sum(dim=-1)
         variance = (episodes.goal_m - episodes.goal_m.mean(dim=0)).square().mean()
         missed = (predicted.goal_m - episodes.goal_m[:, None]).square().mean(dim=-1)
-        goal = weighted_mean(missed, real) / variance.clamp(min=LEAST_VARIANCE_M2)
+        goal = weighted_mean(missed, weights) / variance.clamp(min=LEAST_VARIANCE_M2)
         parts = {"imitation": imitation, "goal": goal}
         return imitation + config.goal_weight * goal, {
             name: float(part.detach()) for name, part in parts.items()
