@@ -1,11 +1,12 @@
 """`mikasa-vla dataset …`: convert, check, describe and share demonstrations."""
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import seeds_argument
+from vla_eval.cli.arguments import add_workers, seeds_argument
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -13,14 +14,24 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser = subparsers.add_parser("dataset", help="convert, describe or share datasets", allow_abbrev=False)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
 
-    convert = actions.add_parser("convert", help="to or from the paper's layout", allow_abbrev=False)
+    convert = actions.add_parser(
+        "convert", help="to or from the paper's layout, or to another control mode", allow_abbrev=False
+    )
     convert.add_argument("source", metavar="SRC", type=Path, help="folder of one task")
-    convert.add_argument("--to", choices=("npz", "lerobot"), required=True, help="the layout to write")
+    goal = convert.add_mutually_exclusive_group(required=True)
+    goal.add_argument("--to", choices=("npz", "lerobot"), help="the layout to write")
+    goal.add_argument(
+        "--control-mode",
+        metavar="MODE",
+        help="replay a recording, and write what the arm did in this control mode (env.control_mode)",
+    )
     convert.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
     convert.add_argument("--task", metavar="T", help="task id, for sources without an instruction")
     convert.add_argument(
         "--state", choices=("eef", "joints"), default="eef", help="what observation.state is (%(default)s)"
     )
+
+    add_workers(convert, default="auto")
 
     leak = actions.add_parser(
         "check-leak",
@@ -52,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _convert(args: argparse.Namespace) -> int:
+    if args.control_mode is not None:
+        return _convert_control_mode(args)
     from vla_eval.data.convert import convert_to_lerobot, convert_to_npz, find_source
     from vla_eval.tasks.catalog import task_spec
 
@@ -68,7 +81,38 @@ def _convert(args: argparse.Namespace) -> int:
         if names:
             print(f"{label}: {', '.join(names)}")
     if not facts.executable_by_pd_ee_delta_pose:
-        print("The environments here use pd_ee_delta_pose: they cannot execute these actions.")
+        print(f"A policy trained on them is evaluated with --set env.control_mode={facts.control_mode}.")
+    return 0
+
+
+def _convert_control_mode(args: argparse.Namespace) -> int:
+    from vla_eval.cli.progress import stop_on_signals
+    from vla_eval.cli.record import describe
+    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.control_modes import action_spec
+
+    action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
+    from vla_eval.data.control_conversion import convert_control_mode
+
+    with stop_on_signals() as stop:
+        progress = RecordingProgress(stop)
+        try:
+            converted = convert_control_mode(
+                args.source, args.control_mode, out=args.out, observer=progress, workers=args.workers
+            )
+        finally:
+            progress.close()
+    if converted is None:
+        print("Stopped. The same command resumes.", file=sys.stderr)
+        return stop.exit_code
+    print(describe(converted.dataset))
+    n_kept = converted.dataset.facts.n_episodes
+    print(
+        f"{n_kept} of {converted.n_episodes} episodes succeed in {args.control_mode} and are in it; "
+        f"{converted.n_same_states} have the recorded states, bit for bit"
+    )
+    for sentence in converted.left_out:
+        print(f"left out: {sentence}")
     return 0
 
 

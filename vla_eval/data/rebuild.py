@@ -62,7 +62,7 @@ def rebuild(
     failed = read_failed(dataset) if (dataset / FAILED_FILE).exists() else ()
     selection = Selection(
         kept=tuple(_attempt(episode) for episode in episodes),
-        failed=tuple(_failed_attempt(one.seed, one.n_steps) for one in failed),
+        failed=tuple(failed_attempt(one.seed, one.n_steps) for one in failed),
     )
     summary = run_plan(
         recipe,
@@ -95,7 +95,7 @@ def _attempt(episode: RecordedEpisode) -> Attempt:
     )
 
 
-def _failed_attempt(seed: int, n_steps: int) -> Attempt:
+def failed_attempt(seed: int, n_steps: int) -> Attempt:
     """Return what is known of a failed seed; nobody renders it."""
     return Attempt(
         seed=seed,

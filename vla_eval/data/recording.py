@@ -50,7 +50,7 @@ from vla_eval.workers.start import simulator_modules
 WORKER_MODULE = "vla_eval.data.recording_worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
 
-Phase = Literal["trying seeds", "rendering", "joining"]
+Phase = Literal["trying seeds", "converting", "rendering", "joining"]
 RecordingPool = Pool[RecordingJob, RecordingAnswer]
 
 

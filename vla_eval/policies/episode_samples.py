@@ -35,13 +35,16 @@ def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
     return torch.stack([batch[key] for key in config.image_features], dim=-4)
 
 
-def episodes_of(batch: dict[str, Tensor], config: EpisodeConfig, *, training: bool) -> Episodes:
+def episodes_of(
+    batch: dict[str, Tensor], config: EpisodeConfig, *, training: bool, same_action: float = SAME_ACTION
+) -> Episodes:
     """Return the steps to train on, moved together: those of the episode, most waiting left out.
 
     Args:
         batch: as `config` asks for it by its delta indices.
         config: of the policy.
         training: leave waiting out and mix colours, at random by torch's generator; else take every step.
+        same_action: actions that differ by less are waiting.
     """
     n_steps = config.n_window_steps
     real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
@@ -50,7 +53,7 @@ def episodes_of(batch: dict[str, Tensor], config: EpisodeConfig, *, training: bo
     change = _change(actions[:, :, 0], real)
     kept = real
     if training:
-        waits = (change < SAME_ACTION) & (torch.rand_like(change) > config.waiting_share)
+        waits = (change < same_action) & (torch.rand_like(change) > config.waiting_share)
         waits[:, -1] = False  # the frame that was sampled
         kept = real & ~waits
     order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]

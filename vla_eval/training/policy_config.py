@@ -62,6 +62,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
     _set_features(config, recipe, dataset)
+    if hasattr(config, "fit_to_control_mode"):
+        config.fit_to_control_mode(dataset.control_mode)
     if hasattr(config, "window_steps"):
         _set_window(config, dataset)
     _check_features(config, dataset)

@@ -7,13 +7,21 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.features import STATE_KEY
-from vla_eval.policies.episode_samples import Episodes, episodes_of, stacked_images, weighted_mean
+from vla_eval.features import ACTION_KEY, STATE_KEY
+from vla_eval.policies.episode_samples import (
+    SAME_ACTION,
+    Episodes,
+    episodes_of,
+    stacked_images,
+    weighted_mean,
+)
 from vla_eval.policies.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.policies.memory.goal_layer import by_camera
+from vla_eval.policies.memory.joint_layer import action_units
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.policies.memory.sizes import NetworkSizes
 
+SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still
 LEAST_VARIANCE = 1e-6
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
 
@@ -28,12 +36,16 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     config_class = MikasaMemoryConfig
     name = TYPE
     draws_nothing = True
+    units: Tensor
 
     def __init__(self, config: MikasaMemoryConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
         self.config: MikasaMemoryConfig = config
-        self.network = MemoryNetwork(network_sizes(config), remembers=config.remembers)
+        sizes = network_sizes(config)
+        self.network = MemoryNetwork(sizes, remembers=config.remembers)
+        units = action_units(joint_targets=sizes.joint_targets, action=sizes.action)
+        self.register_buffer("units", units, persistent=False)
         if config.remembers:
             self.remember, self.begin_memory = self._remember, self.network.begin
         self.reset()
@@ -50,7 +62,9 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         config = self.config
-        episodes = episodes_of(batch, config, training=self.training)
+        scaled = {**batch, ACTION_KEY: batch[ACTION_KEY] / self.units}
+        same = SAME_JOINTS if config.joint_targets else SAME_ACTION
+        episodes = episodes_of(scaled, config, training=self.training, same_action=same)
         answer = self.network(episodes.images, episodes.state)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
@@ -97,7 +111,10 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         if memory is None:
             after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
             memory = Memory(*(part[:, 0] for part in after))
-        return foreseen_alone(self.network.act(sight, memory, state)).clamp(-1, 1)
+        foreseen = foreseen_alone(
+            self.network.act(sight, memory, state), holds_by_zero=not self.config.joint_targets
+        )
+        return foreseen * self.units if self.config.joint_targets else foreseen.clamp(-1, 1)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -111,18 +128,23 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         return self._queue.popleft()
 
 
-def foreseen_alone(answer: Answer) -> Tensor:
+def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
     """Return the actions (B, chunk, action) of an answer, held from the first that is a guess.
 
     An action is one if its error is expected to be larger by `UNFORESEEN` than that of the chunk's first
     action. A chunk that reaches beyond the moment at which the choice is shown cannot know where to go; the
     mean of all demonstrations would send the arm to the middle. Held: no motion, the gripper as it was.
+
+    Args:
+        answer: for one step per episode.
+        holds_by_zero: whether an action of zeros holds the arm; otherwise the last one that is foreseen does.
     """
     doubts = answer.doubts.sqrt()
     foreseen = (doubts <= doubts[:, :1] + UNFORESEEN).long().cumprod(dim=1)
     last = (foreseen.sum(dim=1) - 1)[:, None, None]
     held = answer.actions.take_along_dim(last, dim=1).clone()
-    held[..., :-1] = 0
+    if holds_by_zero:
+        held[..., :-1] = 0
     return torch.where(foreseen.bool()[..., None], answer.actions, held)
 
 
@@ -164,4 +186,5 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         hidden=config.hidden,
         longest_span_steps=config.longest_span_steps,
         free_translation=config.free_translation,
+        joint_targets=config.joint_targets,
     )

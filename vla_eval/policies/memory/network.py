@@ -21,6 +21,7 @@ from torch.nn import functional
 from vla_eval.policies.eef_state import POSITION_SCALE, SPACE, STATE
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
 from vla_eval.policies.memory.goal_layer import GoalLayer
+from vla_eval.policies.memory.joint_layer import JointLayer
 from vla_eval.policies.memory.sizes import KNOWN, PLACE, NetworkSizes
 from vla_eval.policies.memory.vision_encoder import Keys, Likeness, Places, StandingOut, VisionEncoder
 from vla_eval.policies.steps.precision import in_float32
@@ -36,7 +37,7 @@ class Answer(NamedTuple):
     """Outputs of the network for each step.
 
     Attributes:
-        actions: (B, T, chunk, action).
+        actions: (B, T, chunk, action); joint positions in units of `JOINT_UNIT_RAD`.
         doubts: (B, T, chunk) > 0, the squared error that is expected of each action. No gradient flows from
             it into anything but its own layer.
         goal_m: (B, T, 3) where the demonstration's tool centre point ends, predicted from what the memory
@@ -124,8 +125,9 @@ class MemoryNetwork(nn.Module):
             nn.GELU(),
         )
         self.acts = ActionHead(
-            hidden=hidden, chunk=sizes.chunk, action=sizes.action, free=sizes.free_translation
+            hidden=hidden, chunk=sizes.chunk, action=sizes.decided_action, free=sizes.free_translation
         )
+        self.joints = JointLayer() if sizes.joint_targets else None
         with torch.no_grad():
             nn.init.zeros_(self.asks.weight)
             nn.init.zeros_(self.asks.bias)
@@ -221,6 +223,8 @@ class MemoryNetwork(nn.Module):
         known = [looked_up, memory.things.flatten(1), memory.rest, sight.summary, state * POSITION_SCALE]
         decided = self.decides(torch.cat([*known, way_m / WAY_SCALE_M], dim=-1))
         actions, doubts = self.acts(decided, way_m)
+        if self.joints is not None:
+            actions = self.joints(actions, state)
         return Answer(
             actions=actions,
             doubts=doubts,

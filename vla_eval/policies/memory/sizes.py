@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from vla_eval.policies.eef_state import SPACE
+
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in an image
 APART = 1  # one number: how much a place stands out
 KNOWN = APART + RGB + PLACE  # what is known of a place beside its learned features, in this order
@@ -27,6 +29,7 @@ class NetworkSizes:
         hidden: units of the layers between.
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
         free_translation: whether a part of the translation does not depend on the goal.
+        joint_targets: whether an action is joint positions and the gripper.
     """
 
     on_arm: tuple[bool, ...] = (False, True)
@@ -41,6 +44,12 @@ class NetworkSizes:
     hidden: int = 256
     longest_span_steps: float = 100.0
     free_translation: bool = False
+    joint_targets: bool = False
+
+    @property
+    def decided_action(self) -> int:
+        """Numbers of an action as it is decided: in space, whatever the joints have to do for it."""
+        return SPACE + 1 if self.joint_targets else self.action
 
     @property
     def cameras(self) -> int:
