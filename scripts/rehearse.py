@@ -170,7 +170,9 @@ def run_part(name: str, options: Options) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(max_workers=1, mp_context=context) as executor:
+        # What libraries print goes to standard error: standard output is the tables.
+        to_stderr = {"initializer": os.dup2, "initargs": (2, 1)}
+        with ProcessPoolExecutor(max_workers=1, mp_context=context, **to_stderr) as executor:
             result = executor.submit(PARTS[name], options).result()
         wrong = problem(name, result, tiny=options.tiny)
         found: dict[str, Any] = {"state": "failed" if wrong else "done", "result": result}
