@@ -14,6 +14,7 @@ from tests.policies.golden_values import GoldenValues
 from tests.policies.octo import test_octo_parity as octo
 from tests.policies.octo import test_octo_policy as octo_policy
 from tests.policies.octo import test_octo_whole_path as octo_whole_path
+from tests.policies.octo.tiny_octo import GOLDEN
 from tests.policies.openvla import openvla_golden
 from tests.policies.openvla import test_openvla_convert as openvla_convert
 from tests.policies.openvla import test_openvla_network as openvla_network
@@ -32,8 +33,8 @@ NOT_IMPLEMENTED = "sample.w2_ead5."
 
 
 def test_every_value_of_octo_is_compared() -> None:
-    io = GoldenValues(octo.GOLDEN / "io.safetensors")
-    weights = load_file(octo.GOLDEN / "weights.safetensors")
+    io = GoldenValues(GOLDEN / "io.safetensors")
+    weights = load_file(GOLDEN / "weights.safetensors")
     made = octo.make_network(weights)
     forward, diffusion, windows = octo.TestForward(), octo.TestDiffusion(), octo_policy.TestWindows()
     for case in octo.CONFIG["cases"]:
