@@ -102,6 +102,13 @@ def test_a_dry_run_estimates_the_batch_of_a_policy_from_scratch(
     assert "largest batch in 24 GB, estimated: " in capsys.readouterr().out
 
 
+def test_a_named_memory_is_that_of_a_gpu_and_so_is_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--policy", "memory", "--dataset", "demos/RC3", "--device-memory", "24GB", "--dry-run"]
+    for device, rate in (("auto", "at 100 TFLOP/s"), ("cpu", "at 0.1 TFLOP/s")):
+        assert main(["finetune", *arguments, "--device", device]) == 0
+        assert rate in capsys.readouterr().out
+
+
 def test_the_largest_batch_is_what_fits_beside_weights_gradients_and_optimizer() -> None:
     recipe = FinetuneRecipe(type="mikasa_octo", steps=100, batch_size=8)
     found = estimate(

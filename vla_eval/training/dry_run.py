@@ -100,7 +100,9 @@ def _estimate(
     config: FinetuneConfig, recipe: FinetuneRecipe, options: DryRunOptions
 ) -> tuple[Estimate, list[str], int | None]:
     """Return the estimate, what is missing for the real run, and the number of frames, if it is known."""
-    device = choose_device(config.device)
+    # A memory that is named is that of a GPU, which need not be here.
+    is_named = options.device_bytes is not None and config.device == "auto"
+    device = "cuda" if is_named else choose_device(config.device)
     missing, dataset = [], None
     if Path(config.dataset).is_dir():
         dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
