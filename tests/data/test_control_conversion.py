@@ -180,3 +180,12 @@ def test_a_mistyped_mode_or_the_dataset_s_own_is_one_message(
         arguments = ["dataset", "convert", str(recorded), "--control-mode", mode, "--out", str(tmp_path)]
         assert main(arguments) == 1
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flag", [("--task", "RememberColor3-v0"), ("--state", "joints")])
+def test_a_flag_that_another_mode_does_not_take_is_refused(
+    flag: tuple[str, str], recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mode = ("--control-mode", "pd_joint_pos")
+    assert main(["dataset", "convert", str(recorded), *mode, *flag, "--out", str(tmp_path / "o")]) == 1
+    assert f"{flag[0]}: --control-mode keeps task and state of the recording" in capsys.readouterr().err

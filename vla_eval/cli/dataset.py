@@ -27,9 +27,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     )
     convert.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
     convert.add_argument("--task", metavar="T", help="task id, for sources without an instruction")
-    convert.add_argument(
-        "--state", choices=("eef", "joints"), default="eef", help="what observation.state is (%(default)s)"
-    )
+    convert.add_argument("--state", choices=("eef", "joints"), help="what observation.state is (eef)")
 
     add_workers(convert, default="auto")
 
@@ -74,7 +72,7 @@ def _convert(args: argparse.Namespace) -> int:
     if args.to == "npz":
         print(f"{args.out}: {convert_to_npz(source, args.out)} episodes in the paper's layout")
         return 0
-    facts = convert_to_lerobot(source, args.out, task=args.task, state=args.state)
+    facts = convert_to_lerobot(source, args.out, task=args.task, state=args.state or "eef")
     print(f"{args.out}: {len(facts.episodes)} episodes, {facts.n_frames} frames, from {facts.source_layout}")
     print(f"instruction from {facts.instruction_source}; actions for {facts.control_mode}")
     for label, names in (("the source has no", facts.absent), ("left out", facts.left_out)):
@@ -90,8 +88,12 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
     from vla_eval.cli.record import describe
     from vla_eval.cli.recording_progress import RecordingProgress
     from vla_eval.control_modes import action_spec
+    from vla_eval.errors import RecipeError
 
     action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
+    for flag, value in (("--task", args.task), ("--state", args.state)):
+        if value is not None:
+            raise RecipeError(f"{flag}: --control-mode keeps task and state of the recording. Remove it.")
     from vla_eval.data.control_conversion import convert_control_mode
 
     with stop_on_signals() as stop:
