@@ -9,6 +9,7 @@ from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
 
+LEAST_VARIANCE_M2 = 1e-6
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 
 
@@ -78,6 +79,23 @@ def episodes_of(
         counts=taken(counts),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
     )
+
+
+def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
+    """Return by how much a goal is missed, squared, in units of what the mean of the batch's would miss.
+
+    Args:
+        goal_m: (B, T, 3) predicted at each step.
+        right_m: (B, 3).
+        weights: (B, T) of the steps.
+    """
+    missed = (goal_m - right_m[:, None]).square().mean(dim=-1)
+    return weighted_mean(missed, weights) / goal_variance(right_m)
+
+
+def goal_variance(right_m: Tensor) -> Tensor:
+    """Return what the mean of goals (B, 3) misses, squared."""
+    return (right_m - right_m.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE_M2)
 
 
 def _change(actions: Tensor, real: Tensor) -> Tensor:

@@ -1,17 +1,18 @@
 """The positive control as a LeRobot policy: loss over whole episodes, memory from frame to frame."""
 
-from collections import deque
 from typing import Any  # lerobot is untyped
 
 import torch
-from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from vla_eval.features import ACTION_KEY, STATE_KEY
+from vla_eval.policies.episode_policy import EpisodePolicy
 from vla_eval.policies.episode_samples import (
     SAME_ACTION,
     Episodes,
     episodes_of,
+    goal_missed,
+    goal_variance,
     stacked_images,
     weighted_mean,
 )
@@ -22,20 +23,14 @@ from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.policies.memory.sizes import NetworkSizes
 
 SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still
-LEAST_VARIANCE = 1e-6
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
 
 
-class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
-    """See `MikasaMemoryConfig`.
-
-    With memory it has the methods `remember` and `begin_memory`; the harness shows it every frame. The twin
-    has none and is shown the frame at which it is asked.
-    """
+class MikasaMemoryPolicy(EpisodePolicy):
+    """See `MikasaMemoryConfig`; the twin has no memory."""
 
     config_class = MikasaMemoryConfig
     name = TYPE
-    draws_nothing = True
     units: Tensor
 
     def __init__(self, config: MikasaMemoryConfig, **kwargs: Any) -> None:
@@ -46,18 +41,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         self.network = MemoryNetwork(sizes, remembers=config.remembers)
         units = action_units(joint_targets=sizes.joint_targets, action=sizes.action)
         self.register_buffer("units", units, persistent=False)
-        if config.remembers:
-            self.remember, self.begin_memory = self._remember, self.network.begin
-        self.reset()
-
-    def get_optim_params(self) -> Any:
-        """Return all parameters."""
-        return self.parameters()
-
-    def reset(self) -> None:
-        """Forget what lerobot's own loop has shown."""
-        self._shown: Memory | None = None
-        self._queue: deque[Tensor] = deque()
+        self.set_memory(self.network.begin, remembers=config.remembers)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
@@ -104,8 +88,7 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
         The twin takes no memory: it sees the frame and nothing else.
         """
         self.eval()
-        if self.config.remembers and memory is None:
-            raise ValueError(f"'{TYPE}' with a memory needs what `remember` returned for this frame")
+        self.check_shown(memory)
         images, state = stacked_images(batch, self.config), batch[STATE_KEY]
         sight = self.network.see(images, state)
         if memory is None:
@@ -115,17 +98,6 @@ class MikasaMemoryPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is 
             self.network.act(sight, memory, state), holds_by_zero=not self.config.joint_targets
         )
         return foreseen * self.units if self.config.joint_targets else foreseen.clamp(-1, 1)
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes."""
-        if self.config.remembers:
-            frames = {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
-            self._shown = self._remember(frames, self._shown)
-        if not self._queue:
-            chunk = self.predict_action_chunk(batch, self._shown)
-            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
-        return self._queue.popleft()
 
 
 def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
@@ -161,13 +133,11 @@ def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor,
         right_m: (B, 3).
         real: (B, T) 1 for the steps that count, else 0.
     """
-    variance = (right_m - right_m.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE)
     of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)
     by_all = (answer.camera_shares * of_cameras).sum(dim=-1)
-    loss = weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / variance
-    missed = (answer.goal_m - right_m[:, None]).square().mean(dim=-1)
-    return weighted_mean(missed, real) / variance, loss
+    loss = weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / goal_variance(right_m)
+    return goal_missed(answer.goal_m, right_m, real), loss
 
 
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:

@@ -1,16 +1,15 @@
 """Plain policies as a LeRobot policy: imitation over whole episodes, memory from frame to frame."""
 
-from collections import deque
 from typing import Any, NamedTuple  # lerobot is untyped
 
 import torch
-from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.features import STATE_KEY
 from vla_eval.policies.eef_state import POSITION_SCALE, SPACE
-from vla_eval.policies.episode_samples import episodes_of, stacked_images, weighted_mean
+from vla_eval.policies.episode_policy import EpisodePolicy
+from vla_eval.policies.episode_samples import episodes_of, goal_missed, stacked_images, weighted_mean
 from vla_eval.policies.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
 from vla_eval.policies.sequence.cores import CoreMemory, make_core
 from vla_eval.policies.sequence.encoders import Keypoints, Nature
@@ -18,7 +17,6 @@ from vla_eval.policies.sequence.sizes import CORES
 from vla_eval.policies.steps.precision import in_float32
 
 ENCODERS = {"keypoints": Keypoints, "nature": Nature}
-LEAST_VARIANCE_M2 = 1e-6
 
 
 class Predicted(NamedTuple):
@@ -106,35 +104,18 @@ class SequenceNetwork(nn.Module):
         )
 
 
-class MikasaSequencePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
-    """See `MikasaSequenceConfig`.
-
-    With a core that remembers it has the methods `remember` and `begin_memory`; the harness shows it every
-    frame. With another one it is shown the frame at which it is asked.
-    """
+class MikasaSequencePolicy(EpisodePolicy):
+    """See `MikasaSequenceConfig`; it has a memory if its core has one."""
 
     config_class = MikasaSequenceConfig
     name = TYPE
-    draws_nothing = True
 
     def __init__(self, config: MikasaSequenceConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
         self.config: MikasaSequenceConfig = config
         self.network = SequenceNetwork(config)
-        self._remembers = CORES[config.core].remembers
-        if self._remembers:
-            self.remember, self.begin_memory = self._remember, self.network.begin
-        self.reset()
-
-    def get_optim_params(self) -> Any:
-        """Return all parameters."""
-        return self.parameters()
-
-    def reset(self) -> None:
-        """Forget what lerobot's own loop has shown."""
-        self._shown: CoreMemory | None = None
-        self._queue: deque[Tensor] = deque()
+        self.set_memory(self.network.begin, remembers=CORES[config.core].remembers)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
@@ -147,14 +128,10 @@ class MikasaSequencePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot i
         imitation = weighted_mean(errors, episodes.counts)
         # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
         # at which the choice has to be made from memory would count for little.
-        weights = episodes.counts.sum(dim=-1)
-        variance = (episodes.goal_m - episodes.goal_m.mean(dim=0)).square().mean()
-        missed = (predicted.goal_m - episodes.goal_m[:, None]).square().mean(dim=-1)
-        goal = weighted_mean(missed, weights) / variance.clamp(min=LEAST_VARIANCE_M2)
+        goal = goal_missed(predicted.goal_m, episodes.goal_m, episodes.counts.sum(dim=-1))
         parts = {"imitation": imitation, "goal": goal}
-        return imitation + config.goal_weight * goal, {
-            name: float(part.detach()) for name, part in parts.items()
-        }
+        loss = imitation + config.goal_weight * goal
+        return loss, {name: float(part.detach()) for name, part in parts.items()}
 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: CoreMemory | None) -> CoreMemory:
@@ -174,22 +151,9 @@ class MikasaSequencePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot i
         A policy without a memory takes none.
         """
         self.eval()
-        if self._remembers and memory is None:
-            raise ValueError(f"'{TYPE}' with a memory needs what `remember` returned for this frame")
+        self.check_shown(memory)
         images, state = stacked_images(batch, self.config)[:, None], batch[STATE_KEY][:, None]
         tokens = self.network.tokens(images, state)
-        answers = (
-            self.network.read(tokens, self.network.begin(len(tokens)))[0] if memory is None else memory[-1]
-        )
-        return self.network.predict(tokens, answers.reshape(tokens.shape)).actions[:, 0].clamp(-1, 1)
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes."""
-        if self._remembers:
-            frames = {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
-            self._shown = self._remember(frames, self._shown)
-        if not self._queue:
-            chunk = self.predict_action_chunk(batch, self._shown)
-            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
-        return self._queue.popleft()
+        if memory is None:
+            _, memory = self.network.read(tokens, self.network.begin(len(tokens)))
+        return self.network.predict(tokens, memory[-1][:, None]).actions[:, 0].clamp(-1, 1)

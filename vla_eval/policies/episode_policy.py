@@ -1,0 +1,70 @@
+"""What our policies that are trained on whole episodes share: memory from frame to frame, a queue of actions.
+
+Knows no network.
+"""
+
+import abc
+from collections import deque
+from typing import Any, ClassVar  # lerobot is untyped
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from vla_eval.features import STATE_KEY
+from vla_eval.policies.episode_config import EpisodeConfig
+from vla_eval.policies.lerobot_memory import Memory
+
+
+class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
+    """A policy that predicts chunks from a frame and what it remembers.
+
+    With memory it has the methods `remember` and `begin_memory`; the harness shows it every frame. Without,
+    it is shown the frame at which it is asked.
+    """
+
+    config_class: ClassVar[Any] = EpisodeConfig
+    name: ClassVar[str] = "mikasa_episodes"  # lerobot asks every class for a name; each policy has its own
+    config: EpisodeConfig
+    draws_nothing = True
+
+    def set_memory(self, begin: Any, *, remembers: bool) -> None:
+        """Give the policy the methods by which the harness knows that it remembers, if it does.
+
+        Args:
+            begin: of the network: returns the memory of so many episodes before their first frame.
+            remembers: whether there is more than the present frame.
+        """
+        self._remembers = remembers
+        if remembers:
+            self.remember, self.begin_memory = self._remember, begin
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """Return all parameters."""
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Forget what lerobot's own loop has shown."""
+        self._shown: Memory | None = None
+        self._queue: deque[Tensor] = deque()
+
+    @abc.abstractmethod
+    def _remember(self, batch: dict[str, Tensor], memory: Any) -> Any:
+        """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes."""
+        if self._remembers:
+            frames = {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
+            self._shown = self._remember(frames, self._shown)
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch, self._shown)
+            self._queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._queue.popleft()
+
+    def check_shown(self, memory: Any) -> None:
+        """Raise `ValueError` if a policy with a memory is asked without one."""
+        if self._remembers and memory is None:
+            raise ValueError(f"'{self.name}' with a memory needs what `remember` returned for this frame")
