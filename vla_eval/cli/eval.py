@@ -143,8 +143,9 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
+    from vla_eval.cli.evaluations import evaluate_one
     from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
-    from vla_eval.cli.progress import evaluate_with_progress, stop_on_signals
+    from vla_eval.cli.progress import stop_on_signals
     from vla_eval.evaluation.evaluate import RUNS_FOLDER, default_run_folder
     from vla_eval.evaluation.inference_choice import with_inference
     from vla_eval.evaluation.needed import needed_files
@@ -162,7 +163,6 @@ def run(args: argparse.Namespace) -> int:
     check_table_arguments(args)
     if args.baseline is not None:  # a policy behind a socket is asked for its name
         check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
-    command = typed_command()
 
     def needs() -> tuple[Needed, ...]:
         captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.is_on else ()
@@ -171,20 +171,11 @@ def run(args: argparse.Namespace) -> int:
     with backend_of(args, needs=needs) as backend, stop_on_signals() as stop:
         config = with_inference(config, backend)
         out = shard_folder(args.out or default_run_folder(config), args.shard)
-        summary = evaluate_with_progress(
-            config,
-            out=out,
-            command=command,
-            stop=stop,
-            allow_environment_change=args.allow_environment_change,
-            shard=args.shard,
-            backend=backend,
-            json_progress=args.json_progress,
-        )
+        summary = evaluate_one(config, out, args, stop=stop, backend=backend)
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
         print(
-            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To resume: {command}",
+            f"Stopped with {n_done}/{summary.n_episodes} episodes in {out}. To resume: {typed_command()}",
             file=sys.stderr,
         )
         return stop.exit_code

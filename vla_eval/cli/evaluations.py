@@ -1,4 +1,4 @@
-"""Run several evaluations one after another, each in a folder of its own: audits, probes and tables."""
+"""Run evaluations as the command line asks: one, or several one after another, each in its own folder."""
 
 import argparse
 import sys
@@ -9,6 +9,7 @@ from typing import NamedTuple
 from vla_eval.cli import progress
 from vla_eval.cli.arguments import typed_command
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.evaluation.evaluate import EvaluationSummary
 from vla_eval.workers.backend import Backend
 
 
@@ -24,6 +25,31 @@ class Evaluations(NamedTuple):
     stopped: int | None
 
 
+def evaluate_one(
+    config: EvalConfig,
+    out: Path,
+    args: argparse.Namespace,
+    *,
+    stop: progress.StopRequest,
+    backend: Backend,
+) -> EvaluationSummary:
+    """Run or resume an evaluation as the command line asks, with progress; arguments as for `evaluate_each`.
+
+    Raises:
+        VlaEvalError: see `evaluate`.
+    """
+    return progress.evaluate_with_progress(
+        config,
+        out=out,
+        command=typed_command(),
+        stop=stop,
+        allow_environment_change=args.allow_environment_change,
+        shard=args.shard,
+        backend=backend,
+        json_progress=args.json_progress,
+    )
+
+
 def evaluate_each(
     runs: Iterable[tuple[Path, EvalConfig]], args: argparse.Namespace, *, backend: Backend
 ) -> Evaluations:
@@ -37,21 +63,12 @@ def evaluate_each(
     Raises:
         VlaEvalError: see `evaluate`.
     """
-    command, n_errors = typed_command(), 0
+    n_errors = 0
     with progress.stop_on_signals() as stop:
         for out, config in runs:
-            summary = progress.evaluate_with_progress(
-                config,
-                out=out,
-                command=command,
-                stop=stop,
-                allow_environment_change=args.allow_environment_change,
-                shard=args.shard,
-                backend=backend,
-                json_progress=args.json_progress,
-            )
+            summary = evaluate_one(config, out, args, stop=stop, backend=backend)
             n_errors += summary.n_errors
             if summary.was_stopped:
-                print(f"Stopped. To resume: {command}", file=sys.stderr)
+                print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
                 return Evaluations(n_errors, stop.exit_code)
     return Evaluations(n_errors, None)
