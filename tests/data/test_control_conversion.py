@@ -1,7 +1,7 @@
 """Converting a recording to another control mode: the same motion, success checked, what is lost is named."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.data.recorded_episodes import entry_of
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
@@ -55,17 +56,7 @@ def recorded_episode(env: Any, *, noise: float) -> RecordedEpisode:
     context = PolicyContext(name="oracle", env=env.spec, chunking=how.group.rollout.chunking, n_candidates=3)
     start = how.start(1000, horizon_steps=env.spec.horizon_steps)
     one = attempt(NoisyEnv(env, noise), make_oracle(context), start, how.group.rollout, heartbeat=quiet)
-    return RecordedEpisode(
-        **asdict(one),
-        episode_index=0,
-        task=TASK,
-        task_version=1,
-        env_kwargs={},
-        instruction="touch it",
-        expert="oracle",
-        expert_version=1,
-        images_sha256={},
-    )
+    return entry_of(one)
 
 
 def test_targets_of_the_joints_lead_to_the_same_states_and_deltas_of_them_to_success() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.data.recorded_episodes import entry_of
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import (
@@ -62,21 +63,6 @@ def attempt_once(seed: int = 1000, *, noise: float = 0.0, steps_after_success: i
     return attempt(acting, make_oracle(context), start(seed), settings, heartbeat=lambda _stage: None)
 
 
-def recorded(one: Attempt) -> RecordedEpisode:
-    fields = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
-    return RecordedEpisode(
-        episode_index=0,
-        task=TASK,
-        task_version=1,
-        env_kwargs={},
-        instruction="reach it",
-        expert="oracle",
-        expert_version=1,
-        images_sha256={},
-        **fields,
-    )
-
-
 class TestManifest:
     def test_actions_are_kept_exactly(self) -> None:
         actions = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
@@ -87,11 +73,11 @@ class TestManifest:
             decode_actions("AAAA", n_dims=7)
 
     def test_an_entry_comes_back_as_it_was_written(self) -> None:
-        episode = recorded(attempt_once())
+        episode = entry_of(attempt_once())
         assert from_json(RecordedEpisode, to_json(episode), where="test") == episode
 
     def test_another_version_is_refused(self) -> None:
-        text = to_json(recorded(attempt_once())).replace('"format_version": 1', '"format_version": 2')
+        text = to_json(entry_of(attempt_once())).replace('"format_version": 1', '"format_version": 2')
         with pytest.raises(DatasetError, match="format version 2, this program reads version 1"):
             from_json(RecordedEpisode, text, where="test")
 
@@ -166,15 +152,15 @@ class TestEpisodeCheck:
     def test_what_agrees_is_not_mentioned(self) -> None:
         one = attempt_once()
         log, rows = self.log_and_rows(one)
-        assert check_rows(recorded(one), rows, log) == []
-        assert check_states(recorded(one), rows, log, expect_equal_bits=True) == []
+        assert check_rows(entry_of(one), rows, log) == []
+        assert check_states(entry_of(one), rows, log, expect_equal_bits=True) == []
 
     def test_a_changed_action_is_found(self) -> None:
         one = attempt_once()
         log, rows = self.log_and_rows(one)
         rows[ACTION_KEY] = rows[ACTION_KEY].copy()
         rows[ACTION_KEY][3, 2] += 1e-6
-        assert check_rows(recorded(one), rows, log) == [
+        assert check_rows(entry_of(one), rows, log) == [
             "the actions of the table are not those of the manifest"
         ]
 
@@ -182,21 +168,21 @@ class TestEpisodeCheck:
         one = dataclasses.replace(attempt_once(), states_sha256="0" * 64)
         log, rows = self.log_and_rows(one)
         rows[PROPRIO_KEYS["joints"]][4, 1] += 1e-3
-        assert check_states(recorded(one), rows, log, expect_equal_bits=False) == []
-        (sentence,) = check_states(recorded(one), rows, log, expect_equal_bits=True)
+        assert check_states(entry_of(one), rows, log, expect_equal_bits=False) == []
+        (sentence,) = check_states(entry_of(one), rows, log, expect_equal_bits=True)
         assert sentence == "states differ, most by 0.001 in y at step 4"
 
     def test_states_that_differ_by_more_than_the_tolerance_never_pass(self) -> None:
         one = dataclasses.replace(attempt_once(), states_sha256="0" * 64)
         log, rows = self.log_and_rows(one)
         rows[PROPRIO_KEYS["joints"]][4, 1] += 0.02
-        assert len(check_states(recorded(one), rows, log, expect_equal_bits=False)) == 1
+        assert len(check_states(entry_of(one), rows, log, expect_equal_bits=False)) == 1
 
     def test_a_success_that_is_gone_is_found(self) -> None:
         one = attempt_once()
         log, rows = self.log_and_rows(one)
         (sentence,) = check_states(
-            recorded(dataclasses.replace(one, success_step=None)), rows, log, expect_equal_bits=True
+            entry_of(dataclasses.replace(one, success_step=None)), rows, log, expect_equal_bits=True
         )
         assert sentence == f"first success at step {one.success_step}, expected at None"
 
