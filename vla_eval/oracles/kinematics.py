@@ -35,7 +35,8 @@ def joint_poses(qpos: ArrayLike) -> Matrix:
         qpos: joint positions, rad; the first seven are used.
     """
     pose, poses = np.eye(4), []
-    for angle_rad, (a_m, d_m, alpha_rad) in zip(np.asarray(qpos, dtype=float), CHAIN_M_RAD, strict=False):
+    arm_rad = np.asarray(qpos, dtype=float)[: len(CHAIN_M_RAD)]
+    for angle_rad, (a_m, d_m, alpha_rad) in zip(arm_rad, CHAIN_M_RAD, strict=True):
         pose = pose @ _link(float(angle_rad), a_m, d_m, alpha_rad)
         poses.append(pose)
     return np.stack(poses)
