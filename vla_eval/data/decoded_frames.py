@@ -16,7 +16,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.core import ImageArray
 from vla_eval.data.frame_cache import EpisodeRows, FrameSource, frames_in_ram, frames_on_disk
+from vla_eval.data.rewards import rewards_of
 from vla_eval.errors import DatasetError, check_names
+from vla_eval.features import REWARD_KEY, RewardKind
 from vla_eval.storage.cache import cache_dir
 
 Storage = Literal["disk", "ram"]
@@ -46,9 +48,11 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         whole_episodes: serve for each frame the sample of its episode's last frame. For policies with a
             memory, whose window reaches back to the beginning: a window that ends in the middle is a part
             of the same sample.
+        reward: what `next.reward` is, see `rewards_of`; None: as the table has it, if it has it.
 
     Raises:
-        DatasetError: cameras that are not videos, a damaged file, or no room for the frames.
+        DatasetError: cameras that are not videos, a damaged file, no rewards of that kind, or no room for the
+            frames.
         UnknownNameError: `delta_timestamps` names a field that is not there, or `storage` is another word.
     """
 
@@ -59,6 +63,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         storage: Storage | Literal["memory"] = "disk",
         cache: Path | None = None,
         whole_episodes: bool = False,
+        reward: RewardKind | None = None,
     ) -> None:
         if storage == "memory":
             warn_renamed("storage='memory'", "storage='ram'")
@@ -73,6 +78,9 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         self._columns = read_columns(source)
         check_names("field", self._deltas or (), source.meta.features, where="delta_timestamps")
         self._bounds, frame_source = frame_layout(source, self._columns)
+        if reward is not None:
+            rewards = rewards_of(self._columns, self._bounds, reward, root=source.root)
+            self._columns[REWARD_KEY] = rewards
         self._files: dict[str, Path] = {}
         self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share
         if storage == "disk":

@@ -17,7 +17,7 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutCo
 from vla_eval.config.policy import load_policy
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import RecipeError
-from vla_eval.features import CAMERA_KEYS
+from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.training.dataset import TrainingDataset, training_dataset
@@ -76,6 +76,12 @@ class TrainingJob:
         return bool(getattr(self.policy, "whole_episodes", False))
 
     @property
+    def reward(self) -> RewardKind | None:
+        """Which rewards the policy is trained on; None: it reads none."""
+        kind: RewardKind | None = getattr(self.policy, "reward", None)
+        return kind
+
+    @property
     def facts(self) -> TrainingFacts:
         """What is written beside each checkpoint's weights."""
         dataset, features = self.dataset, self.dataset.meta.features
@@ -122,9 +128,10 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         held_out=held_out,
         held_out_task=task,
     )
-    if job.whole_episodes and not recipe.decode_ahead:
+    needs = "whole episodes" if job.whole_episodes else "rewards" if job.reward is not None else None
+    if needs is not None and not recipe.decode_ahead:
         raise RecipeError(
-            f"finetune.decode_ahead is false; '{recipe.type}' is trained on whole episodes, which are served "
+            f"finetune.decode_ahead is false; '{recipe.type}' is trained on {needs}, which are served "
             "from decoded frames alone. Leave the field out."
         )
     return job

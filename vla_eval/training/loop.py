@@ -117,7 +117,7 @@ class _Training:
         with accelerator.main_process_first():  # the others find the decoded frames
             dataset = make_dataset(self.config)
             if job.recipe.decode_ahead:
-                dataset = DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes)
+                dataset = DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes, reward=job.reward)
         self.cameras = dataset.meta.camera_keys
         self.tracker = new_tracker(job, dataset, accelerator)
         set_seed(job.run_seed)
