@@ -6,7 +6,7 @@ import pytest
 
 from vla_eval.cli.main import main
 
-TASK = "mikasa_vla/RememberColor3-VLA-v0"
+TASK = "mikasa_vla/TimedTransferEasy-VLA-v0"
 
 
 def test_the_table_of_an_official_task_is_complete_and_asks_for_no_control(
@@ -36,9 +36,13 @@ def test_each_suite_has_its_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_task_is_shown_with_its_phases_and_where_it_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["show", TASK]) == 0
+    assert main(["show", "mikasa_vla/RememberColor3-VLA-v0"]) == 0
     shown = capsys.readouterr().out
     assert "(rules version 1, object memory, short split)" in shown
     assert "every action is replaced by zeros" in shown
-    assert main(["show", "mikasa_vla/TimedTransferEasy-VLA-v0"]) == 0
-    assert "phases        — (not to be read from the environment)" in capsys.readouterr().out
+    assert "chance        0.333 for a perfect arm that ignores the cue" in shown
+    assert "oracle        vla_eval.oracles.hover:CUBES" in shown
+    assert main(["show", TASK]) == 0
+    shown = capsys.readouterr().out
+    assert "phases        — (not to be read from the environment)" in shown
+    assert "oracle        there is none" in shown

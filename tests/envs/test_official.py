@@ -22,7 +22,9 @@ CUE_STEPS, DELAY_STEPS = 2, 1
 
 
 class SmallTask(HidingEnv):
-    """With an arm, and with a cue and a delay of fixed lengths."""
+    """A RememberColor3: with an arm, three cubes, and a cue and a delay of fixed lengths."""
+
+    GOAL_THRESH = 0.05
 
     def __init__(self, **kwargs: Any) -> None:
         own = ("num_envs", "obs_mode", "robot_uids", "sim_backend", "render_backend")
@@ -32,6 +34,9 @@ class SmallTask(HidingEnv):
         super()._initialize_episode(env_idx, options)
         self.cue_steps_per_env = torch.tensor([CUE_STEPS])
         self.empty_steps_per_env = torch.tensor([DELAY_STEPS])
+        self.cubes = dict(enumerate((self.hidden, self.parked, self.placed)))
+        self.initial_poses = {key: torch.tensor([[0.0, 0.1 * key, 0.02]]) for key in self.cubes}
+        self.true_color_indices = torch.tensor([2], dtype=torch.uint8)
         qpos = np.array([0, 0, 0, -np.pi * 2 / 3, 0, np.pi * 2 / 3, np.pi / 4, 0.04, 0.04])
         qpos[:7] += self._episode_rng.normal(0, 0.02, 7)
         self.agent.reset(qpos)
@@ -110,6 +115,24 @@ def test_what_the_official_tasks_cannot_do_is_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         make_env(EnvSettings(task=TASK, **settings))
+
+
+def test_the_true_state_is_in_the_observation_only_where_it_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(official, "official_class", lambda row: SmallTask)
+    made = make_env(EnvSettings(task=TASK, privileged=True))
+    results = run(made, 1)
+    states = [result.observation.privileged for result in results]
+    assert [state and (state.target, state.phase) for state in states] == [
+        (2, "cue"),
+        (2, "cue"),
+        (2, "delay"),
+        (2, "response"),
+        (2, "response"),
+    ]
+    assert results[0].status.n_candidates == 3
+    made.close()
 
 
 def test_without_the_package_the_message_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.prompts import instruction_for
-from vla_eval.core import StepResult
+from vla_eval.core import EpisodeStart, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.official import official_class
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.registry import make_from_adapter
+from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import OFFICIAL_TASKS, SUITES, task_spec
 from vla_eval.testing.check_env import check_env
 
@@ -25,6 +29,13 @@ SEED = 4242424242
 N_STEPS = 40  # beyond the reveal of all tasks but the long ones
 TABLE_M = -0.05, 0.6  # of the centre of anything that lies or is held on the table
 STAND_IN = {"mug": "stand_in"}
+SCRIPTED = [task for task, row in SUITES["mikasa_vla_90"].items() if row.oracle]
+ORACLES_OF = (
+    *("RememberColor9", "RememberShape5", "RememberShapeAndColor3x3", "FindImposterColor5"),
+    *("FindImposterShape9", "FindImposterShapeAndColor5x3", "ShellGameTouch", "ShellGamePush"),
+    *("ShellGameColorLampTouch", "ShellGameShuffleTouch", "ShellGameShuffleColorLampTouch"),
+    *("InterceptMedium", "InterceptGrabSlow", "RotateLenientPos", "TakeItBack"),
+)
 
 
 def hold(env: Any, seed: int, n_steps: int) -> list[StepResult]:
@@ -75,6 +86,53 @@ def test_the_rows_are_what_the_package_registers(task: str) -> None:
     assert row.horizon_steps == found.max_episode_steps
     if row.suite == "mikasa_vla_90" and hasattr(found.cls, "LANGUAGE_INSTRUCTION"):
         assert instruction_for(row) == found.cls.LANGUAGE_INSTRUCTION
+    if "velocity_range_m_s" in row.kwargs:
+        assert row.kwargs["velocity_range_m_s"] == found.cls.VELOCITY_RANGE
+
+
+@pytest.mark.parametrize("task", SCRIPTED)
+def test_controls_are_told_of_the_world(task: str) -> None:
+    env = make_env(EnvSettings(task=task, kwargs=STAND_IN, privileged=True))
+    result = env.reset({0: SEED}, render=False)[0]
+    state, chance = result.observation.privileged, task_spec(task).chance_success
+    assert state is not None
+    if chance is None:
+        assert state.bodies and not result.status.n_candidates
+    else:
+        assert result.status.n_candidates == round(1 / chance)
+        assert ((state.candidate_positions_m[:, 2] > 0) & (state.candidate_positions_m[:, 2] < 0.1)).all()
+    env.close()
+
+
+def won(task: str, policy: str, n_episodes: int) -> list[bool | None]:
+    """Whether a control wins the first episodes of the protocol."""
+    env = make_env(EnvSettings(task=task, kwargs=STAND_IN, privileged=True))
+    chunking, chance = ChunkingSpec(n_action_steps=1), task_spec(task).chance_success
+    context = PolicyContext(
+        name=policy, env=env.spec, chunking=chunking, n_candidates=round(1 / chance) if chance else 0
+    )
+    control = make_from_adapter(policy, context, {})
+    found = []
+    for seed in range(SEED, SEED + n_episodes):
+        start = EpisodeStart(
+            slot=0, task=task, seed=seed, run=0, instruction="-", horizon_steps=env.spec.horizon_steps
+        )
+        settings = RolloutSettings(chunking=chunking, stop_at_success=True)
+        found += [record.success_once for record in rollout(env, control, [start], settings)]
+    env.close()
+    return found
+
+
+@pytest.mark.parametrize("name", ORACLES_OF)
+def test_the_expert_wins_a_task_of_each_family(name: str) -> None:
+    assert won(f"mikasa_vla/{name}-VLA-v0", "oracle", 2) == [True, True]
+
+
+@pytest.mark.parametrize(
+    "name", ["RememberColor3-Long", "RememberShape9-Long", "RememberShapeAndColor5x3-Long"]
+)
+def test_going_to_the_cue_wins_the_long_remember_tasks(name: str) -> None:
+    assert won(f"mikasa_vla/{name}-VLA-v0", "cue_touch", 2) == [True, True]
 
 
 def test_the_tasks_that_wait_are_those_that_the_official_wrapper_stops(

@@ -81,6 +81,9 @@ def _show_official(spec: TaskSpec, prompt_set: str) -> int:
     _print("success", spec.success)
     _print("horizon", _horizon(spec))
     _print("phases", OFFICIAL_PHASES[spec.phase_source])
+    if spec.chance_success is not None:
+        _print("chance", _chance(spec))
+    _print("oracle", spec.oracle or spec.oracle_sees)
     if spec.waits_for_choice:
         _print("waits", "until the choice, every action is replaced by zeros")
     _print("arguments", "env.horizon_steps; env.mug = ycb or stand_in, in the shell games")

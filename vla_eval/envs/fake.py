@@ -340,7 +340,7 @@ def _argument_type(name: str) -> Any:  # Any: a type annotation
 
 
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them
-    if task.candidates is None:
+    if not task.has_candidates:
         return BALL_DEFAULTS
     several = "n_shown" in (*task.kwargs, *task.open_arguments)
     return SEVERAL_DEFAULTS if several else CHOICE_DEFAULTS

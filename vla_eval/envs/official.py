@@ -10,7 +10,7 @@ import gc
 import importlib
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple  # ManiSkill and the package are untyped: environments, infos are Any here
+from typing import Any  # ManiSkill and the package are untyped: environments, infos are Any here
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ import torch
 from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
+from vla_eval.envs.official_episode import OfficialEpisode, waiting_of
 from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
@@ -38,7 +39,7 @@ from vla_eval.errors import (
 )
 from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.specs import EnvSpec
-from vla_eval.task_state import Phase, TaskStatus
+from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, states
 from vla_eval.tasks.spec import TaskSpec
@@ -64,13 +65,6 @@ def make_official_env(settings: EnvSettings) -> "OfficialEnv":
     return OfficialEnv(settings)
 
 
-class _Waiting(NamedTuple):
-    """The steps of an episode before the choice, as the environment has drawn them."""
-
-    cue_steps: int
-    delay_steps: int
-
-
 class OfficialEnv:
     """`SimEnv` on the official package; see the module docstring."""
 
@@ -86,6 +80,7 @@ class OfficialEnv:
         if "/ShellGame" in row.id:
             self.device["mug"] = provide_mug(settings.kwargs.get("mug", "ycb"), task=row.id)
         self._envs = [_build(cls, settings) for _ in range(settings.n_slots)]
+        self._episodes: dict[int, OfficialEpisode] = {}
         self.device |= describe(self._envs[0], settings)
         self.spec = EnvSpec(
             task=row.id,
@@ -126,26 +121,30 @@ class OfficialEnv:
             )
         env = self._envs[slot]
         _, info = env.reset(seed=seed)
-        return StepResult(
-            observation=self._observation(env, info, render=render),
-            status=self._status(env, info),
-            wording=_wording(self._row, info),
-        )
+        self._episodes[slot] = OfficialEpisode(self._row, env)
+        return self._result(slot, info, render=render, wording=_wording(self._row, info))
 
     def _advance(self, slot: int, action: FloatArray, *, render: bool) -> StepResult:
         env = self._envs[slot]
         executed = ACTION.clipped(action)
-        if self._row.waits_for_choice and int(env.elapsed_steps[0]) < sum(_waiting(env)):
+        if self._row.waits_for_choice and int(env.elapsed_steps[0]) < sum(waiting_of(env)):
             executed = np.zeros_like(executed)
         _, reward, _, _, info = env.step(torch.as_tensor(executed[None], device=env.device))
+        return self._result(slot, info, render=render, reward=float(reward[0]), executed_action=executed)
+
+    def _result(self, slot: int, info: Any, *, render: bool, **fields: Any) -> StepResult:
+        episode = self._episodes[slot]
+        episode.note(int(info["elapsed_steps"][0]))
+        true_state = episode.true_state() if self._settings.privileged else None
         return StepResult(
-            observation=self._observation(env, info, render=render),
-            status=self._status(env, info),
-            reward=float(reward[0]),
-            executed_action=executed,
+            observation=self._observation(self._envs[slot], info, true_state, render=render),
+            status=episode.status(success=bool(info["success"][0])),
+            **fields,
         )
 
-    def _observation(self, env: Any, info: Any, *, render: bool) -> Observation:
+    def _observation(
+        self, env: Any, info: Any, true_state: PrivilegedState | None, *, render: bool
+    ) -> Observation:
         step = int(info["elapsed_steps"][0])
         images = {}
         if render:
@@ -161,26 +160,8 @@ class OfficialEnv:
             step=step,
             images={name: batch[0].copy() for name, batch in images.items()},
             state={name: to_array(batch[0]) for name, batch in state.items()},
+            privileged=true_state,
         )
-
-    def _status(self, env: Any, info: Any) -> TaskStatus:
-        return TaskStatus(
-            phase=self._phase(env, int(info["elapsed_steps"][0])),
-            success=bool(info["success"][0]),
-            fail=False,
-            target=None,
-            n_candidates=0,
-            first_choice=None,
-            n_wrong_choices=0,
-        )
-
-    def _phase(self, env: Any, step: int) -> Phase | None:
-        if self._row.phase_source == "none":
-            return None
-        waiting = _waiting(env)
-        if step < waiting.cue_steps:
-            return "cue"
-        return "delay" if step < sum(waiting) else "response"
 
 
 def official_class(row: TaskSpec) -> Any:
@@ -250,16 +231,6 @@ def _build(cls: Any, settings: EnvSettings) -> Any:
         raise RenderingError(
             f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
         ) from exc
-
-
-def _waiting(env: Any) -> _Waiting:
-    """Return the steps of cue and delay: drawn per episode in the 90 tasks, else constants."""
-    if hasattr(env, "cue_steps_per_env"):
-        delay = env.empty_steps_per_env if hasattr(env, "empty_steps_per_env") else [0]
-        return _Waiting(int(env.cue_steps_per_env[0]), int(delay[0]))
-    if hasattr(env, "TIME_OFFSET"):
-        return _Waiting(int(env.TIME_OFFSET), int(getattr(env, "DELTA_TIME", 0)))
-    return _Waiting(int(env.STEP_DURATION), int(env.EMPTY_DURATION))
 
 
 def _wording(row: TaskSpec, info: Any) -> dict[str, str]:

@@ -207,7 +207,7 @@ def _groups_of_all(
         instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
-            if policy.value.needs_candidates and task.candidates is None:
+            if policy.value.needs_candidates and not task.has_candidates:
                 found.left_out.append(
                     f"{policy.name} on {task.id}: it needs candidates, and this task has none"
                 )

@@ -278,7 +278,7 @@ def _planned(run: StoredRun, there: Mapping[PlannedRow, int]) -> list[PlannedRow
 
 def _has_no_candidates(task: str) -> bool:
     spec = find_task(task)
-    return spec is not None and spec.candidates is None
+    return spec is not None and not spec.has_candidates
 
 
 def _continued_elsewhere(run: StoredRun) -> list[str]:

@@ -24,14 +24,15 @@ def item_names(task: str, n_items: int) -> tuple[str, ...]:
     """Return the names of a task's items, by index.
 
     Args:
-        task: id of a row or of a family, such as `RememberColor3-v0` or `RememberColor`.
+        task: id of a row or of a family, such as `RememberColor3-v0` or `RememberColor`, or of the official
+            package, `mikasa_vla/RememberColor3-VLA-v0`.
         n_items: how many there are.
 
     Returns:
         One name per item; the index itself if the item has no name (mugs), or if its name depends on the
         task's arguments (RememberShapeAndColor).
     """
-    family = task.partition("-")[0].rstrip("0123456789")
+    family = task.rpartition("/")[2].partition("-")[0].rstrip("0123456789")
     names = _NAMES.get(family, ())
     return names[:n_items] if len(names) >= n_items else tuple(map(str, range(n_items)))
 

@@ -13,8 +13,9 @@ import csv
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib.resources import files
-from typing import cast
+from typing import Any, cast
 
+from vla_eval.tasks.official_controls import control_fields
 from vla_eval.tasks.spec import MemoryType, PhaseSource, TaskSpec
 
 NAMESPACE_90 = "mikasa_vla/"
@@ -25,6 +26,7 @@ _AS_PACKAGE = "as the official package has it"
 
 
 def _row(line: dict[str, str]) -> TaskSpec:
+    fields: dict[str, Any] = {"oracle": "", "oracle_sees": "there is none", "chance_success": None}
     return TaskSpec(
         id=f"{NAMESPACE_90}{line['name']}",
         version=1,
@@ -35,14 +37,12 @@ def _row(line: dict[str, str]) -> TaskSpec:
         instruction=line["instruction"],
         description=line["instruction"],
         success=_AS_PACKAGE,
-        oracle="",
-        oracle_sees="there is none",
         candidates=None,
-        chance_success=None,
         max_reward=1.0,
         suite="mikasa_vla_90",
         phase_source=cast(PhaseSource, line["phases"]),
         waits_for_choice=line["waits"] == "yes",
+        **{**fields, **control_fields(line["name"])},
     )
 
 

@@ -28,6 +28,9 @@ LONGEST_SHORT_STEPS, LONGEST_MEDIUM_STEPS = 200, 600  # of the official splits
 PhaseSource = Literal["cue_and_delay", "cue", "none"]
 """Which of its phases an official environment shows to the outside: it has numbers of their steps."""
 
+TrueState = Literal["items", "mugs", "ball", "peg", "cube", "none"]
+"""What scripted controls can be told of an official environment: its candidates, or its moving object."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskSpec:
@@ -58,6 +61,7 @@ class TaskSpec:
             filled in by the environment, per episode.
         phase_source, waits_for_choice: of an official task: which phases can be read from it, and whether the
             official wrapper replaces actions by zeros until the choice.
+        true_state: of an official task: what scripted controls can be told of its world.
         min_response_steps: of a family: the horizon grows with cue and delay so that at least this many
             steps remain for the response. None: the horizon is fixed by the id.
     """
@@ -84,12 +88,21 @@ class TaskSpec:
     instruction: str | None = None
     phase_source: PhaseSource = "none"
     waits_for_choice: bool = False
+    true_state: TrueState = "none"
     min_response_steps: int | None = None
 
     @property
     def gym_id(self) -> str:
         """The id under which Gymnasium knows the task."""
         return f"vla_eval/{self.id}"
+
+    @property
+    def has_candidates(self) -> bool:
+        """Whether one or more of N objects have to be chosen, and which they are is known to controls.
+
+        `candidates` says so of this package's own tasks, whose phases have arguments.
+        """
+        return self.candidates is not None or self.true_state in ("items", "mugs")
 
     @property
     def split(self) -> Split | None:
