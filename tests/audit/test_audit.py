@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.evaluations import CONTROLS, audit_configs, audit_task, kind_of, verdict
+from vla_eval.audit.evaluations import CONTROLS, audit_configs, audit_task, kind_of, protocols_of
+from vla_eval.audit.verdicts import verdict
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.shipped_audit import Counts
-from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.catalog import SUITES, TASKS, task_spec
 
 FAKE = ["--set", "simulator=fake", "--workers", "1"]
 
@@ -74,6 +75,55 @@ def test_every_task_is_played_by_the_controls_that_fit_it() -> None:
     assert all(config.env["freeze_until_choice"] and config.env["strict_choice"] for config in strict)
 
 
+def test_the_official_tasks_are_played_by_the_controls_that_fit_them() -> None:
+    tasks = list(SUITES["mikasa_vla_90"])
+    assert protocols_of(tasks, ("paper", "strict")) == ("official",)
+    configs = {c.name: c for c in audit_configs(tasks, ("official",), episodes=3, workers=1)}
+    n_tasks = {name.removeprefix("audit_official_"): len(config.tasks) for name, config in configs.items()}
+    # Remember-Long; other choices: the arm waits, or mugs move; balls; pegs and TakeItBack; the rest.
+    assert n_tasks == {"choice": 9, "search": 25, "ball": 6, "no_choice": 5, "unscripted": 45}
+    assert configs["audit_official_unscripted"].policies == ("random", "hold")
+    assert {(config.seed_start, config.stop_at_success) for config in configs.values()} == {
+        (4242424242, True)
+    }
+
+
+def test_only_the_controls_that_are_named_are_run() -> None:
+    tasks = ["mikasa_vla/RememberColor3-VLA-v0", "mikasa_vla/TimedTransferEasy-VLA-v0"]
+    settings = {"episodes": 1, "workers": 1}
+    (config,) = audit_configs(tasks, ("official",), controls=["tour"], **settings)  # type: ignore[arg-type]
+    assert (config.tasks, config.policies) == ((tasks[0],), ("tour",))
+    with pytest.raises(RecipeError, match="--control tour: none of these fits mikasa_vla/TimedTransferEasy"):
+        audit_configs(tasks[1:], ("official",), controls=["tour"], **settings)  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match=r"no control 'tuor'.*Did you mean 'tour'"):
+        audit_configs(tasks, ("official",), controls=["tuor"], **settings)  # type: ignore[arg-type]
+
+
+def test_official_tasks_and_ours_are_not_audited_in_one_run() -> None:
+    tasks = ["RememberColor3-v0", "mikasa_vla/RememberColor3-VLA-v0"]
+    with pytest.raises(RecipeError, match="RememberColor3-v0: audited under other protocols"):
+        protocols_of(tasks, ("paper",))
+
+
+def test_the_mug_of_official_tasks_may_be_set() -> None:
+    tasks = ["mikasa_vla/ShellGameTouch-VLA-v0"]
+    settings = {"env": {"mug": "stand_in"}}
+    (config,) = audit_configs(tasks, ("official",), episodes=1, workers=1, settings=settings)
+    assert config.env == {"mug": "stand_in"}
+
+
+def test_a_task_without_a_scripted_arm_is_not_audited() -> None:
+    assert verdict(counts(hold=0), None, scripted=False) == ("not audited: no scripted control",)
+    won = ("won without acting", "not audited: no scripted control")
+    assert verdict(counts(hold=1), None, scripted=False) == won
+
+
+def test_without_a_blind_arm_the_oracle_is_compared_with_chance() -> None:
+    assert verdict(counts(hold=0, oracle=30, tour=10), 1 / 3) == ("needs memory",)
+    assert verdict(counts(hold=0, oracle=12, tour=10), 1 / 3) == ("not decided",)
+    assert verdict(counts(hold=0, tour=10), 1 / 3) == ("not decided",)
+
+
 def test_mistakes_are_said_before_anything_is_played() -> None:
     with pytest.raises(UnknownNameError, match="RememberColor3-v0"):
         audit_configs(["RememberColour3-v0"], ("paper",), episodes=1, workers=1)
@@ -122,3 +172,14 @@ def test_the_command_plays_prints_and_goes_on_where_it_stopped(
     assert [row["task"] for row in audited] == ["RememberColor3-v0", "InterceptMedium-v0"]
     oracle = audited[0]["counts"]["oracle"]
     assert (oracle["n_episodes"], oracle["success_once"], oracle["first_choice"]) == (2, 2, 2)
+
+
+def test_the_command_audits_official_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = [f"mikasa_vla/{name}-VLA-v0" for name in ("RememberColor3", "TimedTransferEasy")]
+    arguments = ["audit", "--task", *tasks, "--control", "hold", "tour", "--episodes", "2", *FAKE]
+    arguments += ["--set", "env.horizon_steps=30", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    color, timed = capsys.readouterr().out.splitlines()[2:4]
+    assert color.startswith(f"| {tasks[0]} | official | 33.3 |")
+    assert timed.startswith(f"| {tasks[1]} | official | – |")
+    assert timed.endswith("| not audited: no scripted control |")

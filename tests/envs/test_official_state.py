@@ -1,4 +1,4 @@
-"""What scripted controls are told of official episodes, read from stand-ins with the official attributes."""
+"""What scripted controls are given of official episodes, read from stand-ins with the official attributes."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -145,7 +145,7 @@ def test_the_goal_of_a_peg_is_its_first_place_turned_by_the_angle_asked_for() ->
     assert bodies["peg"].position_m[0] == pytest.approx(0.1)
 
 
-def test_a_task_without_controls_tells_nothing() -> None:
+def test_a_task_without_controls_gives_nothing() -> None:
     episode = OfficialEpisode(row("TimedTransferEasy"), SimpleNamespace())
     assert episode.true_state() is None
     assert episode.status(success=False).n_candidates == 0

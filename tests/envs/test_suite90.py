@@ -91,7 +91,7 @@ def test_the_rows_are_what_the_package_registers(task: str) -> None:
 
 
 @pytest.mark.parametrize("task", SCRIPTED)
-def test_controls_are_told_of_the_world(task: str) -> None:
+def test_controls_are_given_the_true_state(task: str) -> None:
     env = make_env(EnvSettings(task=task, kwargs=STAND_IN, privileged=True))
     result = env.reset({0: SEED}, render=False)[0]
     state, chance = result.observation.privileged, task_spec(task).chance_success

@@ -7,7 +7,7 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.evaluations import NEEDS_MEMORY, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
+from vla_eval.audit.verdicts import NEEDS_MEMORY, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
 from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
 from vla_eval.results.audit_notes import OTHER_VERDICTS, ROADS, audit_notes

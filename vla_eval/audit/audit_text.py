@@ -4,7 +4,8 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from vla_eval.audit.evaluations import ALPHA, CONTROLS
+from vla_eval.audit.evaluations import CONTROLS
+from vla_eval.audit.verdicts import ALPHA
 from vla_eval.results.shipped_audit import Counts, TaskAudit
 
 COLUMNS = tuple(dict.fromkeys(control for controls in CONTROLS.values() for control in controls))
@@ -19,15 +20,19 @@ def render_audit(audits: Sequence[TaskAudit], style: str) -> str:
     """
     if style == "json":
         return json.dumps([asdict(audit) for audit in audits], indent=2)
-    header = ["task", "protocol", "chance", *COLUMNS, "verdict"]
-    rows = [header, [":--", ":--", *["--:"] * (1 + len(COLUMNS)), ":--"], *map(_row, audits)]
+    columns = [control for control in COLUMNS if any(control in audit.counts for audit in audits)]
+    header = ["task", "protocol", "chance", *columns, "verdict"]
+    rows = [header, [":--", ":--", *["--:"] * (1 + len(columns)), ":--"]]
+    rows += [_row(audit, columns) for audit in audits]
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join([*lines, "", *_notes(audits)])
 
 
-def _row(audit: TaskAudit) -> list[str]:
-    chance = "measured" if audit.chance is None else f"{100 * audit.chance:.1f}"
-    cells = [_cell(audit.counts.get(control)) for control in COLUMNS]
+def _row(audit: TaskAudit, columns: Sequence[str]) -> list[str]:
+    chance = "measured" if "cue_blind" in audit.counts else NOT_PLAYED
+    if audit.chance is not None:
+        chance = f"{100 * audit.chance:.1f}"
+    cells = [_cell(audit.counts.get(control)) for control in columns]
     return [audit.task, audit.protocol, chance, *cells, ", ".join(audit.verdict)]
 
 

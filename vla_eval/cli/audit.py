@@ -24,7 +24,8 @@ which a task can be won: without acting, by touching one candidate after another
 by storing the cue in the gripper. Nothing is rendered.
 
 Protocols: 'paper' is the task as it is; under 'strict' arm and gripper are held until the choice and the
-first choice is final. The same command resumes a stopped audit."""
+first choice is final. The official package's tasks (--suite mikasa_vla_90) have one, 'official'. The same
+command resumes a stopped audit."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -36,16 +37,31 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         description=DESCRIPTION,
         epilog="docs/audit.md explains controls, tests and verdicts.",
     )
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
         "--task",
         nargs="+",
         action="extend",
         dest="tasks",
         metavar="T",
-        help="task ids (all of the catalogue)",
+        help="task ids (all of the suite)",
+    )
+    which.add_argument(
+        "--suite",
+        choices=("paper", "mikasa_vla_90"),
+        default="paper",
+        help="all tasks of this package (paper), or the official package's 90",
+    )
+    parser.add_argument(
+        "--control", nargs="+", action="extend", dest="controls", metavar="C", help="only these controls"
     )
     parser.add_argument("--episodes", type=int, default=30, metavar="N", help="per task and control (30)")
-    parser.add_argument("--protocol", choices=("paper", "strict", "both"), default="both", help="(both)")
+    parser.add_argument(
+        "--protocol",
+        choices=("paper", "strict", "both"),
+        default="both",
+        help="(both); official tasks have their own",
+    )
     add_workers(parser, default="auto")
     add_cluster(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
@@ -82,19 +98,21 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
-    from vla_eval.audit.evaluations import audit_configs
-    from vla_eval.results.shipped_audit import PROTOCOLS
-    from vla_eval.tasks.catalog import TASKS
+    from vla_eval.audit.evaluations import audit_configs, protocols_of
+    from vla_eval.results.shipped_audit import AuditProtocol
+    from vla_eval.tasks.catalog import SUITES
 
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below
     apply_overrides(settings, args.overrides, cls=EvalConfig)
     # Read strictly, with names of nothing: for the types of what was set.
     checked = decode(EvalConfig, {"name": "x", "tasks": ["x"], "policies": ["x"], **settings}, where="--set")
-    protocols = tuple(PROTOCOLS) if args.protocol == "both" else (args.protocol,)
+    tasks = args.tasks or tuple(SUITES[args.suite])
+    wanted: tuple[AuditProtocol, ...] = ("paper", "strict") if args.protocol == "both" else (args.protocol,)
     return audit_configs(
-        args.tasks or tuple(TASKS),
-        protocols,
+        tasks,
+        protocols_of(tasks, wanted),
         episodes=args.episodes,
         workers=args.workers,
+        controls=args.controls,
         settings={name: getattr(checked, name) for name in settings},
     )

@@ -90,7 +90,7 @@ class OfficialEpisode:
         )
 
     def true_state(self) -> PrivilegedState | None:
-        """Return what scripted controls are told; None for a task that has none."""
+        """Return what scripted controls are given; None for a task that has none."""
         row, env, candidates = self._row, self._env, self.candidates
         if row.true_state == "none":
             return None

@@ -1,4 +1,4 @@
-"""The true state of an official episode: what records say of its choice, and what scripted controls are told.
+"""The true state of an official episode: for records, what was chosen; for scripted controls, all of it.
 
 Read from attributes of the official classes, which are named here in tables, so that this file knows how the
 package calls things and nothing else does. A learned policy is given none of it.

@@ -121,7 +121,7 @@ def _chance_notes(rows: Sequence[Row]) -> list[str]:
 
 
 def _has_controls(task: str) -> bool:
-    """Whether chance can be measured by `cue_blind`; the official package's tasks have no scripted arm."""
+    """Whether chance can be measured by `cue_blind`; half of the official 90 tasks have no scripted arm."""
     spec = find_task(task)
     return spec is None or bool(spec.oracle)
 

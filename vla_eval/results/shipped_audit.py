@@ -14,14 +14,14 @@ from typing import Any, Literal
 from vla_eval.errors import ReportError
 from vla_eval.strict_json import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
 
-AuditProtocol = Literal["paper", "strict"]
+AuditProtocol = Literal["paper", "strict", "official"]
 STRICT: Mapping[str, bool] = {
     "freeze_until_choice": True,
     "strict_choice": True,
     "phase_gate_success": True,
 }
-PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT}
-"""Name of a set of rules -> arguments of the tasks."""
+PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT, "official": {}}
+"""Name of a set of rules -> arguments of the tasks. The official package's tasks have one set, their own."""
 
 FILE = Path(__file__).with_suffix(".json")
 
@@ -32,14 +32,15 @@ class Counts:
 
     Attributes:
         n_episodes: episodes with a result; an error is not a result.
-        success_once, success_at_end: in how many of them the success rule held at any step, at the last.
+        success_once, success_at_end: in how many of them the success rule held at any step, at the last; None
+            if episodes ended at their first success.
         first_choice: in how many the first candidate touched was right; None without candidates.
         chance: mean `chance_success` of the episodes; None if it has to be measured.
     """
 
     n_episodes: Count
     success_once: Count
-    success_at_end: Count
+    success_at_end: Count | None
     first_choice: Count | None
     chance: Rate | None
 

@@ -1,4 +1,4 @@
-"""Which of the official 90 tasks have scripted controls: the expert, and what it is told of the world.
+"""Which of the official 90 tasks have scripted controls: the expert, and what it is given of the true state.
 
 The experts are those of this package's own tasks of the same kind. A family without a row here has none.
 """
@@ -18,7 +18,7 @@ class Controls(NamedTuple):
 
     Attributes:
         expert: `module:attribute`.
-        true_state: what controls are told of.
+        true_state: what controls are given.
         sees: the same in words.
     """
 

@@ -29,7 +29,7 @@ PhaseSource = Literal["cue_and_delay", "cue", "none"]
 """Which of its phases an official environment shows to the outside: it has numbers of their steps."""
 
 TrueState = Literal["items", "mugs", "ball", "peg", "cube", "none"]
-"""What scripted controls can be told of an official environment: its candidates, or its moving object."""
+"""What scripted controls can be given of an official environment: its candidates, or its moving object."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class TaskSpec:
             filled in by the environment, per episode.
         phase_source, waits_for_choice: of an official task: which phases can be read from it, and whether the
             official wrapper replaces actions by zeros until the choice.
-        true_state: of an official task: what scripted controls can be told of its world.
+        true_state: of an official task: what scripted controls can be given of its true state.
         min_response_steps: of a family: the horizon grows with cue and delay so that at least this many
             steps remain for the response. None: the horizon is fixed by the id.
     """

@@ -1,0 +1,70 @@
+"""What the counts of controls say of a task, in words. Knows nothing of runs.
+
+No audit proves that a task needs memory. It finds shortcuts among those that its controls try.
+"""
+
+from collections.abc import Mapping
+
+from vla_eval.results.estimates import p_above, p_more
+from vla_eval.results.shipped_audit import Counts
+
+ALPHA = 0.001
+"""Level of each test. All tasks need about 200 tests: less than one false finding in five audits."""
+
+NEEDS_MEMORY = "needs memory"
+NOT_AUDITED = "not audited: no scripted control"
+UNDECIDED = "not decided"
+SHORTCUTS = {
+    "random": "won by chance motions",
+    "tour": "can be toured",
+    "body_memory": "body can store the cue",
+    "cue_touch": "won by staying at the cue",
+    "cue_blind": "won without the cue",
+    "one_frame": "won from single frames",
+}
+WITHOUT_ACTING = "won without acting"
+
+
+def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: bool = True) -> tuple[str, ...]:
+    """Return the verdict: the shortcuts found, or that the oracle's knowledge of the cue decides.
+
+    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, if
+    chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`). Doing nothing is a shortcut
+    if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats the blind arm or,
+    where no blind arm was run, chance; otherwise there were too few episodes.
+
+    Args:
+        counts: control -> its counts.
+        chance: success rate of a perfect arm that ignores the cue.
+        scripted: whether the task has a scripted arm; without one, nothing but standing still is tried.
+    """
+    oracle, blind = counts.get("oracle"), counts.get("cue_blind")
+    found = [WITHOUT_ACTING] if "hold" in counts and counts["hold"].success_once else []
+    for control, words in SHORTCUTS.items():
+        if control in counts and _beats_memoryless(counts[control], chance, blind):
+            found.append(words)
+    if not scripted:
+        found.append(NOT_AUDITED)
+    if found:
+        return tuple(found)
+    if oracle is None:
+        return (UNDECIDED,)
+    by_cue = beats(oracle, blind) if blind is not None else _beats_memoryless(oracle, chance, blind)
+    return (NEEDS_MEMORY if by_cue else UNDECIDED,)
+
+
+def _beats_memoryless(counts: Counts, chance: float | None, blind: Counts | None) -> bool:
+    if chance is not None:
+        return beats_chance(counts, chance)
+    return blind is not None and beats(counts, blind)
+
+
+def beats_chance(counts: Counts, chance: float) -> bool:
+    """Whether this number of successes is significantly above a success rate of `chance`."""
+    return p_above(counts.success_once, counts.n_episodes, chance) < ALPHA
+
+
+def beats(one: Counts, other: Counts) -> bool:
+    """Whether the first succeeds significantly more often than the second."""
+    first, second = ((c.success_once, c.n_episodes) for c in (one, other))
+    return p_more(first, second) < ALPHA
