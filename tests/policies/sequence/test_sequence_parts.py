@@ -43,7 +43,7 @@ def test_steps_one_by_one_get_the_answers_of_all_steps_at_once(name: str, contex
 def test_a_step_is_answered_from_no_later_one(name: str) -> None:
     core, tokens = core_named(name), steps()
     before = answers(core, tokens, at_once=N_STEPS)
-    tokens[:, 7] += 1
+    tokens[:, 7, 0] += 1
     after = answers(core, tokens, at_once=N_STEPS)
     torch.testing.assert_close(after[:, :7], before[:, :7])
     assert not torch.isclose(after[:, 7], before[:, 7]).all()
@@ -53,7 +53,7 @@ def test_a_step_is_answered_from_no_later_one(name: str) -> None:
 def test_a_core_remembers_the_first_step_if_its_row_says_so(name: str) -> None:
     core, tokens = core_named(name), steps()
     before = answers(core, tokens, at_once=N_STEPS)[:, -1]
-    tokens[:, 0] += 1
+    tokens[:, 0, 0] += 1
     assert torch.equal(answers(core, tokens, at_once=N_STEPS)[:, -1], before) is not CORES[name].remembers
 
 
@@ -73,7 +73,7 @@ def test_a_transformer_forgets_what_is_older_than_its_layers_see(lag: int, seen:
     """Two layers of three steps see the last five: 2 · (3 - 1) before the newest."""
     core, tokens = core_named("transformer", context_steps=3), steps()
     before = answers(core, tokens, at_once=1)[:, -1]
-    tokens[:, -1 - lag] += 1
+    tokens[:, -1 - lag, 0] += 1
     assert torch.equal(answers(core, tokens, at_once=1)[:, -1], before) is not seen
 
 
