@@ -31,6 +31,9 @@ class EpisodeConfig(PortedConfig):
         change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
             which raises the moment of decision.
         waiting_share: a step whose action is that of the step before is used with this probability.
+        decision_share: share of the episodes of a training batch that end at a decision: a step at which the
+            arm begins to move after it waited, one of the episode's at random. What happens then has to be
+            known from memory; a step later the demonstration's own motion gives it away.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         mix_colors: the three colours of an episode's images change places at random in training.
         scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
@@ -44,6 +47,7 @@ class EpisodeConfig(PortedConfig):
     first_action_weight: float = 0.5
     change_weight: float = 3.0
     waiting_share: float = 0.3
+    decision_share: float = 0.0
     goal_weight: float = 1.0
     mix_colors: bool = False
 
@@ -60,6 +64,8 @@ class EpisodeConfig(PortedConfig):
         for name in ("first_action_weight", "waiting_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+        if not 0 <= self.decision_share <= 1:
+            raise RecipeError(f"decision_share is {self.decision_share}, expected a number in [0, 1]")
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""

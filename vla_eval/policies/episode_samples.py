@@ -44,7 +44,8 @@ def episodes_of(
     Args:
         batch: as `config` asks for it by its delta indices.
         config: of the policy.
-        training: leave waiting out and mix colours, at random by torch's generator; else take every step.
+        training: leave waiting out, end some episodes at a decision and mix colours, at random by torch's
+            generator; else take every step.
         same_action: actions that differ by less are waiting.
     """
     n_steps = config.n_window_steps
@@ -57,6 +58,8 @@ def episodes_of(
         waits = (change < same_action) & (torch.rand_like(change) > config.waiting_share)
         waits[:, -1] = False  # the frame that was sampled
         kept = real & ~waits
+        if config.decision_share:
+            kept = kept & _until_a_decision(change < same_action, real, config.decision_share)
     order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
 
     rows = torch.arange(len(order), device=order.device)[:, None]
@@ -107,6 +110,20 @@ def _change(actions: Tensor, real: Tensor) -> Tensor:
     difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
     change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
     return change.clamp(max=1.0)
+
+
+def _until_a_decision(waits: Tensor, real: Tensor, share: float) -> Tensor:
+    """Return (B, T): False after a decision, in the share of episodes (B, T) that end at one.
+
+    A decision is a step of motion after one of waiting. An episode without any does not end early.
+    """
+    begins = torch.zeros_like(waits)
+    begins[:, 1:] = real[:, :-1] & waits[:, :-1] & ~waits[:, 1:]
+    draws = torch.rand(waits.shape, device=waits.device).masked_fill(~begins, -1.0)
+    last = draws.argmax(dim=1)
+    ends = begins.any(dim=1) & (torch.rand(len(waits), device=waits.device) < share)
+    steps = torch.arange(waits.shape[1], device=waits.device)
+    return ~ends[:, None] | (steps <= last[:, None])
 
 
 def _mixed(images: Tensor) -> Tensor:

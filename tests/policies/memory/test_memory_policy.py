@@ -168,6 +168,25 @@ class TestTraining:
         torch.testing.assert_close(episodes.state[:, 0], batch["observation.state"][:, n_steps - 5])
         torch.testing.assert_close(episodes.state[:, 1], batch["observation.state"][:, n_steps - 1])
 
+    @pytest.mark.parametrize("share", [0.0, 1.0])
+    def test_an_episode_that_ends_at_a_decision_ends_where_the_arm_begins_to_move(
+        self, recorded: Path, share: float
+    ) -> None:
+        policy = tiny_policy(recorded, waiting_share=1.0, decision_share=share).train()
+        batch = self.batch(policy, n_real=5)
+        n_steps = policy.config.n_window_steps
+        batch["action"][:] = 0.5
+        batch["action"][:, n_steps - 2 :] = torch.rand_like(batch["action"][:, n_steps - 2 :])
+        kept = episodes_of(batch, policy.config, training=True).state
+        expected = batch["observation.state"][:, n_steps - 5 : n_steps - 1 if share else n_steps]
+        torch.testing.assert_close(kept, expected)
+
+    def test_an_episode_without_waiting_is_used_to_its_end(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded, decision_share=1.0).train()
+        batch = self.batch(policy, n_real=5)
+        batch["action"] = torch.rand_like(batch["action"])
+        assert episodes_of(batch, policy.config, training=True).state.shape[1] == 5
+
     def test_chunks_that_reach_beyond_the_end_of_an_episode_are_trained_on(self, recorded: Path) -> None:
         assert getattr(tiny_policy(recorded).config, "drop_n_last_frames", 0) == 0
 

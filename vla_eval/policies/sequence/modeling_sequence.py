@@ -121,7 +121,10 @@ class MikasaSequencePolicy(EpisodePolicy):
         """Return the loss of a batch of training samples, and its parts."""
         config, network = self.config, self.network
         episodes = episodes_of(batch, config, training=self.training)
-        tokens = network.tokens(episodes.images, episodes.state)
+        real = episodes.counts[..., 0] > 0
+        # Images are most of the work: those of padding are not encoded.
+        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None])[0]
+        tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
         answers, _ = network.read(tokens, network.begin(len(tokens)))
         predicted = network.predict(tokens, answers)
         errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
