@@ -118,6 +118,12 @@ def test_a_task_without_a_scripted_arm_is_not_audited() -> None:
     assert verdict(counts(hold=1), None, scripted=False) == won
 
 
+def test_a_task_needs_memory_only_where_the_oracle_beats_every_control() -> None:
+    # Fisher, 30 of 30: against 18 of 30 p = 8e-5; but not against 25 of 30, p = 0.03, at a chance of 0.7.
+    assert verdict(counts(**{**BLIND_AS_CHANCE, "tour": 18}), 1 / 3) == ("needs memory",)
+    assert verdict(counts(**{**BLIND_AS_CHANCE, "tour": 25}), 0.7) == ("not decided",)
+
+
 def test_without_a_blind_arm_the_oracle_is_compared_with_chance() -> None:
     assert verdict(counts(hold=0, oracle=30, tour=10), 1 / 3) == ("needs memory",)
     assert verdict(counts(hold=0, oracle=12, tour=10), 1 / 3) == ("not decided",)

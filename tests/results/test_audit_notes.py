@@ -7,15 +7,17 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.verdicts import NEEDS_MEMORY, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
+from vla_eval.audit.verdicts import NEEDS_MEMORY, NOT_AUDITED, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
 from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
 from vla_eval.results.audit_notes import OTHER_VERDICTS, ROADS, audit_notes
 from vla_eval.results.shipped_audit import STRICT, Counts, TaskAudit, protocol_of, shipped_audits
 from vla_eval.storage.run_folder import StoredRun
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import SUITES, TASKS, task_spec
 
 COLOR, SHELL = "RememberColor3-v0", "ShellGameTouch-v0"
+LONG, TIMED = "mikasa_vla/RememberColor3-Long-VLA-v0", "mikasa_vla/TimedTransferEasy-VLA-v0"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def audit(task: str, *words: str, protocol: audited.AuditProtocol = "paper", version: int = 1) -> TaskAudit:
@@ -33,7 +35,7 @@ def audit(task: str, *words: str, protocol: audited.AuditProtocol = "paper", ver
 
 @pytest.fixture(autouse=True)
 def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An audit of three rows ships, as the command writes it."""
+    """An audit of three rows ships, as the command writes it, and one of two official tasks."""
     rows = [
         audit(COLOR, "can be toured", "body can store the cue"),
         audit(COLOR, "needs memory", protocol="strict"),
@@ -41,6 +43,12 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ]
     monkeypatch.setattr(audited, "FILE", tmp_path / "shipped_audit.json")
     audited.FILE.write_text(render_audit(rows, "json"), encoding="utf-8")
+    monkeypatch.setattr(audited, "OFFICIAL_FILE", tmp_path / "official_audit.json")
+    official = [
+        audit(LONG, "won by staying at the cue", protocol="official"),
+        audit(TIMED, NOT_AUDITED, protocol="official"),
+    ]
+    audited.OFFICIAL_FILE.write_text(render_audit(official, "json"), encoding="utf-8")
     shipped_audits.cache_clear()
     yield
     shipped_audits.cache_clear()
@@ -60,7 +68,18 @@ def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -
 
 def test_every_verdict_of_an_audit_has_words_for_readers() -> None:
     assert set(ROADS) == {*SHORTCUTS.values(), WITHOUT_ACTING}
-    assert set(OTHER_VERDICTS) == {NEEDS_MEMORY, UNDECIDED}
+    assert set(OTHER_VERDICTS) == {NEEDS_MEMORY, UNDECIDED, NOT_AUDITED}
+
+
+def test_a_run_of_official_tasks_gets_their_audit() -> None:
+    runs = [run_of(LONG, env={"mug": "stand_in"}), run_of(TIMED)]
+    (note,) = audit_notes(runs)
+    assert note == (
+        f"can be won without memory: {LONG} by staying where the cue was shown; not audited, for lack of a "
+        f"scripted control: {TIMED} (audit under the official rule, 30 episodes per control: "
+        "docs/audit_official.md)."
+    )
+    assert audit_notes([run_of(LONG, env={"horizon_steps": 100})]) == []
 
 
 def test_a_strict_run_gets_the_strict_verdict() -> None:
@@ -101,11 +120,15 @@ def test_the_audit_that_ships_is_of_present_tasks_and_in_the_docs(monkeypatch: p
     monkeypatch.undo()
     shipped_audits.cache_clear()
     audits = list(shipped_audits().values())
-    assert {audit.task for audit in audits} <= set(TASKS)
+    official = [one for one in audits if one.protocol == "official"]
+    ours = [one for one in audits if one.protocol != "official"]
+    assert {one.task for one in ours} <= set(TASKS)
+    assert {one.task for one in official} <= set(SUITES["mikasa_vla_90"])
     for one in audits:
-        assert verdict(one.counts, one.chance) == one.verdict  # nobody has edited it
-    docs = Path(__file__).parents[2] / "docs" / "audit.md"
-    assert render_audit(audits, "markdown") in docs.read_text(encoding="utf-8")
+        scripted = bool(task_spec(one.task).oracle)
+        assert verdict(one.counts, one.chance, scripted=scripted) == one.verdict  # nobody has edited it
+    for name, shown in (("audit", ours), ("audit_official", official)):
+        assert render_audit(shown, "markdown") in (DOCS / f"{name}.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -30,15 +30,15 @@ def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: boo
 
     A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, if
     chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`). Doing nothing is a shortcut
-    if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats the blind arm or,
-    where no blind arm was run, chance; otherwise there were too few episodes.
+    if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats every other control
+    (Fisher) and, where that is known, chance; otherwise there were too few episodes.
 
     Args:
         counts: control -> its counts.
         chance: success rate of a perfect arm that ignores the cue.
         scripted: whether the task has a scripted arm; without one, nothing but standing still is tried.
     """
-    oracle, blind = counts.get("oracle"), counts.get("cue_blind")
+    blind = counts.get("cue_blind")
     found = [WITHOUT_ACTING] if "hold" in counts and counts["hold"].success_once else []
     for control, words in SHORTCUTS.items():
         if control in counts and _beats_memoryless(counts[control], chance, blind):
@@ -47,10 +47,17 @@ def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: boo
         found.append(NOT_AUDITED)
     if found:
         return tuple(found)
-    if oracle is None:
-        return (UNDECIDED,)
-    by_cue = beats(oracle, blind) if blind is not None else _beats_memoryless(oracle, chance, blind)
-    return (NEEDS_MEMORY if by_cue else UNDECIDED,)
+    return (NEEDS_MEMORY if _beats_all(counts, chance) else UNDECIDED,)
+
+
+def _beats_all(counts: Mapping[str, Counts], chance: float | None) -> bool:
+    """Whether the oracle beats every control that does not know the answer, and chance if that is known."""
+    others = [one for control, one in counts.items() if control != "oracle"]
+    oracle = counts.get("oracle")
+    if oracle is None or not others:
+        return False
+    beats_luck = beats_chance(oracle, chance) if chance is not None else "cue_blind" in counts
+    return beats_luck and all(beats(oracle, other) for other in others)
 
 
 def _beats_memoryless(counts: Counts, chance: float | None, blind: Counts | None) -> bool:

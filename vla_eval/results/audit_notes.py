@@ -19,8 +19,14 @@ ROADS: Mapping[str, str] = {
 OTHER_VERDICTS: Mapping[str, str] = {
     "needs memory": "no shortcut found",
     "not decided": "not decided by so few episodes",
+    "not audited: no scripted control": "not audited, for lack of a scripted control",
 }
-RULES: Mapping[AuditProtocol, str] = {"paper": "the paper's rule", "strict": "the strict rule"}
+RULES: Mapping[AuditProtocol, str] = {
+    "paper": "the paper's rule",
+    "strict": "the strict rule",
+    "official": "the official rule",
+}
+PAGES: Mapping[AuditProtocol, str] = {"official": "docs/audit_official.md"}
 
 
 def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
@@ -32,13 +38,14 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
     for run in runs:
         config = run.description.config
         env = config.get("env") or {}
-        protocol = protocol_of(env) if isinstance(env, Mapping) else None
-        if protocol is None or config.get("simulator") == "fake":
+        if not isinstance(env, Mapping) or config.get("simulator") == "fake":
             continue
         for task in sorted({record.task for record in run.records}):
-            audit, spec = shipped_audits().get((task, protocol)), find_task(task)
-            if audit is not None and spec is not None and audit.version == spec.version:
-                found.setdefault(protocol, {})[task] = audit
+            spec = find_task(task)
+            protocol = protocol_of(env, is_official=spec is not None and spec.suite != "paper")
+            audit = None if protocol is None else shipped_audits().get((task, protocol))
+            if spec is not None and audit is not None and audit.version == spec.version:
+                found.setdefault(audit.protocol, {})[task] = audit
     return [_note(protocol, found[protocol]) for protocol in RULES if protocol in found]
 
 
@@ -55,6 +62,7 @@ def _note(protocol: AuditProtocol, audits: Mapping[str, TaskAudit]) -> str:
     for words, meaning in OTHER_VERDICTS.items():
         tasks = [task for task, audit in audits.items() if words in audit.verdict]
         said += [f"{meaning}: {', '.join(tasks)}"] if tasks else []
-    n_episodes = min(audit.n_episodes for audit in audits.values())
-    under = f"audit under {RULES[protocol]}, {n_episodes} episodes per control: docs/audit.md"
+    n_episodes = min((audit.n_episodes for audit in audits.values() if audit.n_episodes), default=0)
+    page = PAGES.get(protocol, "docs/audit.md")
+    under = f"audit under {RULES[protocol]}, {n_episodes} episodes per control: {page}"
     return f"{'; '.join(said)} ({under})."

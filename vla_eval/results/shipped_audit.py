@@ -1,6 +1,7 @@
-"""The result of the shortcut audit of the shipped tasks: `shipped_audit.json`, made by a command.
+"""The shortcut audits that ship, of this package's tasks and of the official ones, each made by a command.
 
     mikasa-vla audit --format json > vla_eval/results/shipped_audit.json
+    mikasa-vla audit --suite mikasa_vla_90 --format json > vla_eval/results/official_audit.json
 
 Imports neither statistics nor simulators, so that a report can quote it.
 """
@@ -24,6 +25,8 @@ PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": 
 """Name of a set of rules -> arguments of the tasks. The official package's tasks have one set, their own."""
 
 FILE = Path(__file__).with_suffix(".json")
+OFFICIAL_FILE = FILE.with_name("official_audit.json")
+OFFICIAL_ARGUMENTS = {"mug"}  # that change nothing of what is audited
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,8 +66,8 @@ class TaskAudit:
 
     @property
     def n_episodes(self) -> int:
-        """How many episodes each control has, at least."""
-        return min(one.n_episodes for one in self.counts.values())
+        """How many episodes each control has, at least; 0 if none was run."""
+        return min((one.n_episodes for one in self.counts.values()), default=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,24 +82,36 @@ def shipped_audits() -> Mapping[tuple[str, AuditProtocol], TaskAudit]:
     """Return (task, protocol) -> the shipped audit of it.
 
     Raises:
-        ReportError: the file is damaged.
+        ReportError: a file is damaged.
     """
+    return {(one.task, one.protocol): one for file in (FILE, OFFICIAL_FILE) for one in _read(file)}
+
+
+def _read(file: Path) -> tuple[TaskAudit, ...]:
     source = Source(
-        where=str(FILE),
+        where=str(file),
         what="the shipped audit",
         remedy="The file was changed by another program; install mikasa-vla-eval again.",
         error=ReportError,
     )
     try:
-        rows = loads(read_file(FILE, source))
+        rows = loads(read_file(file, source))
     except ValueError as exc:
         raise source.refuse("something else", shorten(str(exc))) from exc
-    audits = as_dataclass(_Shipped, {"audits": rows}, source).audits
-    return {(one.task, one.protocol): one for one in audits}
+    return as_dataclass(_Shipped, {"audits": rows}, source).audits
 
 
-def protocol_of(env: Mapping[str, Any]) -> AuditProtocol | None:  # Any: arguments of tasks
-    """Return the rules that a run's task arguments select; None if they were not audited."""
+def protocol_of(
+    env: Mapping[str, Any], *, is_official: bool = False
+) -> AuditProtocol | None:  # Any: arguments of tasks
+    """Return the rules that a run's task arguments select; None if they were not audited.
+
+    Args:
+        env: the arguments.
+        is_official: whether they are of a task of the official package.
+    """
+    if is_official:
+        return "official" if set(env) <= OFFICIAL_ARGUMENTS else None
     if not env:
         return "paper"
     # Success is gated by phase by default, so omitting the argument is strict, too.
