@@ -27,8 +27,9 @@ STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 ACTION_PADDING_KEY = f"{ACTION_KEY}_is_pad"  # in training samples: which lie beyond the end
 REWARD_KEY, SUCCESS_KEY, DONE_KEY = "next.reward", "next.success", "next.done"
-RewardKind = Literal["dense", "sparse"]
-"""Which rewards a policy is trained on: the table's, or 1 at the first success of an episode and else 0."""
+RewardKind = Literal["dense", "sparse", "success"]
+"""Which rewards a policy is trained on: the table's, or 1 at the first success of an episode and else 0, or 1
+in every step at which the success rule holds."""
 
 StateKind = Literal["eef", "joints"]
 PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.joints"}

@@ -22,6 +22,10 @@ def test_sparse_is_one_at_each_episodes_first_success() -> None:
     assert rewards_of(COLUMNS, BOUNDS, "sparse", root=Path("d")).tolist() == [0, 0, 1, 0, 0, 1, 0]
 
 
+def test_success_is_one_wherever_the_rule_holds() -> None:
+    assert rewards_of(COLUMNS, BOUNDS, "success", root=Path("d")).tolist() == [0, 0, 1, 1, 0, 1, 0]
+
+
 def test_an_episode_without_success_has_no_sparse_reward() -> None:
     columns = {"next.success": torch.zeros(7, dtype=torch.bool)}
     assert rewards_of(columns, BOUNDS, "sparse", root=Path("d")).tolist() == [0] * 7

@@ -152,6 +152,8 @@ def describe(dataset: "RecordedDataset") -> str:
     """Return the result of one task, in one line."""
     facts = dataset.facts
     failed = ", ".join(str(one.seed) for one in dataset.failed) or "none"
+    if dataset.kept_failures:
+        failed = f"kept, {len(dataset.kept_failures)} of {facts.n_episodes} episodes"
     return (
         f"{dataset.path}: {facts.n_episodes} episodes, {facts.n_frames} frames, "
         f"{dataset.n_bytes / MEGABYTE:.1f} MB, {dataset.seconds / 60:.1f} min; failed seeds: {failed}"

@@ -69,6 +69,8 @@ class FinetuneRecipe:
             (gradient accumulation), so that the step is the same with less of the device's memory.
         save_every_steps, log_every_steps: when checkpoints and metrics are written.
         num_workers: processes that load samples, at most; no more than there are cores.
+        failed_episodes: what happens to the dataset's episodes without success; None: policies that learn
+            from rewards keep them, all others leave them out.
         decode_ahead: decode each frame once into the user's cache, instead of once per sample.
         image_transforms: augmentation, fields of lerobot's `ImageTransformsConfig` (`max_num_transforms`,
             `random_order`, `tfs`); {}: its own six; None: images as they are.
@@ -88,6 +90,7 @@ class FinetuneRecipe:
     save_every_steps: int = 5_000
     log_every_steps: int = 100
     num_workers: int = 4
+    failed_episodes: Literal["keep", "leave_out"] | None = None
     decode_ahead: bool = True
     image_transforms: dict[str, Any] | None = None  # Any: lerobot checks its own fields
     imagenet_statistics: bool = False

@@ -3,13 +3,14 @@
 The same dataset gives the same card: no date, no machine's name, everything in a fixed order.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
 from huggingface_hub import DatasetCard, DatasetCardData
 
+from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
@@ -66,7 +67,10 @@ def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> st
 
 def _title(summary: DatasetSummary) -> str:
     task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
-    return f"{markdown_cell(task or 'Imported demonstrations')}: {len(summary.lengths)} demonstrations"
+    n_episodes = len(summary.lengths)
+    all_succeed = summary.n_success in (None, n_episodes)
+    what = "demonstrations" if all_succeed else f"episodes, {summary.n_success} with success"
+    return f"{markdown_cell(task or 'Imported demonstrations')}: {n_episodes} {what}"
 
 
 def _introduction(summary: DatasetSummary) -> str:
@@ -94,7 +98,11 @@ def _statistics(summary: DatasetSummary) -> str:
         experts = sorted({f"{one.expert}, version {one.expert_version}" for one in summary.episodes})
         rows += [
             ("seeds", f"{min(seeds)} to {max(seeds)}"),
-            ("seeds left out because the expert failed", _failed(summary)),
+            ("seeds left out because the expert failed", _listed([one.seed for one in summary.failed])),
+            (
+                "seeds kept although the expert failed",
+                _listed([one.seed for one in summary.episodes if one.success_step is None]),
+            ),
             ("expert", markdown_cell("; ".join(experts))),
         ]
     action = summary.action
@@ -112,9 +120,8 @@ def _statistics(summary: DatasetSummary) -> str:
     )
 
 
-def _failed(summary: DatasetSummary) -> str:
-    seeds = [str(one.seed) for one in summary.failed]
-    shown = ", ".join(seeds[:MAX_SEEDS_SHOWN])
+def _listed(seeds: Sequence[int]) -> str:
+    shown = ", ".join(map(str, seeds[:MAX_SEEDS_SHOWN]))
     more = f" and {len(seeds) - MAX_SEEDS_SHOWN} more" if len(seeds) > MAX_SEEDS_SHOWN else ""
     return f"{len(seeds)}: {shown}{more}" if seeds else "none"
 
@@ -188,11 +195,11 @@ def _differences(summary: DatasetSummary) -> str:
         "- The simulation is a new implementation of the tasks, not the authors' code "
         "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
         _expert_difference(facts, summary),
-        f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper's recorder kept "
-        f"every episode of its batch, whether it succeeded or not.",
+        f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper says that all of "
+        f"its episodes succeed, and its recorder kept every episode, whether it succeeded or not.",
         f"- Cut: {_cut(facts)}; the paper's recorder recorded to the horizon.",
-        "- Actions are end-effector deltas as they were executed; the paper's recordings for reinforcement "
-        "learning hold joint deltas.",
+        f"- Actions are for {markdown_code(facts.control_mode)}, {_stored(facts)}; the paper's recordings "
+        f"for reinforcement learning are for {markdown_code(JOINT_DELTA_POS)}.",
         "- Images are video (lossy); the paper's are arrays of pixels.",
     ]
     render = facts.recipe.get("render")
@@ -214,6 +221,12 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
             f"normalise with care, and expect imitation to be easier than with the paper's data."
         )
     return text
+
+
+def _stored(facts: DatasetFacts) -> str:
+    if facts.recipe.get("stored_action") == "intended":
+        return "as the expert asked for them, before noise was added"
+    return "as they were executed"
 
 
 def _cut(facts: DatasetFacts) -> str:

@@ -142,8 +142,8 @@ def _copied(
         )
         for episode, one in zip(episodes, kept, strict=True)
     ]
-    facts = copy_with_actions(dataset, path, changed, recipe)
-    return RecordedDataset(path=path, facts=facts, failed=read_failed(path), seconds=time.monotonic() - begun)
+    copy_with_actions(dataset, path, changed, recipe)
+    return RecordedDataset.read(path, seconds=time.monotonic() - begun)
 
 
 def _seed(one: Attempt) -> int:

@@ -25,6 +25,7 @@ from vla_eval.core import ImageArray
 from vla_eval.errors import DatasetError, StorageFullError
 
 FORMAT_VERSION = 1  # raised when the files' layout changes: old ones are then not found any more
+FRAMES_FOLDER = "frames"  # in the user's cache
 DIGEST_DIGITS = 24
 MIB = 1024**2
 # Beyond the frames: file headers, and what a file system keeps for itself.

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, Self
 
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe
 from vla_eval.config.files import content_of, options_of
 from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed
+from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed, read_manifest
 from vla_eval.data.recording_folder import RecordingFolder
 from vla_eval.data.recording_jobs import (
     AttemptJob,
@@ -88,7 +88,19 @@ class RecordedDataset:
     path: Path
     facts: DatasetFacts
     failed: tuple[FailedSeed, ...]
+    kept_failures: tuple[int, ...]  # seeds of the episodes without success
     seconds: float  # of this call
+
+    @classmethod
+    def read(cls, path: Path, *, seconds: float) -> Self:
+        """Return what is known of the dataset in a folder."""
+        return cls(
+            path=path,
+            facts=read_facts(path),
+            failed=read_failed(path),
+            kept_failures=tuple(one.seed for one in read_manifest(path) if one.success_step is None),
+            seconds=seconds,
+        )
 
     @property
     def n_bytes(self) -> int:
@@ -258,12 +270,7 @@ class _Recorder:
             self._render(shards)
             self._join(task, selection, shards)
         self.folder.remove_shards(task.task)  # also what a killed session has left
-        return RecordedDataset(
-            path=path,
-            facts=read_facts(path),
-            failed=read_failed(path),
-            seconds=time.monotonic() - begun,
-        )
+        return RecordedDataset.read(path, seconds=time.monotonic() - begun)
 
     def record_part(self, task: TaskPlan, part: Shard) -> RecordedPart:
         """Try all seeds, since each decides on the others, and render the part's share of the episodes."""

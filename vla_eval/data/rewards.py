@@ -17,20 +17,21 @@ def rewards_of(columns: Mapping[str, Any], bounds: Tensor, kind: RewardKind, *, 
         columns: field -> (N, …).
         bounds: (N, 2) first and stop row of each row's episode.
         kind: `dense`: the table's; `sparse`: 1 where the success rule holds for the first time in the
-            episode, else 0, so that the sum over an episode is whether it succeeded once.
+            episode, else 0, so that the sum over an episode is whether it succeeded once; `success`: 1
+            wherever it holds.
         root: the dataset's folder, for messages.
 
     Raises:
         DatasetError: the dataset does not say what its rewards or successes are.
     """
-    key = SUCCESS_KEY if kind == "sparse" else REWARD_KEY
+    key = REWARD_KEY if kind == "dense" else SUCCESS_KEY
     if key not in columns:
         raise DatasetError(
             f"{root}: has no field '{key}', which `reward: {kind}` is read from. Use a dataset with rewards "
             "(`mikasa-vla record` stores them), or a policy that reads none."
         )
     values: Tensor = columns[key].reshape(-1).float()
-    if kind == "dense":
+    if kind != "sparse":
         return values
     n_so_far = values.cumsum(0)
     n_before_episode = n_so_far[bounds[:, 0]] - values[bounds[:, 0]]

@@ -6,16 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
+import numpy as np
+
 from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.dataset_folder import open_recorded
+from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import FileDigest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError, some_of
-from vla_eval.features import CAMERA_KEYS
+from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +33,9 @@ class TrainingDataset:
         state, control_mode: see `TrainingFacts`.
         was_replayed: whether a replay has confirmed it.
         meta: lerobot's description of it.
+        failed: numbers of the episodes in which the success rule never held; empty, too, if that is not
+            stored.
+        left_out: numbers of the episodes that are not trained on.
     """
 
     root: Path
@@ -40,6 +46,22 @@ class TrainingDataset:
     control_mode: str
     was_replayed: bool
     meta: Any
+    failed: tuple[int, ...] = ()
+    left_out: tuple[int, ...] = ()
+
+    @property
+    def episodes(self) -> list[int] | None:
+        """Numbers of the episodes that are trained on; None: all."""
+        left_out = set(self.left_out)
+        return [i for i in range(self.meta.total_episodes) if i not in left_out] if left_out else None
+
+    @property
+    def lengths(self) -> list[int]:
+        """The number of frames of each episode that is trained on."""
+        rows = self.meta.episodes
+        ends = list(zip(rows["dataset_from_index"], rows["dataset_to_index"], strict=True))
+        chosen = range(len(ends)) if self.episodes is None else self.episodes
+        return [int(ends[i][1]) - int(ends[i][0]) for i in chosen]
 
 
 def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
@@ -82,7 +104,14 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
         control_mode=facts.control_mode,
         was_replayed=report is not None,
         meta=opened.meta,
+        failed=_failed(root) if SUCCESS_KEY in opened.meta.features else (),
     )
+
+
+def _failed(root: Path) -> tuple[int, ...]:
+    columns = read_columns(root)
+    numbers, success = columns["episode_index"], columns[SUCCESS_KEY].astype(bool)
+    return tuple(int(number) for number in np.setdiff1d(numbers, numbers[success]))
 
 
 def _one_dataset(root: Path) -> Path:

@@ -18,6 +18,7 @@ from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
+from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.job import default_out, load_finetune_recipe
 from vla_eval.training.lora import check_lora_targets
 from vla_eval.training.policy_config import policy_config, used_frames
@@ -105,7 +106,9 @@ def _estimate(
     device = "cuda" if is_named else choose_device(config.device)
     missing, dataset = [], None
     if Path(config.dataset).is_dir():
-        dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+        dataset = chosen_episodes(
+            training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed), recipe
+        )
     else:
         missing.append(f"the dataset {config.dataset}; its fields are taken to be those of recordings")
     base = recipe.base_checkpoint

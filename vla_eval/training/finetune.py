@@ -15,6 +15,7 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.estimate import RateWatch, estimate
+from vla_eval.training.failures import about_failures
 from vla_eval.training.held_out import HeldOut, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
@@ -70,6 +71,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
         f"dataset: {dataset.name} {dataset.sha256[:12]}, {frames.n_used} of {frames.n_frames} frames as "
         "starts"
     )
+    if dataset.failed:
+        say(about_failures(dataset))
     warning = shared_seeds_warning(dataset)
     if warning is not None:
         say(warning)
@@ -137,10 +140,12 @@ def _is_first_process() -> bool:
 def _open(job: TrainingJob, command: str) -> Path | None:
     section = to_data(job.recipe)
     del section["trackio_project"]  # may be changed when a run is resumed
+    del section["failed_episodes"]  # what comes of it stands below
+    chosen = {"episodes_left_out": list(job.dataset.left_out)} if job.dataset.left_out else {}
     base = job.recipe.base_checkpoint
     settings: dict[str, Any] = {  # Any: plain data
         "finetune": section,
-        "dataset": {"name": job.dataset.name, "sha256": job.dataset.sha256},
+        "dataset": {"name": job.dataset.name, "sha256": job.dataset.sha256, **chosen},
         "run_seed": job.run_seed,
         "base_sha256": checkpoint_sha256(Path(base)) if base else None,
     }

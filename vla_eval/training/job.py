@@ -21,6 +21,7 @@ from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.training.dataset import TrainingDataset, training_dataset
+from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.held_out import check_held_out
 from vla_eval.training.lora import check_lora_targets, peft_config
 from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
@@ -107,7 +108,9 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
     """
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
-    dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
+    dataset = chosen_episodes(
+        training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed), recipe
+    )
     held_out = config.held_out
     task = None if held_out is None else check_held_out(held_out, recipe, dataset)
     device = choose_device(config.device)
@@ -171,6 +174,7 @@ def lerobot_config(job: TrainingJob) -> Any:
         dataset=DatasetConfig(
             repo_id=f"local/{dataset.name}",
             root=str(dataset.root),
+            episodes=dataset.episodes,
             use_imagenet_stats=recipe.imagenet_statistics,
             image_transforms=image_transforms(recipe),
             video_backend=video_decoder(),

@@ -68,7 +68,9 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         _set_window(config, dataset)
     _check_features(config, dataset)
     if hasattr(config, "fit_to_actions"):
-        actions = torch.from_numpy(read_columns(dataset.root)[ACTION_KEY].astype(np.float32))
+        columns = read_columns(dataset.root)
+        chosen = ~np.isin(columns["episode_index"], dataset.left_out)
+        actions = torch.from_numpy(columns[ACTION_KEY][chosen].astype(np.float32))
         config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
@@ -104,7 +106,7 @@ def _check_features(config: Any, dataset: TrainingDataset) -> None:
 
 def _set_window(config: Any, dataset: TrainingDataset) -> None:
     """Let the history of a policy with a memory reach back to the beginning of every episode."""
-    longest = max(_lengths(dataset))
+    longest = max(dataset.lengths)
     if config.window_steps is None:
         config.window_steps = longest
     if config.window_steps < longest:
@@ -113,13 +115,6 @@ def _set_window(config: Any, dataset: TrainingDataset) -> None:
             f"longest episode of {dataset.name}, {longest} frames: a memory must begin where the episode "
             f"does. Leave the field out."
         )
-
-
-def _lengths(dataset: TrainingDataset) -> list[int]:
-    """Return the number of frames of each episode."""
-    ends = dataset.meta.episodes
-    pairs = zip(ends["dataset_from_index"], ends["dataset_to_index"], strict=True)
-    return [int(end) - int(begin) for begin, end in pairs]
 
 
 def masks_padding(config: Any) -> bool:
@@ -145,7 +140,7 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
         SpecMismatchError: none, since chunks are longer than the episodes.
     """
     dropped = getattr(config, "drop_n_last_frames", 0)
-    lengths = _lengths(dataset)
+    lengths = dataset.lengths
     used = UsedFrames(sum(max(0, length - dropped) for length in lengths), sum(lengths))
     if used.n_used == 0:
         raise SpecMismatchError(
