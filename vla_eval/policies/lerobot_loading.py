@@ -25,6 +25,7 @@ from torch import Tensor
 
 import vla_eval.policies.memory.configuration_memory  # importing it registers
 import vla_eval.policies.octo.configuration_octo
+import vla_eval.policies.offline_rl.configuration_offline_rl
 import vla_eval.policies.openvla.configuration_openvla
 import vla_eval.policies.sequence.configuration_sequence
 import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above

@@ -27,7 +27,7 @@ TINY_RECIPES = {
 }
 """Type of a policy -> recipe of its tiny form."""
 TINY_UNET: dict[str, Any] = {"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}
-SMALL = ("act", "diffusion", "mikasa_memory", "mikasa_sequence")
+SMALL = ("act", "diffusion", "mikasa_memory", "mikasa_offline_rl", "mikasa_sequence")
 """Types whose own recipes are small enough; the U-Net of a diffusion policy is not."""
 TINY_PI0_ADAPTER = "vla_eval.testing.tiny_models:make_tiny_pi0"
 N_EPISODES = 2

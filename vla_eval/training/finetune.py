@@ -140,7 +140,7 @@ def _is_first_process() -> bool:
 def _open(job: TrainingJob, command: str) -> Path | None:
     section = to_data(job.recipe)
     del section["trackio_project"]  # may be changed when a run is resumed
-    del section["failed_episodes"]  # what comes of it stands below
+    del section["failed_episodes"]  # its outcome is recorded below
     chosen = {"episodes_left_out": list(job.dataset.left_out)} if job.dataset.left_out else {}
     base = job.recipe.base_checkpoint
     settings: dict[str, Any] = {  # Any: plain data

@@ -1,4 +1,4 @@
-"""Plain encoders of one camera's images: the one of the paper's baselines, and keypoints."""
+"""Plain encoders of images: the one of the paper's baselines, and keypoints."""
 
 import torch
 from torch import Tensor, nn
@@ -13,19 +13,20 @@ class Nature(nn.Sequential):
     """The encoder of the paper's sequence baselines: three convolutions, a linear layer, tanh.
 
     Sizes: Mnih et al. 2015, as in https://github.com/CognitiveAISystems/RATE (commit 5aa88f0, image encoder
-    of the MIKASA-Robo configurations), but for one camera instead of both as six channels.
+    of the MIKASA-Robo configurations), which has both cameras as six channels.
 
     Args:
         image_px: height and width of an image.
         outputs: numbers that are returned.
+        channels: of an image.
     """
 
-    def __init__(self, *, image_px: int, outputs: int) -> None:
+    def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
         edge = image_px
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):
             edge = (edge - kernel) // stride + 1
         super().__init__(
-            nn.Conv2d(RGB, 32, 8, stride=4),
+            nn.Conv2d(channels, 32, 8, stride=4),
             nn.ReLU(),
             nn.Conv2d(32, 64, 4, stride=2),
             nn.ReLU(),

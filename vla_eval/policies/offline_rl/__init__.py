@@ -1,0 +1,1 @@
+"""Policies that learn from rewards of recorded episodes: conservative and implicit Q-learning."""
