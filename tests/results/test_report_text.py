@@ -53,6 +53,14 @@ def test_the_table_fits_a_terminal_of_100_columns_with_success_third_at_most(n_t
     assert "vs cue_blind" in titles and "vs random" in titles
 
 
+def test_a_narrower_terminal_gets_fewer_columns() -> None:
+    text = render(demo_like(3), "markdown", width=80)
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert max(map(len, lines)) <= 80
+    assert "success once" in lines[0] and "vs random" not in lines[0]
+    assert "not shown: vs random" in text
+
+
 def test_what_is_the_same_in_all_rows_is_said_above_and_what_has_no_room_below() -> None:
     text = render(demo_like(2), "markdown")
     assert text.splitlines()[0] == "All rows: K 1, chance 0.35, ceiling 1.00, episodes 20, errors 0."

@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
     from vla_eval.cli.evaluations import evaluate_each
-    from vla_eval.cli.output import print_shard
+    from vla_eval.cli.output import print_in, print_shard
 
     configs = _configs(args)
     out = shard_folder(args.out, args.shard)
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     if args.shard is not None:
         print_shard(out, args.out, args.shard)
     else:
-        print(render_audit(read_audit(configs, args.out), args.format))
+        print_in(args.format, render_audit(read_audit(configs, args.out), args.format))
     return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.cli.screen import print_markdown, screen_width
 from vla_eval.errors import unknown_name
 from vla_eval.storage.shard import Shard
 
@@ -60,11 +61,20 @@ def print_table(
         columns=columns,
         wide=args.wide,
         preset=args.preset,
+        width=screen_width(),
     )
-    print(text)
+    print_in(args.format, text)
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
+
+
+def print_in(fmt: str, text: str) -> None:
+    """Print what was written in a format; only Markdown is wrapped to a terminal."""
+    if fmt == "markdown":
+        print_markdown(text)
+    else:
+        print(text)
 
 
 def check_table_arguments(args: argparse.Namespace) -> None:

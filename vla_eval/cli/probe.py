@@ -15,7 +15,7 @@ from vla_eval.cli.arguments import (
     workers_argument,
 )
 from vla_eval.cli.cluster import add_cluster
-from vla_eval.cli.output import FORMATS
+from vla_eval.cli.output import FORMATS, print_in
 from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
 from vla_eval.cli.probe_runs import run_all
 from vla_eval.config.decoding import decode
@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
     table = read_probe(probe.worlds, args.out)
     for path in write_retention(table, args.out):
         print(f"retention curve: {path}", file=sys.stderr)
-    print(render_probe(table, args.format))
+    print_in(args.format, render_probe(table, args.format))
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
 
 

@@ -5,6 +5,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS
+from vla_eval.cli.output import print_in
 from vla_eval.cli.probe_runs import run_all
 from vla_eval.config.evaluation import EvalConfig
 
@@ -50,7 +51,7 @@ def run_grid(args: argparse.Namespace, config: EvalConfig, settings: "GridSettin
     if stopped is not None:
         return stopped
     table = read_grid(grid.worlds, args.out)
-    print(render_grid(table, args.format))
+    print_in(args.format, render_grid(table, args.format))
     sys.stdout.flush()  # the table first, wherever the two go
     for path in write_heat_maps(table, args.out):
         print(f"Heat map: {path}", file=sys.stderr)

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import add_verb
-from vla_eval.cli.output import add_table_arguments, print_table
+from vla_eval.cli.output import add_table_arguments, print_in, print_table
+from vla_eval.cli.screen import print_markdown
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     print_table(runs, args, columns=args.columns)
     if args.format == "markdown":
         for text in probe_texts(runs):
-            print(f"\n{text}")
+            print_markdown(f"\n{text}")
     return 0
 
 
@@ -111,7 +112,7 @@ def _print_published(args: argparse.Namespace) -> int:
 
     if args.published is None or args.html is not None or args.filmstrip is not None:
         raise ReportError("Name at least one RUN, a run folder, or --published alone.")
-    print(render_published(args.published, args.format))
+    print_in(args.format, render_published(args.published, args.format))
     return 0
 
 

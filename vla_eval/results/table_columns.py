@@ -49,7 +49,9 @@ class Layout(NamedTuple):
     left_out: tuple[str, ...] = ()
 
 
-def lay_out(table: Table, *, names: Sequence[str] = (), wide: bool = False) -> Layout:
+def lay_out(
+    table: Table, *, names: Sequence[str] = (), wide: bool = False, width: int | None = None
+) -> Layout:
     """Choose the columns for reading.
 
     Args:
@@ -57,6 +59,8 @@ def lay_out(table: Table, *, names: Sequence[str] = (), wide: bool = False) -> L
         names: exactly these columns, in this order.
         wide: all but the extra columns, however wide the table becomes and whatever is constant, and a row
             for each of several runs.
+        width: characters that the columns have to fit into, if neither of the two is given; None:
+            `FITS_CHARACTERS`.
 
     Raises:
         UnknownNameError: there is no such column.
@@ -69,7 +73,8 @@ def lay_out(table: Table, *, names: Sequence[str] = (), wide: bool = False) -> L
     if wide:
         return _layout(table, shown, rows=table.with_runs())
     same = [column for column in shown if column.folds and len(set(_cells(column, table))) == 1]
-    fitting, left_out = _fit([column for column in shown if column not in same], table)
+    varying = [column for column in shown if column not in same]
+    fitting, left_out = _fit(varying, table, width=width or FITS_CHARACTERS)
     found = tuple((column.title, column.cell(table.rows[0])) for column in same)
     return _layout(table, fitting)._replace(same=found, left_out=tuple(one.title for one in left_out))
 
@@ -84,15 +89,15 @@ def _layout(table: Table, columns: Sequence[Column], *, rows: Sequence[Row] | No
     return Layout(tuple(columns), tuple(tuple(one.cell(row) for one in columns) for row in shown))
 
 
-def _fit(columns: Sequence[Column], table: Table) -> tuple[list[Column], list[Column]]:
+def _fit(columns: Sequence[Column], table: Table, *, width: int) -> tuple[list[Column], list[Column]]:
     """Return the columns that fit side by side, the most important ones first chosen, and the others."""
-    left = FITS_CHARACTERS - 1
+    left = width - 1
     kept: set[str] = set()
     for column in sorted(columns, key=lambda one: one.rank):
-        width = max(2, len(column.title), *map(len, _cells(column, table))) + CELL_FRAME
-        if not column.rank or width <= left:
+        own = max(2, len(column.title), *map(len, _cells(column, table))) + CELL_FRAME
+        if not column.rank or own <= left:
             kept.add(column.name)
-            left -= width
+            left -= own
     return [one for one in columns if one.name in kept], [one for one in columns if one.name not in kept]
 
 

@@ -36,6 +36,7 @@ def render(
     columns: Sequence[str] = (),
     wide: bool = False,
     preset: Preset | None = None,
+    width: int | None = None,
 ) -> str:
     """Write the table.
 
@@ -48,6 +49,7 @@ def render(
         columns: names of the columns in the formats for reading, in this order; none: those that fit.
         wide: all columns in the formats for reading, however wide the table becomes, and a row per run.
         preset: `paper`: LaTeX with tasks as columns and policies as rows.
+        width: characters that the chosen columns have to fit into; None: `FITS_CHARACTERS`.
 
     Returns:
         The text, without a newline at its end.
@@ -64,7 +66,7 @@ def render(
         return _csv(table, sides)
     if fmt == "json":
         return _json(table, sides)
-    layout = lay_out(table, names=columns, wide=wide)
+    layout = lay_out(table, names=columns, wide=wide, width=width)
     return {"markdown": _markdown, "latex": _latex, "html-table": _html}[fmt](table, layout, sides)
 
 
