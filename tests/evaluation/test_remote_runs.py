@@ -89,6 +89,38 @@ def test_servers_of_different_policies_are_not_one_policy(bench: Bench) -> None:
         evaluate(bench, "out", f"{first},{second}")
 
 
+def test_planning_asks_a_server_once(bench: Bench) -> None:
+    bench.write_policy("remote", url="ws://127.0.0.1:9", chunk_size=STEPS)
+    task = ["--task", "RememberColor3-v0", "--set", "simulator=fake"]
+    for recipe in ("", f"{bench.folder / 'night.yaml'}@"):
+        server = SmallServer()
+        with serving(server) as url:
+            assert main(["eval", *task, "--policy", f"{recipe}{url}", "--dry-run"]) == 0
+            assert server.n_connections == 1
+            make_plan(bench.config(policies=[f"{recipe}{url}"]))
+            assert server.n_connections == 2
+
+
+def test_a_run_with_a_baseline_asks_a_server_once_before_its_worker_does(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server = SmallServer()
+    with serving(server) as url:
+        name = f"small@{url.removeprefix('ws://').replace(':', '-')}"
+        common = ["eval", "--task", "RememberColor3-v0", "--policy", url, "hold", "--episodes", "1"]
+        fake = ["--workers", "1", "--set", "simulator=fake", "--out", str(bench.folder / "out")]
+        assert main([*common, *fake, "--baseline", name]) == 0
+        assert server.n_connections == 2  # of the plan, and of the only worker
+        assert main([*common, *fake, "--baseline", "smal"]) == 1
+    assert f"Known: hold, {name}" in capsys.readouterr().err
+
+
+def test_checkpoints_of_one_policy_are_no_servers(bench: Bench) -> None:
+    bench.write_policy("remote", url="ws://127.0.0.1:9")
+    with pytest.raises(RecipeError, match=r"found .*night\.yaml\. Give a policy server"):
+        make_plan(bench.config(policies=[f"both={bench.folder / 'night.yaml'},random"]))
+
+
 def test_without_a_server_the_command_says_so_once_and_leaves_no_folder(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:

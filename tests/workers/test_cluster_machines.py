@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
 from vla_eval.evaluation.needed import needed_files
+from vla_eval.policies.run_seeds import load_policy_entries
 from vla_eval.workers import parcel as parcel_module
 from vla_eval.workers.cluster import connect, machines
 from vla_eval.workers.cluster.connect import check_address
@@ -130,13 +130,11 @@ class TestParcels:
         (folder / "model.safetensors").write_bytes(b"0" * 100)
         recipe = {"version": 1, "description": "d", "adapter": "lerobot", "default_n_action_steps": 4}
         (tmp_path / "own.yaml").write_text(json.dumps({**recipe, "args": {"checkpoint": str(folder)}}))
-        config = EvalConfig(
-            name="x", tasks=("RememberColor3-v0",), policies=(str(tmp_path / "own.yaml"), "memory_color3")
-        )
+        policies = load_policy_entries((str(tmp_path / "own.yaml"), "memory_color3"))
 
-        assert [need.folders for need in needed_files(config)] == [(str(folder),), ()]
+        assert [need.folders for need in needed_files(policies)] == [(str(folder),), ()]
         monkeypatch.setattr(parcel_module, "MAX_PARCEL_BYTES", 100)
-        assert [need.folders for need in needed_files(config)] == [(), ()]
+        assert [need.folders for need in needed_files(policies)] == [(), ()]
 
 
 class StandIn:

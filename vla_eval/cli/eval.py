@@ -27,7 +27,6 @@ from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.grid import is_model_table
-from vla_eval.policies.recipe import policy_name
 from vla_eval.storage.shard import shard_folder
 from vla_eval.workers.needed import Needed
 
@@ -149,6 +148,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluation.evaluate import RUNS_FOLDER, default_run_folder
     from vla_eval.evaluation.inference_choice import with_inference
     from vla_eval.evaluation.needed import needed_files
+    from vla_eval.policies.run_seeds import load_policy_entries
     from vla_eval.storage.run_folder import read_run
 
     if args.config is not None and is_model_table(args.config):
@@ -161,17 +161,17 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         return _dry_run(config, args)
     check_table_arguments(args)
-    if args.baseline is not None:  # a policy behind a socket is asked for its name
-        check_baseline(args.baseline, [policy_name(policy) for policy in config.policies])
+    policies = load_policy_entries(config.policies)
+    check_baseline(args.baseline, [policy.name for policy in policies])
 
     def needs() -> tuple[Needed, ...]:
         captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.is_on else ()
-        return (*needed_files(config), *captured)
+        return (*needed_files(policies), *captured)
 
     with backend_of(args, needs=needs) as backend, stop_on_signals() as stop:
-        config = with_inference(config, backend)
+        config = with_inference(config, policies, backend)
         out = shard_folder(args.out or default_run_folder(config), args.shard)
-        summary = evaluate_one(config, out, args, stop=stop, backend=backend)
+        summary = evaluate_one(config, out, args, stop=stop, backend=backend, policies=policies)
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
         print(

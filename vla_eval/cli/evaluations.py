@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ from vla_eval.cli import progress
 from vla_eval.cli.arguments import typed_command
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary
+from vla_eval.policies.run_seeds import PolicyEntry
 from vla_eval.workers.backend import Backend
 
 
@@ -32,8 +33,11 @@ def evaluate_one(
     *,
     stop: progress.StopRequest,
     backend: Backend,
+    policies: Sequence[PolicyEntry] | None = None,
 ) -> EvaluationSummary:
     """Run or resume an evaluation as the command line asks, with progress; arguments as for `evaluate_each`.
+
+    `policies`: see `evaluate`.
 
     Raises:
         VlaEvalError: see `evaluate`.
@@ -47,6 +51,7 @@ def evaluate_one(
         shard=args.shard,
         backend=backend,
         json_progress=args.json_progress,
+        policies=policies,
     )
 
 

@@ -36,5 +36,7 @@ def run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | No
 
 def _needed(configs: Sequence[EvalConfig]) -> tuple[Needed, ...]:
     from vla_eval.evaluation.needed import needed_files
+    from vla_eval.policies.run_seeds import load_policy_entries
 
-    return tuple(dict.fromkeys(need for config in configs for need in needed_files(config)))
+    policies = dict.fromkeys(policy for config in configs for policy in config.policies)
+    return needed_files(load_policy_entries(tuple(policies)))

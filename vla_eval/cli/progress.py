@@ -1,7 +1,7 @@
 """Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
 
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
+from vla_eval.policies.run_seeds import PolicyEntry
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.shard import Shard
 from vla_eval.workers.backend import Backend
@@ -72,10 +73,11 @@ def evaluate_with_progress(
     shard: Shard | None = None,
     backend: Backend = LOCAL,
     json_progress: int | None = None,
+    policies: Sequence[PolicyEntry] | None = None,
 ) -> EvaluationSummary:
     """Run an evaluation with progress on standard error, and end early if asked to stop.
 
-    `json_progress` is the file descriptor of lines for other programs.
+    `json_progress` is the file descriptor of lines for other programs; `policies`: see `evaluate`.
 
     Raises:
         VlaEvalError: see `evaluate`.
@@ -90,6 +92,7 @@ def evaluate_with_progress(
             observer=progress,
             shard=shard,
             backend=backend,
+            policies=policies,
         )
     finally:
         progress.close()

@@ -1,16 +1,18 @@
 """`eval --dry-run`: what would run, and what it takes. Starts no worker and writes nothing."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import default_run_folder, worker_count
+from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import JobQueue
 from vla_eval.evaluation.plan import EpisodeJob, Plan
 from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies.checkpoint import find_checkpoint, weights_file
+from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
 from vla_eval.records import EpisodeKey
 from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import read_run
@@ -73,17 +75,27 @@ def describe_evaluation(
     Raises:
         VlaEvalError: a mistake in the configuration, a recipe or a checkpoint; a folder of another run.
     """
+    policies = load_policy_entries(config.policies)
+    config = with_inference(config, policies)
     path = shard_folder(out or default_run_folder(config), shard)
-    return list(_lines(config, path, evaluation_effort(config, out=path, shard=shard), rates))
+    effort = evaluation_effort(config, out=path, shard=shard, policies=policies)
+    return list(_lines(config, path, effort, rates))
 
 
-def evaluation_effort(config: EvalConfig, *, out: Path, shard: Shard | None = None) -> EvaluationEffort:
-    """Return what is left to run.
+def evaluation_effort(
+    config: EvalConfig,
+    *,
+    out: Path,
+    shard: Shard | None = None,
+    policies: Sequence[PolicyEntry] | None = None,
+) -> EvaluationEffort:
+    """Return what is left to run; `policies`: see `make_plan`.
 
     Raises:
         VlaEvalError: see `describe_evaluation`.
     """
-    plan = plan_shard(config, shard)
+    policies = load_policy_entries(config.policies) if policies is None else policies
+    plan = plan_shard(config, shard, policies)
     finished = _finished(out)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)

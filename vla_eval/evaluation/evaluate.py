@@ -8,7 +8,7 @@ means, the same call resumes where it stopped.
 import functools
 import logging
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +31,7 @@ from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.evaluation.worker import Finished, worker_main
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
@@ -126,6 +127,7 @@ def evaluate(
     observer: EvaluationObserver | None = None,
     backend: Backend = LOCAL,
     shard: Shard | None = None,
+    policies: Sequence[PolicyEntry] | None = None,
 ) -> EvaluationSummary:
     """Run all episodes of a configuration that have no result yet.
 
@@ -137,14 +139,16 @@ def evaluate(
         observer: gets the progress.
         backend: where the workers run.
         shard: run only this part of the episodes.
+        policies: those of the configuration; None: they are read, and policy servers asked.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
-    config = with_inference(config, backend)
+    policies = load_policy_entries(config.policies) if policies is None else policies
+    config = with_inference(config, policies, backend)
     observer, path = observer or _Silence(), out or shard_folder(default_run_folder(config), shard)
-    plan = plan_shard(config, shard)
+    plan = plan_shard(config, shard, policies)
     with RunFolder.open(
         path,
         _describe(config, plan, command),

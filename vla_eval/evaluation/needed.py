@@ -3,37 +3,32 @@
 Recipes, prompts and settings travel with the episodes; small checkpoints are sent where they are missing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
-from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.shipped import search_folders
 from vla_eval.policies.checkpoint import SHIPPED_FOLDER, adapter_bases, checkpoint_sha256, find_checkpoint
 from vla_eval.policies.checkpoint_notes import LEROBOT_CHECKPOINTS
-from vla_eval.policies.run_seeds import load_policy_entry
-from vla_eval.wire.addresses import named_server
+from vla_eval.policies.run_seeds import PolicyEntry
 from vla_eval.workers.needed import Needed
 from vla_eval.workers.parcel import fits
 
 CHECKPOINT_ARGS = ("checkpoint", "base_checkpoint")
 
 
-def needed_files(config: EvalConfig) -> tuple[Needed, ...]:
+def needed_files(policies: Sequence[PolicyEntry]) -> tuple[Needed, ...]:
     """Return the checkpoints that the policies of an evaluation load.
 
     Raises:
-        UnknownNameError, RecipeError: a policy's recipe cannot be read.
         CheckpointError: a checkpoint is not here.
     """
-    return tuple(dict.fromkeys(_checkpoints(config)))
+    return tuple(dict.fromkeys(_checkpoints(policies)))
 
 
-def _checkpoints(config: EvalConfig) -> Iterator[Needed]:
-    for name in config.policies:
-        if named_server(name) is not None:
-            continue
-        recipes = [recipe.value for recipe in load_policy_entry(name).recipes]
+def _checkpoints(policies: Sequence[PolicyEntry]) -> Iterator[Needed]:
+    for policy in policies:
+        recipes = [recipe.value for recipe in policy.recipes]
         own = [recipe for recipe in recipes if recipe.adapter in LEROBOT_CHECKPOINTS]
         for recipe, arg in product(own, CHECKPOINT_ARGS):
             path = recipe.args.get(arg)

@@ -4,7 +4,7 @@ Every mistake in a configuration that can be found without starting a simulator 
 first episode. Knows nothing of processes or files of results.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -26,9 +26,7 @@ from vla_eval.evaluation.inference_choice import (
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.policies.registry import check_adapter
-from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.policies.remote.survey import survey
-from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entry
+from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.storage.shard import Shard
@@ -142,8 +140,12 @@ class Plan:
     shard: Shard | None = None
 
 
-def make_plan(config: EvalConfig) -> Plan:
+def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None) -> Plan:
     """Plan the episodes of a configuration.
+
+    Args:
+        config: the configuration.
+        policies: those of the configuration; None: they are read, and policy servers asked.
 
     Raises:
         UnknownNameError: a task, policy, adapter or prompt set does not exist.
@@ -156,16 +158,12 @@ def make_plan(config: EvalConfig) -> Plan:
     """
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
-    policies = [load_policy_entry(text) for text in config.policies]
+    policies = load_policy_entries(config.policies) if policies is None else policies
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
     _check_runs(config, policies)
     prompts = load_prompts(config.prompt_set)
-    servers = {
-        policy.name: survey(policy.value.args, policy=policy.name)
-        for policy in policies
-        if policy.value.adapter == REMOTE_ADAPTER
-    }
+    servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = _shared(config, policies)
     found = _groups_of_all(config, tasks, policies, prompts=prompts, servers=servers, shared=shared)
     if not found.groups:
@@ -174,7 +172,7 @@ def make_plan(config: EvalConfig) -> Plan:
     return Plan(
         jobs=tuple(job for group in found.groups for job in _jobs(config, group)),
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
-        normalization=_normalization(policies),
+        normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
@@ -230,12 +228,16 @@ def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:
             )
 
 
-def _normalization(policies: Sequence[PolicyEntry]) -> dict[str, Mapping[str, Any]]:  # Any: plain data
+def _noted[T](
+    policies: Sequence[PolicyEntry],
+    note: Callable[[str, Mapping[str, Any]], T],  # Any: whatever the adapter takes
+) -> dict[str, T]:
+    """Return what is noted of each policy's checkpoints by adapter and arguments; nothing that is empty."""
     return {
-        policy.part(index): notes
+        policy.part(index): noted
         for policy in policies
         for index, recipe in enumerate(policy.recipes)
-        if (notes := normalization_notes(recipe.value.adapter, recipe.value.args))
+        if (noted := note(recipe.value.adapter, recipe.value.args))
     }
 
 
@@ -262,7 +264,7 @@ def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
 
 def _shared(config: EvalConfig, policies: Sequence[PolicyEntry]) -> dict[str, str]:
     """Return the policies whose inference is shared, see `Plan.shared`."""
-    if chosen_inference(config) == "in_process":
+    if chosen_inference(config, policies=policies) == "in_process":
         return {}
     return {
         policy.part(index): text

@@ -7,7 +7,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from vla_eval.config.files import Recipe, find_recipe, list_recipes, load_recipe
+from vla_eval.config.files import Recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.checkpoint import (
     CONFIG_FILE,
@@ -19,30 +19,11 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.checkpoint_json import get_count, get_text
 from vla_eval.policies.config_check import MAX_ACTIONS
-from vla_eval.policies.remote.survey import moved, remote_recipe
-from vla_eval.storage.planned import named_checkpoints
+from vla_eval.policies.remote.survey import moved, survey_address
 from vla_eval.wire.addresses import named_server
 
 LEROBOT_ADAPTER = "lerobot"
 BIG_CHECKPOINT_BYTES = 1 << 30  # of such policies one worker is enough for a GPU, and too much for most CPUs
-
-
-def policy_name(name: str) -> str:
-    """Return the name that records and tables use for what the user wrote.
-
-    Raises:
-        UnknownNameError: there is no such recipe, and no such folder.
-        CheckpointError: it is a folder without a checkpoint.
-        RemotePolicyError: it is an address, and there is no policy server.
-    """
-    named = named_checkpoints(name)
-    if named is not None:
-        return named.name
-    server = named_server(name)
-    if server is not None and server.recipe is None:
-        return remote_recipe(server.urls).name
-    name = name if server is None else bare_policy(name)
-    return checkpoint_name(Path(name)) if is_folder(name) else find_recipe("policies", name).stem
 
 
 def bare_policy(name: str) -> str:
@@ -66,7 +47,7 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     """
     server = named_server(name)
     if server is not None and server.recipe is None:
-        return remote_recipe(server.urls)
+        return survey_address(server.urls).recipe
     if server is not None:
         recipe = load_recipe("policies", bare_policy(name), PolicyRecipe)
         return replace(recipe, value=moved(recipe, server.urls))

@@ -1,13 +1,20 @@
-"""A policy of several checkpoints, `NAME=A,B,C`: the same training with different run seeds, one run each."""
+"""The policies of a configuration, each read once, and a policy server asked once.
 
+`NAME=A,B,C` is one of several checkpoints: the same training with different run seeds, one run each.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vla_eval.config.files import Recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.policies.recipe import load_policy_recipe
+from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.policies.remote.survey import survey, survey_address
 from vla_eval.storage.planned import named_checkpoints
 from vla_eval.wire.addresses import named_server
+from vla_eval.wire.metadata import ServerMetadata
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,12 +26,14 @@ class PolicyEntry:
         recipes: one; or one per run, for a policy of several checkpoints.
         texts: what the configuration calls each of them.
         is_by_run: whether each recipe is a run of its own.
+        server: of a policy behind a socket, what its server said of itself.
     """
 
     name: str
     recipes: tuple[Recipe[PolicyRecipe], ...]
     texts: tuple[str, ...]
     is_by_run: bool = False
+    server: ServerMetadata | None = None
 
     @property
     def value(self) -> PolicyRecipe:
@@ -36,6 +45,15 @@ class PolicyEntry:
         return f"{self.name}/run-{index}" if self.is_by_run else self.name
 
 
+def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
+    """Return the policies of a configuration.
+
+    Raises:
+        VlaEvalError: see `load_policy_entry`.
+    """
+    return tuple(load_policy_entry(text) for text in texts)
+
+
 def load_policy_entry(text: str) -> PolicyEntry:
     """Return the policy that an entry of a configuration names.
 
@@ -45,20 +63,39 @@ def load_policy_entry(text: str) -> PolicyEntry:
     Raises:
         UnknownNameError, RecipeError, CheckpointError, RemotePolicyError: see `load_policy_recipe`.
         RecipeError: the checkpoints of one policy are not of the same kind, or one stands there twice.
+        RemoteChangedError: two servers of one policy are not of the same one.
     """
     named = named_checkpoints(text)
     if named is None:
-        recipe = load_policy_recipe(text)
-        return PolicyEntry(name=recipe.name, recipes=(recipe,), texts=(text,))
-    served = [one for one in named.checkpoints if named_server(one) is not None]
-    if served:
-        raise RecipeError(
-            f"policies: {text}: expected folders of checkpoints or names in policies/, found {served[0]}. "
-            f"Give a policy server without a name and '='."
-        )
+        return _single(text)
+    for one in named.checkpoints:
+        if named_server(one) is not None:
+            raise _is_served(text, one)
     recipes = tuple(load_policy_recipe(one) for one in named.checkpoints)
+    for one, recipe in zip(named.checkpoints, recipes, strict=True):
+        if recipe.value.adapter == REMOTE_ADAPTER:
+            raise _is_served(text, one)
     _check_alike(text, named.checkpoints, recipes)
     return PolicyEntry(name=named.name, recipes=recipes, texts=named.checkpoints, is_by_run=True)
+
+
+def _single(text: str) -> PolicyEntry:
+    """Return a policy of one recipe; its server, if it has one, is asked what it is."""
+    address = named_server(text)
+    if address is not None and address.recipe is None:
+        recipe, server = survey_address(address.urls)
+        return PolicyEntry(name=recipe.name, recipes=(recipe,), texts=(text,), server=server)
+    recipe = load_policy_recipe(text)
+    is_remote = recipe.value.adapter == REMOTE_ADAPTER
+    said = survey(recipe.value.args, policy=recipe.name) if is_remote else None
+    return PolicyEntry(name=recipe.name, recipes=(recipe,), texts=(text,), server=said)
+
+
+def _is_served(text: str, one: str) -> RecipeError:
+    return RecipeError(
+        f"policies: {text}: expected folders of checkpoints or names in policies/ with weights, found {one}. "
+        f"Give a policy server without a name and '='."
+    )
 
 
 def _check_alike(text: str, names: tuple[str, ...], recipes: tuple[Recipe[PolicyRecipe], ...]) -> None:

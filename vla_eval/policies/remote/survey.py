@@ -6,7 +6,7 @@ Nobody is waited for: a run that cannot start says so at once.
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any  # Any: what a recipe holds
+from typing import Any, NamedTuple  # Any: what a recipe holds
 
 from vla_eval.config.files import Recipe
 from vla_eval.config.policy import PolicyRecipe
@@ -18,6 +18,13 @@ from vla_eval.wire.metadata import ServerMetadata
 
 UNNAMED = "remote"
 MAX_SERVER_NAME = 80  # characters of a server's name that records repeat
+
+
+class SurveyedPolicy(NamedTuple):
+    """A policy at an address, and what its servers said of themselves."""
+
+    recipe: Recipe[PolicyRecipe]
+    server: ServerMetadata
 
 
 def survey(args: Mapping[str, Any], *, policy: str) -> ServerMetadata:
@@ -35,8 +42,8 @@ def survey(args: Mapping[str, Any], *, policy: str) -> ServerMetadata:
     return _survey(remote_settings(args, where=f"policy '{policy}'"))
 
 
-def remote_recipe(urls: str) -> Recipe[PolicyRecipe]:
-    """Return a recipe for the policy at an address: everything is as the server says.
+def survey_address(urls: str) -> SurveyedPolicy:
+    """Return a recipe for the policy at an address: everything is as the server says, which is asked once.
 
     Raises:
         RecipeError, RemotePolicyError: see `survey`.
@@ -45,7 +52,7 @@ def remote_recipe(urls: str) -> Recipe[PolicyRecipe]:
     metadata = _survey(settings)
     # What the server calls itself becomes a part of files' names.
     own_name = re.sub(r"[^A-Za-z0-9._-]", "-", metadata.name or UNNAMED)[:MAX_SERVER_NAME].lstrip(".-")
-    return Recipe(
+    recipe = Recipe(
         name=f"{own_name or UNNAMED}@{address_name(split_urls(urls)[0])}",
         path=Path(urls),
         sha256=metadata.recipe_sha256 or settings_digest(settings),
@@ -57,6 +64,7 @@ def remote_recipe(urls: str) -> Recipe[PolicyRecipe]:
             default_n_action_steps=metadata.n_action_steps or 1,
         ),
     )
+    return SurveyedPolicy(recipe, metadata)
 
 
 def moved(recipe: Recipe[PolicyRecipe], urls: str) -> PolicyRecipe:
