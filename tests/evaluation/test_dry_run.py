@@ -2,10 +2,15 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.evaluation.evaluation_bench import Bench
+from tests.evaluation.evaluation_bench import bench as bench
+from tests.wire.small_servers import SmallServer, serving
 from vla_eval.cli.main import main
+from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.dry_run import AssumedRates, evaluation_effort
 from vla_eval.evaluation.evaluate import evaluate
@@ -30,7 +35,7 @@ def test_steps_inferences_and_frames_are_those_of_episodes_without_a_result(tmp_
     assert (effort.n_episodes, effort.n_finished) == (8, 0)  # 2 policies, 2 numbers of steps, 2 seeds
     assert effort.n_steps == 8 * 60
     assert effort.n_inferences == 4 * 60 + 4 * 9  # 60 steps by sevens are nine inferences
-    assert effort.n_frames == 2 * effort.n_inferences and effort.n_learned_inferences == 0
+    assert effort.n_frames == effort.n_learned_inferences == 0  # scripted policies read no image
     evaluate(config(), out=out)
     after = evaluation_effort(config(), out=out)
     assert (after.n_episodes, after.n_finished, after.n_steps) == (8, 8, 0)
@@ -40,7 +45,38 @@ def test_a_policy_that_is_shown_every_frame_has_a_frame_of_each_step() -> None:
     learned = dataclasses.replace(config(), policies=("memory_color3", "oracle"), n_action_steps=(6,))
     effort = evaluation_effort(learned, out=Path("nowhere"))
     assert effort.n_inferences == 4 * 10 and effort.n_learned_inferences == 2 * 10
-    assert effort.n_frames == 2 * (2 * 60 + 2 * 10)  # cameras, episodes, steps or inferences
+    assert effort.n_frames == 2 * 2 * 60  # cameras, episodes, steps; the oracle reads no image
+
+
+@pytest.mark.parametrize(
+    ("said", "fields", "expected"),
+    [
+        ({}, {}, 10),  # 60 steps by sixes
+        ({"needs_every_frame": True}, {}, 60),
+        ({}, {"eager_rendering": True}, 60),
+        ({}, {"cue_view": "first_frame"}, 11),
+        ({"cameras": {}}, {}, 0),
+    ],
+)
+def test_frames_of_a_policy_behind_a_socket_are_those_that_its_server_wants(
+    said: dict[str, Any], fields: dict[str, Any], expected: int
+) -> None:
+    camera = {"base_camera": {"key": "image", "height_px": 128, "width_px": 128}}
+    with serving(SmallServer(**{"cameras": camera, **said})) as url:
+        served = dataclasses.replace(config(), policies=(url,), n_action_steps=(6,), episodes=1, **fields)
+        assert evaluation_effort(served, out=Path("nowhere")).n_frames == 2 * expected
+
+
+def test_captured_episodes_have_a_frame_of_every_stride() -> None:
+    capture = CaptureConfig(video=1, frame_stride=4)  # of the first seed of each row
+    captured = dataclasses.replace(config(), policies=("oracle",), n_action_steps=(1,), capture=capture)
+    effort = evaluation_effort(captured, out=Path("nowhere"))
+    assert effort.n_frames == 2 * 16  # cameras; steps 0, 4, …, 60
+
+
+def test_a_policy_of_another_package_may_read_every_step(bench: Bench) -> None:
+    other = bench.config(n_action_steps=[4], episodes=1)  # episodes of 12 steps
+    assert evaluation_effort(other, out=Path("nowhere")).n_frames == 2 * 12
 
 
 def test_hours_are_those_of_the_stated_rates() -> None:
@@ -65,5 +101,5 @@ def test_the_command_prints_what_would_run(
     assert main(["eval", *arguments, "--dry-run"]) == 0
     printed = capsys.readouterr().out
     assert "5 to run, 0 of 5 have a result" in printed
-    assert "300 control steps, 75 inferences, 150 frames" in printed and "assumptions:" in printed
+    assert "300 control steps, 75 inferences, 0 frames" in printed and "assumptions:" in printed
     assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from vla_eval.evaluation.evaluate import default_run_folder, worker_count
 from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import JobQueue
 from vla_eval.evaluation.plan import EpisodeJob, Plan
+from vla_eval.evaluation.rendered import images_read, n_rendered
 from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies.checkpoint import find_checkpoint, weights_file
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
@@ -46,8 +47,7 @@ class EvaluationEffort:
         n_steps: control steps.
         n_inferences: of all policies.
         n_learned_inferences: of those that load weights.
-        n_frames: images that are rendered, of two cameras: at each inference, and at each control step for
-            a policy that has to be shown every frame.
+        n_frames: images of two cameras that are rendered for policies and captures; see `n_rendered`.
         n_workers: processes.
         copies: learned policies -> bytes of their weights; each worker loads its own copy.
     """
@@ -102,10 +102,10 @@ def evaluation_effort(
     steps = [horizon_steps(job) for job in ahead]
     inferences = [_inferences(job) for job in ahead]
     checkpoints = _checkpoints(plan)
-    watching = {name for name, folder in checkpoints.items() if _is_shown_every_frame(folder)}
+    reads = images_read(policies)
     rendered = [
-        n_steps if job.group.key.policy in watching else n
-        for job, n_steps, n in zip(ahead, steps, inferences, strict=True)
+        n_rendered(job, config, reads=reads[job.group.key.policy], n_steps=n_steps)
+        for job, n_steps in zip(ahead, steps, strict=True)
     ]
     learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
     return EvaluationEffort(
@@ -174,13 +174,3 @@ def _n_bytes(folder: Path) -> int:
     file = weights_file(folder)
     assert file is not None  # `find_checkpoint` looks for it
     return file.stat().st_size
-
-
-def _is_shown_every_frame(folder: Path) -> bool:
-    # Here and not above: a dry run of scripted policies need not wait for torch.
-    from vla_eval.policies.lerobot_loading import LoadOptions, make_unfilled_policy, read_config
-    from vla_eval.policies.lerobot_memory import remembers
-    from vla_eval.policies.lerobot_types import history
-
-    config = read_config(folder, LoadOptions(device="cpu"))
-    return len(history(config)) > 1 or remembers(make_unfilled_policy(config))

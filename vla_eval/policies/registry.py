@@ -49,6 +49,9 @@ POLICIES = {
     "openvla": "vla_eval.policies.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
 }
+_SCRIPTED_MODULES = ("vla_eval.policies.scripted:", "vla_eval.policies.shortcuts:")
+SCRIPTED = frozenset(name for name, target in POLICIES.items() if target.startswith(_SCRIPTED_MODULES))
+"""Those of ours that read no image."""
 PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "cue_reader", "body_memory", "cue_touch", "one_frame"})
 """Those of ours that read the true state of the world."""
 
