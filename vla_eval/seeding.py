@@ -7,6 +7,8 @@ and neither batch size, device, order of episodes nor global random state plays 
 import hashlib
 import random
 import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import IntEnum, unique
 
 import numpy as np
@@ -26,6 +28,29 @@ class Stream(IntEnum):
     NOISE = 8
     DISTRACTOR = 9
     SHUFFLE = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeedRange:
+    """All seeds from `first` to `last`."""
+
+    first: int
+    last: int
+
+    def __contains__(self, seed: int) -> bool:
+        """Whether a seed is one of them."""
+        return self.first <= seed <= self.last
+
+
+def seed_ranges(seeds: Iterable[int]) -> tuple[SeedRange, ...]:
+    """Return the fewest ranges that hold exactly these seeds, in their order."""
+    ranges: list[SeedRange] = []
+    for seed in sorted(set(seeds)):
+        if ranges and seed == ranges[-1].last + 1:
+            ranges[-1] = SeedRange(first=ranges[-1].first, last=seed)
+        else:
+            ranges.append(SeedRange(first=seed, last=seed))
+    return tuple(ranges)
 
 
 def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:

@@ -115,6 +115,12 @@ def test_a_run_with_a_baseline_asks_a_server_once_before_its_worker_does(
     assert f"Known: hold, {name}" in capsys.readouterr().err
 
 
+def test_seeds_that_a_server_was_trained_on_are_warned_of(bench: Bench) -> None:
+    with serving(SmallServer(training_seeds={"RememberColor3-v0": [[3, 40]]})) as url:
+        (warning,) = make_plan(bench.config(policies=[url], episodes=6)).warnings
+    assert "trained on demonstrations of 4 of the 6 seeds" in warning  # 3 to 6
+
+
 def test_checkpoints_of_one_policy_are_no_servers(bench: Bench) -> None:
     bench.write_policy("remote", url="ws://127.0.0.1:9")
     with pytest.raises(RecipeError, match=r"found .*night\.yaml\. Give a policy server"):

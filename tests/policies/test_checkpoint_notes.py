@@ -16,6 +16,7 @@ from vla_eval.errors import CheckpointError, TaskArgumentError
 from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.policies.checkpoint import TrainingFacts, write_facts
 from vla_eval.policies.checkpoint_notes import normalization_notes
+from vla_eval.seeding import SeedRange
 from vla_eval.storage.run_file import RunDescription, RunFile, Session
 
 IMAGES = "observation.images.base"
@@ -100,6 +101,31 @@ def test_a_run_says_by_which_statistics_its_policies_normalise(tmp_path: Path, c
     assert normalization_notes("oracle", {}) == {}
 
 
+def facts_with(seeds: dict[str, tuple[SeedRange, ...]] | None) -> TrainingFacts:
+    return TrainingFacts(
+        run="r", dataset="mine_250", dataset_sha256="0" * 64, task="RememberColor3-v0", state="eef",
+        images={IMAGES: (128, 128)}, fps=20.0, action_names=("x", "y"), control_mode="c", run_seed=0,
+        seeds=seeds,
+    )  # fmt: skip
+
+
+def test_an_evaluation_on_seeds_of_the_demonstrations_is_warned_of(checkpoint: Path, tmp_path: Path) -> None:
+    write_facts(checkpoint, facts_with({"RememberColor3-v0": (SeedRange(first=0, last=50),)}))
+    (warning,) = plan(tmp_path, "lerobot", checkpoint).warnings  # of seed 1
+    assert "mine was trained on demonstrations of 1 of the 1 seeds" in warning
+    assert "RememberColor3-v0 (1)" in warning and "--seed-start" in warning
+
+
+@pytest.mark.parametrize(
+    "seeds", [None, {"RememberColor3-v0": (SeedRange(first=5000, last=6000),)}, {"RememberColor5-v0": ()}]
+)
+def test_other_seeds_other_tasks_and_old_checkpoints_bring_no_warning(
+    checkpoint: Path, tmp_path: Path, seeds: dict[str, tuple[SeedRange, ...]] | None
+) -> None:
+    write_facts(checkpoint, facts_with(seeds))
+    assert plan(tmp_path, "lerobot", checkpoint).warnings == []
+
+
 def test_a_statistic_that_is_used_and_not_there_is_an_error(checkpoint: Path) -> None:
     save_file({"action/q01": np.zeros(2, np.float32)}, checkpoint / "after.safetensors")
     with pytest.raises(CheckpointError, match=r"after\.safetensors: has no statistic 'q99' of 'action'"):
@@ -127,12 +153,13 @@ def test_a_run_of_a_version_that_did_not_note_them_can_be_read(tmp_path: Path) -
         options={},
         command="",
         normalization={"p": {"of": "d"}},
+        training_seeds={"p": {"RememberColor3-v0": (SeedRange(first=1, last=3),)}},
     )
     session = Session(started_at="2026-01-01T00:00:00+00:00", command="", options={})
     RunFile(description=described, sessions=(session,)).save(tmp_path)
     assert RunFile.load(tmp_path).description == described
     data = json.loads((tmp_path / "run.json").read_text())
-    del data["normalization"]
+    del data["normalization"], data["training_seeds"]
     (tmp_path / "run.json").write_text(json.dumps(data))
     assert RunFile.load(tmp_path).description.normalization == {}
 

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -23,10 +24,11 @@ from vla_eval.core import EpisodeStart
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
-from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts
+from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts, write_facts
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.seeding import SeedRange
 from vla_eval.testing.tiny_models import Family, make_tiny_pi0, tiny_paligemma, write_tiny_smolvlm
 from vla_eval.training.finetune import finetune
 
@@ -90,6 +92,8 @@ class TestRuns:
         assert isinstance(facts, TrainingFacts)
         assert facts.dataset_sha256 == described["settings"]["dataset"]["sha256"]
         assert (facts.task, facts.state, facts.fps, facts.run_seed) == (TASK, "eef", 20.0, 3)
+        # The episodes of `recorded` are of these; the expert failed at 1002.
+        assert facts.seeds == {TASK: (SeedRange(first=1000, last=1001), SeedRange(first=1003, last=1004))}
         recipe = load_policy_recipe(str(straight))
         assert (recipe.name, recipe.value.default_n_action_steps) == ("straight-000004", 4)
         policy = make_lerobot(context(), checkpoint=str(straight))
@@ -148,12 +152,23 @@ class TestRuns:
         lines: list[str] = []
         with tiny_paligemma():
             finetune(pi0(recorded, base, tokenizer, steps=2))
+            facts = read_facts(find_checkpoint(base))
+            assert facts is not None
+            earlier = SeedRange(first=1, last=9)  # as if the base had been trained on another dataset
+            write_facts(find_checkpoint(base), replace(facts, seeds={TASK: (earlier,)}))
             with killed_at(3):
                 finetune(pi0(recorded, lora, tokenizer, **changes))
             finetune(pi0(recorded, lora, tokenizer, **changes), say=lines.append)
         folder = find_checkpoint(lora)
         assert (folder / "adapter_model.safetensors").is_file()
         assert not (folder / "model.safetensors").is_file()
+        facts = read_facts(folder)
+        assert facts is not None and facts.seeds is not None
+        assert facts.seeds[TASK] == (
+            earlier,
+            SeedRange(first=1000, last=1001),
+            SeedRange(first=1003, last=1004),
+        )
         trained = next(line for line in lines if line.startswith("trained:"))
         n_trained, n_all = (int(word.replace(",", "")) for word in trained.split() if word[0].isdigit())
         assert 0 < n_trained < n_all / 4

@@ -70,7 +70,9 @@ def test_tiny_pi0_pi05_and_smolvla_go_from_a_dataset_to_a_table_in_worker_proces
     monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
     out = tmp_path / "evaluation"
     policies = ["--policy", *map(str, runs.values())]
-    arguments = ["--task", TASK, *policies, "--n-action-steps", "2", "4", "--episodes", "1", "--workers", "1"]
+    # 1001 is a seed of the demonstrations, 1002 is not: the expert failed there.
+    arguments = ["--task", TASK, *policies, "--n-action-steps", "2", "4", "--workers", "1"]
+    arguments += ["--seed-start", "1001", "--episodes", "2"]
     assert main(["eval", *arguments, *FAKE, "--out", str(out)]) == 0
 
     run = read_run(out)
@@ -85,4 +87,13 @@ def test_tiny_pi0_pi05_and_smolvla_go_from_a_dataset_to_a_table_in_worker_proces
         dataset = described["settings"]["dataset"]
         assert run.description.recipes[f"datasets/{dataset['name']}"] == dataset["sha256"]
         assert run.description.recipes[f"checkpoints/{family}-000002"] == checkpoint_sha256(folder)
-    assert "pi05-000002" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "pi05-000002" in printed.out
+    warning = (
+        f"pi05-000002 was trained on demonstrations of 1 of the 2 seeds it is evaluated on in {TASK} (1001)"
+    )
+    assert f"warning: {warning}" in printed.err  # before the first episode
+    assert f"- {warning}" in printed.out  # below the table
+    assert "pi05-000002" in json.loads((out / "run.json").read_text())["training_seeds"]
+    assert main(["eval", *arguments, *FAKE, "--dry-run"]) == 0
+    assert f"warning: {warning}" in capsys.readouterr().out

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from vla_eval.errors import RemoteReplyError
+from vla_eval.seeding import SeedRange
 from vla_eval.wire.codec import packb, unpackb
 from vla_eval.wire.metadata import CameraImage, ServerMetadata
 
@@ -51,6 +52,23 @@ def test_cameras_keep_height_and_width_apart() -> None:
 def test_the_number_of_sessions_is_no_part_of_the_identity() -> None:
     assert read(OURS).identity() == read({**OURS, "n_sessions": 0}).identity()
     assert read(OURS).identity() != read({**OURS, "weights_sha256": "ef" * 32}).identity()
+
+
+def test_training_seeds_are_read_and_written_and_no_part_of_the_identity() -> None:
+    seeds = {"RememberColor3-v0": [[1000, 1001], [1003, 1003]]}
+    found = read({**OURS, "training_seeds": seeds})
+    first, second = SeedRange(first=1000, last=1001), SeedRange(first=1003, last=1003)
+    assert found.training_seeds == {"RememberColor3-v0": (first, second)}
+    assert unpackb(packb(found.to_wire())) == {**OURS, "training_seeds": seeds}
+    assert found.identity() == read(OURS).identity()  # earlier versions did not say them
+
+
+@pytest.mark.parametrize(
+    "seeds", [[1], {"t": 1}, {"t": [1, 2]}, {"t": [[1]]}, {"t": [[1, "2"]]}, {"t": [[-1, 2]]}]
+)
+def test_training_seeds_of_another_form_are_refused(seeds: object) -> None:
+    with pytest.raises(RemoteReplyError, match=r"'training_seeds': .* expected a map of lists of first and"):
+        read({**OURS, "training_seeds": seeds})
 
 
 def test_a_plain_server_says_nothing_and_may_be_sent_nothing() -> None:

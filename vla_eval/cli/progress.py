@@ -144,6 +144,8 @@ class Progress:
         n_episodes = len(plan.jobs)
         for pair in plan.left_out:
             self._bar.write(f"left out: {pair}")
+        for warning in plan.warnings:
+            self._bar.write(f"warning: {warning}")
         if n_finished == n_episodes:
             self._bar.write(f"{self._out}: all {n_episodes} episodes are there")
             return

@@ -50,6 +50,7 @@ class EvaluationEffort:
         n_frames: images of two cameras that are rendered for policies and captures; see `n_rendered`.
         n_workers: processes.
         copies: learned policies -> bytes of their weights; each worker loads its own copy.
+        warnings: what a person should know before the first episode.
     """
 
     n_episodes: int
@@ -60,6 +61,7 @@ class EvaluationEffort:
     n_frames: int
     n_workers: int
     copies: dict[str, int]
+    warnings: tuple[str, ...] = ()
 
     def seconds(self, rates: AssumedRates) -> float:
         """Return how long it takes at these rates, all workers busy to the end."""
@@ -117,6 +119,7 @@ def evaluation_effort(
         n_frames=N_CAMERAS * sum(rendered),
         n_workers=worker_count(config, plan, n_jobs=queue.n_batches),
         copies={policy: _n_bytes(folder) for policy, folder in checkpoints.items()},
+        warnings=tuple(plan.warnings),
     )
 
 
@@ -140,6 +143,8 @@ def _lines(config: EvalConfig, out: Path, effort: EvaluationEffort, rates: Assum
             f"  {name}: {n_bytes / GB:.2f} GB of weights × {effort.n_workers} copies, "
             f"{effort.n_workers * n_bytes / GB:.1f} GB"
         )
+    for warning in effort.warnings:
+        yield f"warning: {warning}"
     yield f"time, estimated: {effort.seconds(rates) / 3600:.2g} h"
     yield (
         f"assumptions: {rates.steps_per_second:g} control steps per second and worker, "

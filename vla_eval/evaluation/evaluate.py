@@ -194,6 +194,7 @@ def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
         normalization=dict(plan.normalization),
         servers=dict(plan.servers),
         shard=plan.shard,
+        training_seeds=plan.training_seeds,
     )
 
 

@@ -23,13 +23,15 @@ from vla_eval.evaluation.inference_choice import (
     has_weights,
     inference_fields,
 )
-from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes
+from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes, training_seeds
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.policies.registry import check_adapter
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
+from vla_eval.seeding import SeedRange
 from vla_eval.storage.shard import Shard
+from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
@@ -119,6 +121,8 @@ class Plan:
             `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         servers: policy behind a socket -> what its server says of itself.
+        training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
+            demonstrations it was trained on, where known.
         task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
         shared: `EpisodeGroup.part` whose inference all workers share -> what the configuration calls it.
@@ -132,12 +136,18 @@ class Plan:
     recipe_hashes: Mapping[str, str]
     normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
     servers: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]]
     task_versions: Mapping[str, int]
     policy_names: tuple[str, ...]
     shared: Mapping[str, str]
     left_out: tuple[str, ...]
     max_workers: int | None
     shard: Shard | None = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know before the first episode."""
+        return seen_in_training((job.key for job in self.jobs), self.training_seeds)
 
 
 def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None) -> Plan:
@@ -174,6 +184,10 @@ def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None)
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
+        training_seeds={
+            **_noted(policies, training_seeds),
+            **{name: server.training_seeds for name, server in servers.items() if server.training_seeds},
+        },
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
         shared=shared,

@@ -18,6 +18,7 @@ from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.policies.bases import how_to_get
 from vla_eval.policies.checkpoint_json import get_text
 from vla_eval.policies.checkpoint_json import read_json as read_json  # where most look for it
+from vla_eval.seeding import SeedRange
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -58,6 +59,8 @@ class TrainingFacts:
         action_names: dimensions of the action.
         control_mode: what an action means.
         run_seed: seed of the training run.
+        seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
+            another episode, and earlier versions did not note them.
     """
 
     run: str
@@ -70,6 +73,7 @@ class TrainingFacts:
     action_names: tuple[str, ...]
     control_mode: str
     run_seed: int
+    seeds: dict[str, tuple[SeedRange, ...]] | None = None
 
 
 def find_checkpoint(path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""What an evaluation notes of the weights that a policy's recipe names: digests, and statistics.
+"""What an evaluation notes of the weights that a policy's recipe names: digests, statistics, training seeds.
 
 Knows nothing of models, and does not import torch: planning an evaluation must not wait for it.
 """
@@ -19,6 +19,7 @@ from vla_eval.policies.checkpoint_json import get_mapping, get_text
 from vla_eval.policies.recipe import LEROBOT_ADAPTER
 from vla_eval.policies.saved_processor import SavedStep, read_saved_processor
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
+from vla_eval.seeding import SeedRange
 
 LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
@@ -95,6 +96,26 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
         "before": _used(folder, PREPROCESSOR_FILE),
         "after": _used(folder, POSTPROCESSOR_FILE),
     }
+
+
+def training_seeds(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[SeedRange, ...]]:
+    """Return of which seeds a policy was shown demonstrations.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Returns:
+        Task id -> seeds; empty where they are not known.
+
+    Raises:
+        CheckpointError: what the checkpoint says of its training is damaged.
+    """
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return {}
+    facts = read_facts(find_checkpoint(Path(checkpoint)))
+    return {} if facts is None else facts.seeds or {}
 
 
 def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:

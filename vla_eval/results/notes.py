@@ -11,6 +11,7 @@ from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
 from vla_eval.results.success_table import Row
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
+from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import find_task
 
 RENDERER = "device.render_"
@@ -183,7 +184,11 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
         )
         for path in grouping.further
     ]
-    own = [note for run in runs for note in (*_incomplete(run), *_continued_elsewhere(run))]
+    own = [
+        note
+        for run in runs
+        for note in (*_incomplete(run), *_continued_elsewhere(run), *_seen_in_training(run))
+    ]
     shards = _absent_shards(runs)
     return _told_together(notes) + own + shards + _environment_differences(runs) + _recipe_differences(runs)
 
@@ -289,6 +294,10 @@ def _continued_elsewhere(run: StoredRun) -> list[str]:
         f"{run.path} was resumed in another environment (--allow-environment-change); what changed: "
         f"{some_of(changed)}."
     ]
+
+
+def _seen_in_training(run: StoredRun) -> list[str]:
+    return seen_in_training((record.key for record in run.records), run.description.training_seeds)
 
 
 def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vla_eval.errors import RunChangedError, RunFolderError, one_line
+from vla_eval.seeding import SeedRange
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.planned import PlannedEpisodes, planned_config
 from vla_eval.storage.shard import Shard
@@ -41,6 +42,8 @@ class RunDescription:
             of the weights in `recipes` covers them.
         servers: policy behind a socket -> what its server says of itself; compared on resume.
         shard: which part of the plan it is; None: all of it. Compared on resume.
+        training_seeds: the seeds of the demonstrations that policies were trained on, where known; recorded
+            only, since the digest of the weights covers them.
     """
 
     name: str
@@ -52,6 +55,7 @@ class RunDescription:
     normalization: Mapping[str, JsonValue] = field(default_factory=dict)
     servers: Mapping[str, JsonValue] = field(default_factory=dict)
     shard: Shard | None = None
+    training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]] = field(default_factory=dict)
 
 
 class Change(NamedTuple):
@@ -240,9 +244,16 @@ def _session_fields(session: Session) -> dict[str, Any]:  # Any: JSON
 
 
 def _description(value: RunDescription) -> dict[str, Any]:  # Any: JSON
-    # Of a whole run there is no field `shard`, so that earlier versions of this program read it.
-    own = {name: item for name, item in _fields(value).items() if name != "shard"}
-    return own if value.shard is None else {**own, "shard": asdict(value.shard)}
+    # Fields that say nothing are left out, so that earlier versions of this program read the file.
+    own = {name: item for name, item in _fields(value).items() if name not in ("shard", "training_seeds")}
+    if value.shard is not None:
+        own["shard"] = asdict(value.shard)
+    if value.training_seeds:
+        own["training_seeds"] = {
+            policy: {task: [asdict(one) for one in seeds] for task, seeds in tasks.items()}
+            for policy, tasks in value.training_seeds.items()
+        }
+    return own
 
 
 def _plain(value: object) -> dict[str, JsonValue]:

@@ -14,11 +14,12 @@ from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
-from vla_eval.data.manifest import FileDigest
+from vla_eval.data.manifest import FileDigest, read_manifest
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY
+from vla_eval.seeding import SeedRange, seed_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +33,7 @@ class TrainingDataset:
         task: task id; empty for an import that names none.
         state, control_mode: see `TrainingFacts`.
         was_replayed: whether a replay has confirmed it.
+        seeds: see `TrainingFacts`.
         meta: lerobot's description of it.
         failed: numbers of the episodes in which the success rule never held; empty, too, if that is not
             stored.
@@ -45,6 +47,7 @@ class TrainingDataset:
     state: str
     control_mode: str
     was_replayed: bool
+    seeds: dict[str, tuple[SeedRange, ...]] | None
     meta: Any
     failed: tuple[int, ...] = ()
     left_out: tuple[int, ...] = ()
@@ -103,6 +106,7 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
         state=facts.state,
         control_mode=facts.control_mode,
         was_replayed=report is not None,
+        seeds=None if is_import else demonstrated_seeds(root),
         meta=opened.meta,
         failed=_failed(root) if SUCCESS_KEY in opened.meta.features else (),
     )
@@ -112,6 +116,18 @@ def _failed(root: Path) -> tuple[int, ...]:
     columns = read_columns(root)
     numbers, success = columns["episode_index"], columns[SUCCESS_KEY].astype(bool)
     return tuple(int(number) for number in np.setdiff1d(numbers, numbers[success]))
+
+
+def demonstrated_seeds(root: Path) -> dict[str, tuple[SeedRange, ...]]:
+    """Return task -> the seeds of the episodes that a recorded dataset holds.
+
+    Raises:
+        DatasetError: see `read_manifest`.
+    """
+    seeds: dict[str, set[int]] = {}
+    for episode in read_manifest(root):
+        seeds.setdefault(episode.task, set()).add(episode.seed)
+    return {task: seed_ranges(own) for task, own in seeds.items()}
 
 
 def _one_dataset(root: Path) -> Path:

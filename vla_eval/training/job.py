@@ -18,8 +18,9 @@ from vla_eval.config.policy import load_policy
 from vla_eval.data.opening import video_decoder
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
-from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint
+from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
 from vla_eval.policies.lerobot_device import choose_device
+from vla_eval.seeding import SeedRange
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.held_out import check_held_out
@@ -97,7 +98,20 @@ class TrainingJob:
             action_names=tuple(features["action"]["names"]),
             control_mode=dataset.control_mode,
             run_seed=self.run_seed,
+            seeds=self._seeds,
         )
+
+    @property
+    def _seeds(self) -> dict[str, tuple[SeedRange, ...]] | None:
+        """Seeds of the demonstrations, and of those that the weights it starts from were trained on."""
+        below = None if self.base is None else read_facts(self.base)
+        if below is None or below.seeds is None:
+            return self.dataset.seeds
+        own = self.dataset.seeds or {}
+        return {
+            task: tuple(dict.fromkeys((*below.seeds.get(task, ()), *own.get(task, ()))))
+            for task in {**below.seeds, **own}
+        }
 
 
 def training_job(config: FinetuneConfig) -> TrainingJob:

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple  # Any: a server may say anything
 
 import numpy as np
 
-from vla_eval.bounds import MAX_SERVER_ROWS
+from vla_eval.bounds import MAX_SEED, MAX_SERVER_ROWS
 from vla_eval.errors import RemoteReplyError
+from vla_eval.seeding import SeedRange
 from vla_eval.strict_json import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")
+NOT_COMPARED = ("n_sessions", "training_seeds")
 
 MAX_ACTIONS = 10_000  # of one reply
 MAX_IMAGE_PX = 4096
@@ -54,6 +56,7 @@ class ServerMetadata:
         supports: which of `reset`, `observe`, `seed` and `row` may be sent.
         versions: package -> version, at the server.
         n_sessions: sessions that it has at the moment.
+        training_seeds: task -> the seeds of the demonstrations that the policy was trained on.
         other: what else it says.
     """
 
@@ -78,6 +81,7 @@ class ServerMetadata:
     supports: tuple[str, ...] = ()
     versions: Mapping[str, str] | None = None
     n_sessions: int | None = None
+    training_seeds: Mapping[str, tuple[SeedRange, ...]] | None = None
     other: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -103,8 +107,12 @@ class ServerMetadata:
         message: dict[str, Any] = {
             one.name: getattr(self, one.name)
             for one in fields(self)
-            if one.name not in ("weights_known", "other")
+            if one.name not in ("weights_known", "other", "training_seeds")
         }
+        if self.training_seeds is not None:
+            message["training_seeds"] = {
+                task: [[one.first, one.last] for one in seeds] for task, seeds in self.training_seeds.items()
+            }
         if not self.weights_known:
             del message["weights_sha256"]
         if self.cameras is not None:
@@ -116,11 +124,12 @@ class ServerMetadata:
         return {**self.other, **plain}
 
     def identity(self) -> dict[str, Any]:
-        """Return what is compared when a run is resumed, as JSON can hold it: all but the number of sessions.
+        """Return what is compared when a run is resumed, as JSON can hold it.
 
-        What the server does not say is left out.
+        Left out are what the server does not say, the number of sessions, and the training seeds, which the
+        digest of the weights covers.
         """
-        message = {key: value for key, value in self.to_wire().items() if key != "n_sessions"}
+        message = {key: value for key, value in self.to_wire().items() if key not in NOT_COMPARED}
         unsaid = () if self.is_ours else [key for key, value in message.items() if value is None]
         return {key: _as_json(value) for key, value in message.items() if key not in unsaid}
 
@@ -208,6 +217,20 @@ def _layouts(value: Any) -> dict[str, tuple[str, ...]] | None:
     )
 
 
+def _seeds(value: Any) -> dict[str, tuple[SeedRange, ...]] | None:
+    if not isinstance(value, Mapping):
+        return None
+    read: dict[str, tuple[SeedRange, ...]] = {}
+    for task, pairs in value.items():
+        if not isinstance(pairs, list | tuple) or not all(isinstance(pair, list | tuple) for pair in pairs):
+            return None
+        numbers = [[_count(0, MAX_SEED)(number) for number in pair] for pair in pairs]
+        if any(len(pair) != 2 or None in pair for pair in numbers):
+            return None
+        read[str(task)] = tuple(SeedRange(first=first or 0, last=last or 0) for first, last in numbers)
+    return read
+
+
 def _texts(value: Any) -> dict[str, str] | None:
     is_map = isinstance(value, Mapping) and all(isinstance(item, str) for item in value.values())
     return dict(value) if is_map else None
@@ -255,6 +278,7 @@ _READERS = {
     "supports": _Reader("a list of names", _names),
     "versions": _Reader("a map of texts", _texts),
     "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),
+    "training_seeds": _Reader("a map of lists of first and last seeds", _seeds),
 }
 
 

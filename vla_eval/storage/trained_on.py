@@ -1,0 +1,43 @@
+"""Which episodes of an evaluation have seeds whose demonstrations their policy was trained on.
+
+An episode's world is a function of task and seed: there, the policy is tested on what it was shown. Knows
+nothing of files.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+
+from vla_eval.records import EpisodeKey
+from vla_eval.seeding import SeedRange
+
+TrainingSeeds = Mapping[str, Mapping[str, Sequence[SeedRange]]]
+"""Policy, or `POLICY/run-N` of several checkpoints -> task id -> the seeds of its demonstrations."""
+
+
+def seen_in_training(keys: Iterable[EpisodeKey], known: TrainingSeeds) -> list[str]:
+    """Return a sentence for each policy and task with seeds that are those of demonstrations.
+
+    Args:
+        keys: the episodes.
+        known: the seeds that policies were trained on, as far as they are known.
+    """
+    seen: dict[tuple[str, str], set[int]] = defaultdict(set)
+    asked: dict[tuple[str, str], set[int]] = defaultdict(set)
+    for key in keys:
+        own = known.get(key.policy) or known.get(f"{key.policy}/run-{key.run}")
+        if own is None:
+            continue
+        place = (key.policy, key.task)
+        asked[place].add(key.seed)
+        if any(key.seed in seeds for seeds in own.get(key.task, ())):
+            seen[place].add(key.seed)
+    return [
+        f"{policy} was trained on demonstrations of {len(seeds)} of the {len(asked[policy, task])} seeds it "
+        f"is evaluated on in {task} ({_named(seeds)}): its rate there says nothing of new episodes. Use "
+        "other seeds (--seed-start)."
+        for (policy, task), seeds in seen.items()
+    ]
+
+
+def _named(seeds: set[int]) -> str:
+    return str(min(seeds)) if len(seeds) == 1 else f"from {min(seeds)} to {max(seeds)}"
