@@ -1,4 +1,4 @@
-"""The positive control in `pd_joint_pos`: it decides in space, and learns which joints that takes."""
+"""The positive control in other control modes; in `pd_joint_pos` it learns which joints a place takes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,27 +7,35 @@ import numpy as np
 import pytest
 import torch
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.control_modes import JOINT_DELTA_POS, JOINT_POS
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, JOINT_DELTA_POS, JOINT_POS
 from vla_eval.data.changed_actions import copy_with_actions
 from vla_eval.data.manifest import encode_actions, read_manifest
+from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import SpecMismatchError
 from vla_eval.features import rotation_columns
 from vla_eval.oracles.kinematics import tool_pose
+from vla_eval.policies.checkpoint import read_facts
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.memory.joint_layer import JOINT_UNIT_RAD, REST_RAD, JointLayer
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
 from vla_eval.policies.memory.network import Answer
+from vla_eval.tasks.interface import env_spec
 from vla_eval.training.dataset import training_dataset
+from vla_eval.training.finetune import finetune
 from vla_eval.training.policy_config import policy_config
 
 TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}
 
 
 def dataset_of(recorded: Path, out: Path, mode: str) -> Path:
-    """Return a copy of the dataset with actions of eight numbers: the arm rests."""
+    """Return a copy of the dataset with actions of a mode: the arm rests."""
     path = out / mode / recorded.name
-    rest = np.array([*REST_RAD, 1.0], dtype=np.float32)
+    rest = np.array([*((0.0,) * 3 if mode == EE_DELTA_POS else REST_RAD), 1.0], dtype=np.float32)
     env = {"control_mode": mode}
     episodes = [
         replace(one, env_kwargs=env, actions=encode_actions(np.tile(rest, (one.n_steps, 1))))
@@ -55,6 +63,29 @@ def test_a_dataset_of_joint_positions_gives_a_policy_that_answers_in_radians_abo
     assert chunk.shape == (1, 3, 8)
     # Untrained, the layer's output is below 2 in units of 0.1 rad.
     assert (chunk[..., :7] - torch.tensor(REST_RAD)).abs().max() < 2 * JOINT_UNIT_RAD
+
+
+def test_it_is_trained_without_rotation_and_refused_in_another_mode(
+    recorded: Path, tmp_path: Path, no_network: None
+) -> None:
+    config = FinetuneConfig(
+        policy="memory",
+        dataset=str(dataset_of(recorded, tmp_path, EE_DELTA_POS)),
+        out=str(tmp_path / "run"),
+        finetune={"steps": 1, "batch_size": 2, "save_every_steps": 1, "log_every_steps": 1, "policy": TINY},
+        device="cpu",
+        allow_unreplayed=True,
+    )
+    folder = finetune(config).checkpoint
+    facts = read_facts(folder)
+    assert facts is not None
+    assert (facts.control_mode, facts.action_names) == (EE_DELTA_POS, CONTROL_MODES[EE_DELTA_POS].dims)
+    env = FakeEnv(EnvSettings(task=recorded.name, cameras=("base_camera", "hand_camera"))).spec
+    context = PolicyContext(name="p", env=env, chunking=ChunkingSpec(n_action_steps=2), n_candidates=3)
+    with pytest.raises(SpecMismatchError, match=f"control mode: expected {EE_DELTA_POS}"):
+        make_lerobot(context, checkpoint=str(folder))
+    context = replace(context, env=env_spec(None, control_mode=EE_DELTA_POS, image_size_px=128))
+    assert make_lerobot(context, checkpoint=str(folder)).spec.reads == "every"
 
 
 def test_joint_deltas_are_refused_with_what_to_do(recorded: Path, tmp_path: Path) -> None:
