@@ -9,6 +9,7 @@ from huggingface_hub import DatasetCard
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
+from tests.data.failed_episodes import let_fail
 from vla_eval.cli.main import main
 from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
 from vla_eval.data.convert import convert_to_lerobot, find_source
@@ -60,6 +61,16 @@ def test_the_numbers_are_those_of_the_dataset(recorded: Path) -> None:
     numbers = (gripper.mean(), gripper.std(), gripper.min(), gripper.max())
     assert f"| gripper | {' | '.join(f'{number:.4f}' for number in numbers)} |" in text
     assert "look, wait, choose" in text and "follow the ball" in text
+
+
+def test_failures_that_were_kept_are_in_the_title_and_named(recorded: Path) -> None:
+    text = write_card(let_fail(recorded, 1, 3))
+
+    assert "# RememberColor3-v0: 4 episodes, 2 with success\n" in text
+    assert "| episodes with success | 2 |" in text
+    assert "| seeds kept although the expert failed | 2: 1001, 1004 |" in text
+    assert "- Kept: all;" in text
+    assert "RememberColor3-v0: 4 demonstrations" not in text
 
 
 def test_hashes_and_recipe_are_there(recorded: Path) -> None:
