@@ -22,6 +22,7 @@ from tests.policies.openvla import test_openvla_paper_compat as openvla_paper_co
 from tests.policies.openvla import test_openvla_policy as openvla_policy
 from tests.policies.openvla import test_openvla_tokens as openvla_tokens
 from tests.policies.openvla import test_openvla_whole_path as openvla_whole_path
+from tests.policies.sequence import test_sequence_parity as sequence
 from tests.policies.spatialvla import spatialvla_golden
 from tests.policies.spatialvla import test_spatialvla_network as network
 from tests.policies.spatialvla import test_spatialvla_policy as policy
@@ -117,3 +118,12 @@ def test_every_value_of_openvla_is_compared(tmp_path: Path, monkeypatch: pytest.
         out = tmp_path / f"loss-{case}"
         whole.test_the_loss_of_the_policy_and_its_parts_are_the_originals(published, out, case)
     assert openvla_golden.values().unread() == set()
+
+
+def test_every_value_of_the_sequence_models_is_compared() -> None:
+    io = GoldenValues(sequence.GOLDEN)
+    for name in ("rate", "gtrxl", "decision_transformer"):
+        sequence.test_segments_are_answered_as_by_rates_code(io, name, 100)
+    sequence.test_slots_are_read_and_written_as_by_elmurs_code(io, 100)
+    sequence.test_decision_mamba_answers_as_the_authors_blocks(io)
+    assert io.unread() == set()

@@ -22,6 +22,7 @@ class Episodes(NamedTuple):
         actions: (B, T, chunk, action).
         counts: (B, T, chunk) float, 0 for what is beyond the episode.
         goal_m: (B, 3) the tool centre point at the episode's end.
+        steps: (B, T) which step of the window each is.
     """
 
     images: Tensor
@@ -29,6 +30,7 @@ class Episodes(NamedTuple):
     actions: Tensor
     counts: Tensor
     goal_m: Tensor
+    steps: Tensor
 
 
 def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
@@ -81,6 +83,7 @@ def episodes_of(
         actions=taken(actions),
         counts=taken(counts),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
+        steps=order,
     )
 
 

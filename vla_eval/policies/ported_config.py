@@ -48,8 +48,8 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
             )
 
     @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
+    def reward_delta_indices(self) -> list[int] | None:
+        """No rewards, unless a policy says otherwise."""
         return None
 
     def get_optimizer_preset(self) -> Any:

@@ -72,6 +72,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         chosen = ~np.isin(columns["episode_index"], dataset.left_out)
         actions = torch.from_numpy(columns[ACTION_KEY][chosen].astype(np.float32))
         config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
+    if hasattr(config, "fit_to_rewards"):
+        config.fit_to_rewards(read_columns(dataset.root))
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)

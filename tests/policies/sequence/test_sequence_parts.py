@@ -1,20 +1,38 @@
 """Cores over time and encoders of images: what they answer, keep and forget."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
-from vla_eval.policies.sequence.cores import Core, make_core
-from vla_eval.policies.sequence.encoders import Keypoints, Nature
+from vla_eval.errors import VlaEvalError
+from vla_eval.policies.sequence.core import Core
+from vla_eval.policies.sequence.cores import make_core
+from vla_eval.policies.sequence.encoders import Cameras, Keypoints, Nature
 from vla_eval.policies.sequence.sizes import CORES
 
 WIDTH, N_STEPS = 8, 12
+SMALL_OPTIONS: dict[str, dict[str, Any]] = {
+    "decision_transformer": {"head_width": 4},
+    "rate": {"head_width": 4, "cached_tokens": 7, "memory_tokens": 2, "valve_heads": 2},
+    "gtrxl": {"head_width": 4, "cached_tokens": 7},
+    "decision_mamba": {"state": 3},
+    "elmur": {"slots": 3, "experts": 3, "inner_width": 5},
+}
 
 
-def core_named(name: str, *, context_steps: int = 40, layers: int = 2) -> Core:
+def core_named(name: str, *, context_steps: int = 40, layers: int = 2, tokens_per_step: int = 1) -> Core:
     torch.manual_seed(0)
     return make_core(
-        name, width=WIDTH, layers=layers, heads=2, context_steps=context_steps, dropout=0.0
+        name,
+        width=WIDTH,
+        layers=layers,
+        heads=2,
+        context_steps=context_steps,
+        dropout=0.0,
+        tokens_per_step=tokens_per_step,
+        given=SMALL_OPTIONS.get(name),
     ).eval()
 
 
@@ -30,13 +48,25 @@ def answers(core: Core, tokens: Tensor, *, at_once: int) -> Tensor:
     return torch.cat(parts, dim=1)
 
 
-@pytest.mark.parametrize("context_steps", [1, 3, 40])
+@pytest.mark.parametrize(("context_steps", "tokens_per_step"), [(1, 1), (3, 1), (40, 1), (2, 3)])
 @pytest.mark.parametrize("name", CORES)
-def test_steps_one_by_one_get_the_answers_of_all_steps_at_once(name: str, context_steps: int) -> None:
-    core = core_named(name, context_steps=context_steps)
+def test_steps_one_by_one_get_the_answers_of_all_steps_at_once(
+    name: str, context_steps: int, tokens_per_step: int
+) -> None:
+    core = core_named(name, context_steps=context_steps, tokens_per_step=tokens_per_step)
     whole = answers(core, steps(), at_once=N_STEPS)
     for at_once in (1, 5):
         torch.testing.assert_close(answers(core, steps(), at_once=at_once), whole, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", CORES)
+def test_training_gets_the_answers_of_acting(name: str) -> None:
+    core, tokens = core_named(name, context_steps=3), steps()
+    acting = answers(core, tokens, at_once=1)
+    for module in core.modules():
+        if isinstance(module, torch.nn.Dropout | torch.nn.MultiheadAttention):
+            module.p = module.dropout = 0.0
+    torch.testing.assert_close(answers(core.train(), tokens, at_once=N_STEPS), acting, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", CORES)
@@ -55,6 +85,49 @@ def test_a_core_remembers_the_first_step_if_its_row_says_so(name: str) -> None:
     before = answers(core, tokens, at_once=N_STEPS)[:, -1]
     tokens[:, 0, 0] += 1
     assert torch.equal(answers(core, tokens, at_once=N_STEPS)[:, -1], before) is not CORES[name].remembers
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "seen"),
+    [
+        ("rate", {}, True),
+        ("rate", {"cached_tokens": 0}, True),
+        ("rate", {"memory_tokens": 0, "valve_heads": 0}, True),
+        ("rate", {"cached_tokens": 0, "memory_tokens": 0, "valve_heads": 0}, False),
+        ("gtrxl", {}, True),
+        ("elmur", {}, True),
+        ("decision_transformer", {}, False),
+    ],
+)
+def test_a_later_segment_knows_what_is_kept_of_the_first_and_nothing_else(
+    name: str, changes: dict[str, Any], seen: bool
+) -> None:
+    options = {**SMALL_OPTIONS[name], **changes}
+    core = make_core(name, width=WIDTH, layers=2, heads=2, context_steps=4, dropout=0.0, given=options).eval()
+    tokens = steps()
+    before = answers(core, tokens, at_once=N_STEPS)[:, -1]
+    tokens[:, 0, 0] += 1  # of the first segment of three
+    assert torch.equal(answers(core, tokens, at_once=N_STEPS)[:, -1], before) is not seen
+
+
+@pytest.mark.parametrize("name", ["rate", "elmur"])
+@pytest.mark.parametrize("carries", [True, False])
+def test_later_segments_teach_what_to_write_unless_that_is_switched_off(name: str, carries: bool) -> None:
+    options = {**SMALL_OPTIONS[name], "carries_gradient": carries}
+    core = make_core(name, width=WIDTH, layers=1, heads=2, context_steps=4, dropout=0.0, given=options)
+    tokens = steps().requires_grad_()
+    answers, _ = core(tokens, core.begin(2))
+    answers[:, -1].square().sum().backward()
+    assert tokens.grad is not None
+    assert bool(tokens.grad[:, :4].any()) is carries
+
+
+@pytest.mark.parametrize(("lag", "seen"), [(2, True), (3, False)])
+def test_a_decision_transformer_sees_exactly_its_last_steps(lag: int, seen: bool) -> None:
+    core, tokens = core_named("decision_transformer", context_steps=3), steps()
+    before = answers(core, tokens, at_once=1)[:, -1]
+    tokens[:, -1 - lag, 0] += 1
+    assert torch.equal(answers(core, tokens, at_once=1)[:, -1], before) is not seen
 
 
 @pytest.mark.parametrize("name", CORES)
@@ -105,3 +178,30 @@ def test_encoders_take_the_sizes_of_images_that_are_recorded(image_px: int) -> N
 def test_the_encoder_of_the_baselines_has_their_size() -> None:
     """9216 inputs of the last layer for 128 pixels, as in RATE (CognitiveAISystems/RATE, commit 5aa88f0)."""
     assert Nature(image_px=128, outputs=64)[7].in_features == 9216
+    cameras = Cameras("nature_stacked", n_cameras=2, image_px=128, outputs=64)
+    assert (len(cameras), cameras[0][0].in_channels, cameras.outputs) == (1, 6, 64)
+
+
+def test_stacked_images_are_the_channels_of_the_first_camera_and_then_of_the_second() -> None:
+    cameras = Cameras("nature_stacked", n_cameras=2, image_px=64, outputs=5)
+    images = torch.rand(2, 3, 2, 3, 64, 64)  # episodes, steps, cameras
+    one = torch.cat([images[1, 2, 0], images[1, 2, 1]])[None]
+    torch.testing.assert_close(cameras(images)[1, 2], cameras[0](2 * one - 1)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("rate", {"memory_token": 3}, r"core 'rate'.*Did you mean 'memory_tokens'"),
+        ("decision_transformer", {"cached_tokens": 3}, r"option 'cached_tokens'"),
+        ("rate", {"memory_tokens": 0, "valve_heads": 2}, r"valve_heads is 2, expected 0"),
+        ("gtrxl", {"inner_width": 0}, r"inner_width is 0, expected a number ≥ 1"),
+        ("elmur", {"slots": 0}, r"slots is 0, expected a number ≥ 1"),
+        ("decision_mamba", {"state": "many"}, r"'state': expected a whole number"),
+    ],
+)
+def test_options_that_a_core_does_not_have_or_take_are_refused(
+    name: str, given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(VlaEvalError, match=message):
+        make_core(name, width=8, layers=1, heads=1, context_steps=1, dropout=0.0, given=given)

@@ -7,20 +7,24 @@ import pytest
 import torch
 
 from tests.policies.sample_frames import BASE, WRIST, at, between, frames
+from tests.policies.sequence.test_sequence_parts import SMALL_OPTIONS
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import RecipeError
-from vla_eval.policies.sequence.modeling_sequence import MikasaSequencePolicy
+from vla_eval.policies.sequence.modeling_sequence import Demonstrated, MikasaSequencePolicy
 from vla_eval.policies.sequence.sizes import CORES
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.policy_config import policy_config
 
-TINY = {"width": 16, "heads": 2, "context_steps": 20, "chunk_size": 3, "n_action_steps": 2}
+TINY = {"width": 16, "heads": 2, "context_steps": 2, "chunk_size": 3, "n_action_steps": 2}
+RETURNS = {"tokens": "return_observation_action", "reward": "sparse"}
 
 
 def tiny_policy(recorded: Path, **fields: Any) -> Any:
     torch.manual_seed(0)
+    fields.setdefault("core_options", SMALL_OPTIONS.get(fields.get("core", ""), {}))
     recipe = FinetuneRecipe(type="mikasa_sequence", policy={**TINY, **fields})
     dataset = training_dataset(recorded, allow_unreplayed=True)
     return MikasaSequencePolicy(policy_config(recipe, dataset, device="cpu")).eval()
@@ -37,6 +41,68 @@ def test_it_acts_frame_by_frame_as_it_was_trained_on_whole_episodes(recorded: Pa
             memory = policy.remember(between(seen, first, stop), memory)
         chunk = policy.predict_action_chunk(at(seen, stop - 1), memory=memory)
         torch.testing.assert_close(chunk, whole[:, stop - 1].clamp(-1, 1), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("core", CORES)
+def test_when_it_acts_it_reads_the_target_return_and_the_actions_that_it_has_decided_on(
+    recorded: Path, core: str
+) -> None:
+    """As if a demonstration with these returns and actions had been read."""
+    policy = tiny_policy(recorded, core=core, **RETURNS, target_return=2.5)
+    seen, memory, chunks = frames(5, n_episodes=2), None, []
+    for step in range(5):
+        if CORES[core].remembers:
+            memory = policy.remember(between(seen, step, step + 1), memory)
+        chunks.append(policy.predict_action_chunk(at(seen, step), memory=memory))
+    images = torch.stack([seen[BASE], seen[WRIST]], dim=2)
+    with torch.no_grad():
+        tokens = policy.network.tokens(images, seen["observation.state"])
+        actions = torch.stack([chunk[:, 0] for chunk in chunks], dim=1)
+        given = Demonstrated(returns=torch.full((2, 5), 2.5), actions=actions)
+        whole = policy.network.predict(tokens, policy.network.answers(tokens, given)).actions.clamp(-1, 1)
+    torch.testing.assert_close(torch.stack(chunks, dim=1), whole, atol=1e-5, rtol=1e-5)
+
+
+def test_another_target_return_gives_other_actions(recorded: Path) -> None:
+    seen = frames(1)
+    chunks = []
+    for target in (0.0, 1.0):
+        policy = tiny_policy(recorded, core="rate", **RETURNS, target_return=target)
+        memory = policy.remember(between(seen, 0, 1), None)
+        chunks.append(policy.predict_action_chunk(at(seen, 0), memory=memory))
+    assert not torch.allclose(*chunks)
+
+
+def test_the_target_of_sparse_rewards_is_one_and_of_dense_ones_the_best_of_the_dataset(
+    recorded: Path,
+) -> None:
+    assert tiny_policy(recorded, **RETURNS).config.target_return == 1.0
+    dense = tiny_policy(recorded, **{**RETURNS, "reward": "dense"}).config.target_return
+    columns = read_columns(recorded)
+    sums = [columns["next.reward"][columns["episode_index"] == episode].sum() for episode in range(4)]
+    assert dense == pytest.approx(max(sums), rel=1e-5)
+
+
+def test_tokens_of_returns_without_a_kind_of_reward_are_refused(recorded: Path) -> None:
+    with pytest.raises(
+        RecipeError, match=r"reward is None, expected dense or sparse.*reads the return to go"
+    ):
+        tiny_policy(recorded, tokens="return_observation_action")
+    with pytest.raises(RecipeError, match=r"reward and target_return belong to tokens=return"):
+        tiny_policy(recorded, reward="sparse")
+
+
+def test_without_goal_and_weights_the_loss_is_the_mean_squared_error(recorded: Path) -> None:
+    plain = {"goal_weight": 0.0, "change_weight": 0.0, "waiting_share": 1.0, "first_action_weight": 1 / 3}
+    policy = tiny_policy(recorded, head="linear", encoder="nature_stacked", state_in_token=False, **plain)
+    batch = demonstrations(policy, n_episodes=2)
+    with torch.no_grad():
+        loss, _ = policy.train().forward(batch)
+        images = torch.stack([batch[BASE], batch[WRIST]], dim=2)[:, :-1]
+        tokens = policy.network.tokens(images, batch["observation.state"][:, :-1])
+        found = policy.network.predict(tokens, policy.network.answers(tokens, None)).actions
+    wanted = batch["action"].unfold(1, 3, 1).transpose(-1, -2)
+    torch.testing.assert_close(loss, (found - wanted).square().mean(), atol=1e-5, rtol=1e-5)
 
 
 def test_without_a_memory_it_is_not_shown_every_frame(recorded: Path) -> None:
@@ -67,6 +133,8 @@ def test_a_core_that_does_not_exist_is_answered_by_the_nearest(recorded: Path) -
 def test_a_width_that_the_heads_do_not_divide_is_refused(recorded: Path) -> None:
     with pytest.raises(RecipeError, match=r"width is 18, expected a multiple of 2 · heads \(4\)"):
         tiny_policy(recorded, core="transformer", width=18)
+    with pytest.raises(RecipeError, match=r"width is 15, expected a multiple of 2 for the core 'rate'"):
+        tiny_policy(recorded, core="rate", width=15)
 
 
 def test_the_recipes_differ_in_nothing_but_the_core() -> None:
@@ -81,13 +149,20 @@ def test_the_recipes_differ_in_nothing_but_the_core() -> None:
     assert recipes["recurrent"] == recipes["context"] == recipes["bc_mlp"]
 
 
+def demonstrations(policy: Any, *, n_episodes: int) -> dict[str, torch.Tensor]:
+    """Return a batch of episodes as long as the window, with random actions."""
+    n_steps, chunk = policy.config.n_window_steps, policy.config.chunk_size
+    batch = frames(n_steps + 1, n_episodes=n_episodes)
+    draws = torch.Generator().manual_seed(2)
+    batch["action"] = 2 * torch.rand(n_episodes, n_steps + chunk - 1, 7, generator=draws) - 1
+    batch["action_is_pad"] = torch.zeros(n_episodes, n_steps + chunk - 1, dtype=torch.bool)
+    batch["observation.state_is_pad"] = torch.zeros(n_episodes, n_steps + 1, dtype=torch.bool)
+    return batch
+
+
 def test_the_mean_of_all_goals_misses_one_variance(recorded: Path) -> None:
     policy = tiny_policy(recorded)
-    n_steps, chunk = policy.config.n_window_steps, policy.config.chunk_size
-    batch = frames(n_steps + 1, n_episodes=2)
-    batch["action"] = torch.zeros(2, n_steps + chunk - 1, 7)
-    batch["action_is_pad"] = torch.zeros(2, n_steps + chunk - 1, dtype=torch.bool)
-    batch["observation.state_is_pad"] = torch.zeros(2, n_steps + 1, dtype=torch.bool)
+    batch = demonstrations(policy, n_episodes=2)
     with torch.no_grad():
         policy.network.goal.weight.zero_()
         policy.network.goal.bias.copy_(5 * batch["observation.state"][:, -1, :3].mean(dim=0))

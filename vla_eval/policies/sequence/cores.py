@@ -1,29 +1,17 @@
-"""Cores over time: tokens of steps in, one answer per step out, and what is kept for the next step.
+"""The cores by name, and the plain ones: no memory, a recurrent state, a transformer over all frames."""
 
-Every core answers a step from that step and those before it alone. It gives the same answers, up to
-rounding, whether it is given the steps of an episode at once or one after the other.
-"""
-
-import abc
 import math
+from collections.abc import Mapping
+from typing import Any  # values of a recipe
 
 import torch
 from torch import Tensor, nn
 
-CoreMemory = tuple[Tensor, ...]
-"""What is kept of B episodes, each tensor (B, …)."""
-
-
-class Core(nn.Module, abc.ABC):
-    """What a policy needs of a core."""
-
-    @abc.abstractmethod
-    def begin(self, n_episodes: int) -> CoreMemory:
-        """Return the memory before the first step."""
-
-    @abc.abstractmethod
-    def forward(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
-        """Return the answers (B, T, width) to tokens (B, T, width), and the memory after the last."""
+from vla_eval.policies.sequence.core import Core, CoreMemory
+from vla_eval.policies.sequence.elmur import Elmur
+from vla_eval.policies.sequence.mamba import DecisionMamba
+from vla_eval.policies.sequence.sizes import ElmurOptions, MambaOptions, TransformerXLOptions, options_of
+from vla_eval.policies.sequence.transformer_xl import TransformerXL
 
 
 class PerStep(Core):
@@ -137,12 +125,41 @@ class CausalTransformer(Core):
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-def make_core(name: str, *, width: int, layers: int, heads: int, context_steps: int, dropout: float) -> Core:
-    """Return the core of that name in `CORES`."""
+def make_core(
+    name: str,
+    *,
+    width: int,
+    layers: int,
+    heads: int,
+    context_steps: int,
+    dropout: float,
+    tokens_per_step: int = 1,
+    given: Mapping[str, Any] | None = None,
+) -> Core:
+    """Return the core of that name in `CORES`.
+
+    Args:
+        name: of the core.
+        width: of tokens.
+        layers: one above the other.
+        heads: of attention.
+        context_steps: that a layer of a transformer sees, or that are in a segment.
+        dropout: of the core.
+        tokens_per_step: tokens of a step.
+        given: fields of the core's options that differ from its row.
+    """
+    options, n_tokens = options_of(name, given or {}), context_steps * tokens_per_step
+    stack: dict[str, Any] = {"width": width, "layers": layers, "dropout": dropout}
+    if isinstance(options, TransformerXLOptions):
+        # A window that moves on by a step shares all others with the one before.
+        overlap = n_tokens - tokens_per_step if name == "decision_transformer" else 0
+        return TransformerXL(**stack, heads=heads, segment=n_tokens, overlap=overlap, options=options)
+    if isinstance(options, ElmurOptions):
+        return Elmur(**stack, heads=heads, segment=n_tokens, options=options)
+    if isinstance(options, MambaOptions):
+        return DecisionMamba(**stack, options=options)
     if name == "mlp":
-        return PerStep(width=width, layers=layers, dropout=dropout)
+        return PerStep(**stack)
     if name == "transformer":
-        return CausalTransformer(
-            width=width, layers=layers, heads=heads, context_steps=context_steps, dropout=dropout
-        )
-    return Recurrent({"gru": nn.GRU, "lstm": nn.LSTM}[name], width=width, layers=layers, dropout=dropout)
+        return CausalTransformer(**stack, heads=heads, context_steps=n_tokens)
+    return Recurrent({"gru": nn.GRU, "lstm": nn.LSTM}[name], **stack)

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.policies.sequence.sizes import ENCODERS
+
 RGB = 3
 KEYPOINTS = 32
 NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
@@ -47,14 +49,15 @@ class Keypoints(nn.Module):
     Args:
         image_px: height and width of an image, a multiple of 4.
         outputs: numbers that are returned.
+        channels: of an image.
     """
 
     line: Tensor
 
-    def __init__(self, *, image_px: int, outputs: int) -> None:
+    def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
         super().__init__()
         self.features = nn.Sequential(
-            nn.Conv2d(RGB, 32, 8, stride=4, padding=2),
+            nn.Conv2d(channels, 32, 8, stride=4, padding=2),
             nn.ReLU(),
             nn.Conv2d(32, 32, 3, padding=1),
             nn.ReLU(),
@@ -75,3 +78,29 @@ class Keypoints(nn.Module):
         y = (shares.sum(dim=-1) * self.line).sum(dim=-1)
         read: Tensor = self.reads(torch.cat([x, y, strong], dim=-1))
         return read
+
+
+class Cameras(nn.ModuleList):
+    """The images of all cameras as one vector: an encoder for each, or one whose channels they all are.
+
+    Args:
+        name: of the encoder in `ENCODERS`.
+        n_cameras: number of cameras.
+        image_px: height and width of an image.
+        outputs: numbers that an encoder returns.
+    """
+
+    def __init__(self, name: str, *, n_cameras: int, image_px: int, outputs: int) -> None:
+        make = Keypoints if name == "keypoints" else Nature
+        channels = RGB * n_cameras if ENCODERS[name].shared else RGB
+        n_encoders = RGB * n_cameras // channels
+        self.outputs = n_encoders * outputs
+        super().__init__(
+            make(image_px=image_px, outputs=outputs, channels=channels) for _ in range(n_encoders)
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W) in [0, 1]."""
+        parts = (2 * images - 1).flatten(0, 1).flatten(1, 2).chunk(len(self), dim=1)
+        seen = [encoder(part) for encoder, part in zip(self, parts, strict=True)]
+        return torch.cat(seen, dim=-1).reshape(*images.shape[:2], self.outputs)

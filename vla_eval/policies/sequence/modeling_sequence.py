@@ -9,14 +9,20 @@ from torch.nn import functional
 from vla_eval.features import STATE_KEY
 from vla_eval.policies.eef_state import POSITION_SCALE, SPACE
 from vla_eval.policies.episode_policy import EpisodePolicy
-from vla_eval.policies.episode_samples import episodes_of, goal_missed, stacked_images, weighted_mean
+from vla_eval.policies.episode_samples import (
+    Episodes,
+    episodes_of,
+    goal_missed,
+    stacked_images,
+    weighted_mean,
+)
+from vla_eval.policies.returns import returns_to_go, rewards_in
 from vla_eval.policies.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
-from vla_eval.policies.sequence.cores import CoreMemory, make_core
-from vla_eval.policies.sequence.encoders import Keypoints, Nature
+from vla_eval.policies.sequence.core import CoreMemory
+from vla_eval.policies.sequence.cores import make_core
+from vla_eval.policies.sequence.encoders import Cameras
 from vla_eval.policies.sequence.sizes import CORES
 from vla_eval.policies.steps.precision import in_float32
-
-ENCODERS = {"keypoints": Keypoints, "nature": Nature}
 
 
 class Predicted(NamedTuple):
@@ -44,8 +50,20 @@ class Gated(nn.Module):
         return gated
 
 
+class Demonstrated(NamedTuple):
+    """What the tokens of a demonstration's steps are made of, beside the observations.
+
+    Attributes:
+        returns: (B, T) to go.
+        actions: (B, T, action) executed at these steps.
+    """
+
+    returns: Tensor
+    actions: Tensor
+
+
 class SequenceNetwork(nn.Module):
-    """An encoder for each camera, a token for each step, a core over the steps, a head.
+    """Encoders of images, tokens for each step, a core over the tokens, a head.
 
     Args:
         config: sizes and names of the parts.
@@ -55,11 +73,11 @@ class SequenceNetwork(nn.Module):
         super().__init__()
         width, images = config.width, config.image_features
         image_px = int(next(iter(images.values())).shape[-1])
-        make = ENCODERS[config.encoder]
-        self.encoders = nn.ModuleList(make(image_px=image_px, outputs=width) for _ in images)
-        n_state = int(config.robot_state_feature.shape[0])
+        self.config = config
+        self.encoders = Cameras(config.encoder, n_cameras=len(images), image_px=image_px, outputs=width)
+        n_state = int(config.robot_state_feature.shape[0]) if config.state_in_token else 0
         self.token = nn.Sequential(
-            nn.Linear(len(images) * width + n_state, width), nn.LayerNorm(width), nn.GELU()
+            nn.Linear(self.encoders.outputs + n_state, width), nn.LayerNorm(width), nn.GELU()
         )
         self.core = make_core(
             config.core,
@@ -68,11 +86,17 @@ class SequenceNetwork(nn.Module):
             heads=config.heads,
             context_steps=config.context_steps,
             dropout=config.dropout,
+            tokens_per_step=config.tokens_per_step,
+            given=config.core_options,
         )
-        self.head = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width), Gated(width, width))
+        if config.head == "gated":
+            self.head = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width), Gated(width, width))
         self.shape = (config.chunk_size, int(config.action_feature.shape[0]))
         self.actions = nn.Linear(width, self.shape[0] * self.shape[1])
         self.goal = nn.Linear(width, SPACE)
+        if config.reads_returns:
+            self.returns = nn.Linear(1, width)
+            self.executed = nn.Linear(self.shape[1], width)
 
     def begin(self, n_episodes: int) -> CoreMemory:
         """Return the memory before the first step; its last tensor is the core's answer, (B, width)."""
@@ -81,25 +105,55 @@ class SequenceNetwork(nn.Module):
 
     def tokens(self, images: Tensor, state: Tensor) -> Tensor:
         """Return (B, T, width) of images (B, T, cameras, 3, H, W) in [0, 1] and state (B, T, state)."""
-        shape = state.shape[:2]
-        seen = [
-            encoder((2 * images[:, :, index] - 1).flatten(0, 1)).unflatten(0, shape)
-            for index, encoder in enumerate(self.encoders)
-        ]
-        token: Tensor = self.token(torch.cat([*seen, state * POSITION_SCALE], dim=-1))
+        seen = self.encoders(images)
+        read = [seen, state * POSITION_SCALE] if self.config.state_in_token else [seen]
+        token: Tensor = self.token(torch.cat(read, dim=-1))
         return token
 
+    def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
+        """Return the core's answers (B, T, width) to the observations of whole demonstrations.
+
+        Args:
+            tokens: (B, T, width) of the observations.
+            demonstrated: what the other tokens are made of, if there are others.
+        """
+        begun = self.core.begin(len(tokens))
+        if demonstrated is None:
+            alone: Tensor = self.core(tokens, begun)[0]
+            return alone
+        returns, executed = self.returns(demonstrated.returns[..., None]), self.executed(demonstrated.actions)
+        steps = torch.stack([returns, tokens, executed], dim=2)
+        read: Tensor = self.core(steps.flatten(1, 2), begun)[0]
+        return read[:, 1 :: steps.shape[2]]
+
     def read(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
-        """Return the core's answers (B, T, width), and the memory after the last step."""
-        answers, kept = self.core(tokens, memory[:-1])
-        return answers, (*kept, answers[:, -1])
+        """Return the core's answers (B, T, width) to observations, and the memory after the last step.
+
+        The return to go is the target at every step: no reward is known. The action is the one that the
+        policy itself decides on at the step.
+        """
+        if not self.config.reads_returns:
+            answers, kept = self.core(tokens, memory[:-1])
+            return answers, (*kept, answers[:, -1])
+        kept, found = memory[:-1], []
+        target = tokens.new_full((len(tokens), 1, 1), self.config.return_at_inference)
+        for step in range(tokens.shape[1]):
+            token = tokens[:, step : step + 1]
+            told = torch.cat([self.returns(target), token], dim=1)
+            answer, kept = self.core(told, kept)
+            found.append(answer[:, 1:])
+            action = self.predict(token, found[-1]).actions[:, :, 0].clamp(-1, 1)
+            _, kept = self.core(self.executed(action.to(token.dtype)), kept)
+        return torch.cat(found, dim=1), (*kept, found[-1][:, 0])
 
     @in_float32
     def predict(self, tokens: Tensor, answers: Tensor) -> Predicted:
         """Return what is predicted at each step, both inputs (B, T, width)."""
-        decided = self.head(torch.cat([tokens, answers], dim=-1))
+        is_gated = self.config.head == "gated"
+        decided = self.head(torch.cat([tokens, answers], dim=-1)) if is_gated else answers
+        actions = self.actions(decided).unflatten(-1, self.shape)
         return Predicted(
-            actions=self.actions(decided).unflatten(-1, self.shape),
+            actions=actions if is_gated else actions.tanh(),
             goal_m=self.goal(decided) / POSITION_SCALE,
         )
 
@@ -125,7 +179,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         # Images are most of the work: those of padding are not encoded.
         encoded = network.tokens(episodes.images[real][None], episodes.state[real][None])[0]
         tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
-        answers, _ = network.read(tokens, network.begin(len(tokens)))
+        answers = network.answers(tokens, self._demonstrated(batch, episodes))
         predicted = network.predict(tokens, answers)
         errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
@@ -135,6 +189,13 @@ class MikasaSequencePolicy(EpisodePolicy):
         parts = {"imitation": imitation, "goal": goal}
         loss = imitation + config.goal_weight * goal
         return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    def _demonstrated(self, batch: dict[str, Tensor], episodes: Episodes) -> Demonstrated | None:
+        if not self.config.reads_returns:
+            return None
+        kind: Any = self.config.reward  # the configuration has checked it
+        returns = returns_to_go(rewards_in(batch, kind)).gather(1, episodes.steps)
+        return Demonstrated(returns=returns, actions=episodes.actions[:, :, 0])
 
     @torch.no_grad()
     def _remember(self, batch: dict[str, Tensor], memory: CoreMemory | None) -> CoreMemory:
