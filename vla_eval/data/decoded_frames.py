@@ -141,11 +141,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         for key, chosen in rows.items():
             if key not in self._frames:
                 fields[key] = self._columns[key][chosen]
-        images = {camera: self._image(camera, rows.get(camera, [index])) for camera in self._frames}
-        sample = {**images, **fields}
-        if self._transforms is not None:
-            for camera in images:
-                sample[camera] = self._transforms(sample[camera])
+        sample = {**self._images(index, rows), **fields}
         sample["task"] = self.meta.tasks.iloc[fields["task_index"].item()].name
         return sample
 
@@ -178,11 +174,16 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
             padding[f"{key}_is_pad"] = torch.tensor([not first <= row < stop for row in wanted])
         return rows, padding
 
+    def _images(self, index: int, rows: Mapping[str, list[int]]) -> Sample:
+        """Return the images of a sample by field; `rows` has those of fields with an axis of time."""
+        return {camera: self._image(camera, rows.get(camera, [index])) for camera in self._frames}
+
     def _image(self, camera: str, rows: list[int]) -> torch.Tensor:
         taken = self._frames[camera][rows]  # a list of rows copies
         frames = torch.from_numpy(taken) if isinstance(taken, np.ndarray) else taken
         frames = frames.squeeze(0)
-        return frames if self._return_uint8 else frames.type(torch.float32) / MAX_UINT8
+        frames = frames if self._return_uint8 else frames.type(torch.float32) / MAX_UINT8
+        return frames if self._transforms is None else self._transforms(frames)
 
 
 def read_columns(source: LeRobotDataset) -> dict[str, Any]:

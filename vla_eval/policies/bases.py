@@ -196,12 +196,17 @@ BASES: Mapping[str, Base] = MappingProxyType({base.name: base for base in _ALL})
 OF_RECIPES: Mapping[str, str] = MappingProxyType(
     {
         "smolvla": "smolvla_base",
+        "smolvla_frames": "smolvla_base",
+        "smolvla_memory_tokens": "smolvla_base",
         "pi0": "pi0_base",
         "pi0_expert": "pi0_base",
         "pi0_lora": "pi0_base",
+        "pi0_frames": "pi0_base",
         "pi05": "pi05_base",
         "pi05_expert": "pi05_base",
         "pi05_lora": "pi05_base",
+        "pi05_frames": "pi05_base",
+        "pi05_memory_tokens": "pi05_base",
         "pi0_fast": "pi0_fast_base",
         "octo_small": "octo_small",
         "octo_base": "octo_base",

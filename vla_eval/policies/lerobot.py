@@ -15,6 +15,8 @@ Three kinds of policies, told apart by their configuration:
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
   gets `memory` (a recurrent policy of your own). One that also has `begin_memory(n_episodes) -> memory`,
   a tuple of tensors (B, …), infers for several episodes in one pass: see `lerobot_memory.py`.
+
+Any of them may be shown earlier frames as further images: see `vla_memory/`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,8 +52,15 @@ from vla_eval.policies.lerobot_inputs import (
     input_map,
 )
 from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
-from vla_eval.policies.lerobot_memory import memory_of, recall, remembers, remembers_in_rows
+from vla_eval.policies.lerobot_memory import (
+    memory_of,
+    recall,
+    remembers,
+    remembers_in_rows,
+    remembers_singly,
+)
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
+from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.specs import PolicySpec
 
 
@@ -88,6 +97,7 @@ class LeRobotPolicy:
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
         self._remembers = remembers(loaded.policy)
+        self._earlier = _earlier_frames(loaded.config)
         self._deltas = history(loaded.config)
         self._masks_history = bool(getattr(loaded.config, "masks_history", False))
         self._noise_shape = noise_shape(loaded.config)
@@ -113,7 +123,7 @@ class LeRobotPolicy:
         self._slots: dict[int, Episode] = {}
         self.spec = PolicySpec(
             name=name,
-            reads="every" if self._remembers or len(self._deltas) > 1 else "last",
+            reads="every" if self._remembers or self._earlier or len(self._deltas) > 1 else "last",
             cameras=tuple(inputs.cameras),
             states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
@@ -122,7 +132,7 @@ class LeRobotPolicy:
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
         for episode in episodes:
-            self._slots[episode.slot] = Episode(start=episode)
+            self._slots[episode.slot] = Episode(start=episode, earlier=self._earlier)
 
     def forget(self, slots: Sequence[int]) -> None:
         """Release the frames and the memory of these slots."""
@@ -191,7 +201,7 @@ class LeRobotPolicy:
             return batch
 
         policy = self._loaded.policy
-        if not self._batch:
+        if not self._batch and not remembers_singly(policy):
             (episode,) = rows
             memory = policy.remember(preprocessed([frames_in_time(episode.unseen)]), episode.memory)
             return memory, [memory]
@@ -208,6 +218,12 @@ class LeRobotPolicy:
                 "disagree."
             )
         return [ActionChunk(actions=np.ascontiguousarray(row)) for row in rows]
+
+
+def _earlier_frames(config: Any) -> FrameMemory | None:
+    """Return the memory of a policy that is shown earlier frames before the first one; None: it is not."""
+    choice = config.frame_choice() if hasattr(config, "frame_choice") else None
+    return None if choice is None else FrameMemory(choice=choice, cameras=tuple(config.memory_cameras))
 
 
 def make_lerobot(

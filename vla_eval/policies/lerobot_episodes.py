@@ -14,6 +14,7 @@ from torch import Tensor
 
 from vla_eval.core import EpisodeStart
 from vla_eval.errors import InvalidActionError
+from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.seeding import Stream, generator
 
 Frame = Mapping[str, Tensor]
@@ -30,6 +31,7 @@ class Episode:
         frames: the newest frames that an inference may read, oldest first.
         unseen: the frames since the previous inference, oldest first.
         memory: what the policy remembers of the frames before; None at the beginning.
+        earlier: the earlier frames that the policy is shown as further images; None: it is shown none.
         step: of the newest frame.
     """
 
@@ -37,13 +39,21 @@ class Episode:
     frames: tuple[Frame, ...] = ()
     unseen: tuple[Frame, ...] = ()
     memory: Any = None  # whatever the policy's `remember` returns
+    earlier: FrameMemory | None = None
     step: int = 0
 
     def shown(self, unseen: Sequence[Frame], *, step: int, n_kept: int) -> "Episode":
         """Return the episode after these frames, of which an inference may read the newest `n_kept`."""
+        earlier = self.earlier
+        if earlier is not None:
+            shown = []
+            for frame in unseen:
+                earlier = earlier.after(frame)
+                shown.append({**frame, **earlier.fields()})
+            unseen = shown
         frames = deque(self.frames, maxlen=n_kept)
         frames.extend(unseen)
-        return replace(self, frames=tuple(frames), unseen=tuple(unseen), step=step)
+        return replace(self, frames=tuple(frames), unseen=tuple(unseen), earlier=earlier, step=step)
 
     def read(self, deltas: Sequence[int], *, masks_history: bool) -> Frame:
         """Return the frame (…) that an inference reads, or the frames in time (T, …).

@@ -238,9 +238,12 @@ def _expected_cameras(config: Any, absent: Sequence[str], policy: str) -> dict[s
                 f"policy '{policy}' (type '{config.type}') does not mask missing cameras, so that "
                 f"`absent_cameras` cannot leave out '{field}'. Map a camera to it."
             )
-    # `empty_camera_i`: declared as masked by the policy's own configuration.
+    # `empty_camera_i`: declared as masked by the policy's own configuration. Earlier frames have no camera.
+    not_cameras = (*absent, *getattr(config, "memory_fields", ()))
     return {
-        key: shape for key, shape in features.items() if key not in absent and ".empty_camera_" not in key
+        key: shape
+        for key, shape in features.items()
+        if key not in not_cameras and ".empty_camera_" not in key
     }
 
 

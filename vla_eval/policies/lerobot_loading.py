@@ -28,7 +28,8 @@ import vla_eval.policies.octo.configuration_octo
 import vla_eval.policies.offline_rl.configuration_offline_rl
 import vla_eval.policies.openvla.configuration_openvla
 import vla_eval.policies.sequence.configuration_sequence
-import vla_eval.policies.spatialvla.configuration_spatialvla  # noqa: F401  as above
+import vla_eval.policies.spatialvla.configuration_spatialvla
+import vla_eval.policies.vla_memory.configuration_vla_memory  # noqa: F401  as above
 from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError, unknown_name
 from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import (
@@ -53,7 +54,10 @@ from vla_eval.policies.weights import check_same, put_weights
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
 
 BUILT_EMPTY = frozenset(
-    {"pi0", "pi05", "pi0_fast", "smolvla", "mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"}
+    {
+        *("pi0", "pi05", "pi0_fast", "smolvla", "mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"),
+        *("mikasa_pi0", "mikasa_pi05", "mikasa_smolvla"),
+    }
 )
 """Types whose constructors do not compute with their weights: they are built without memory for them."""
 

@@ -33,6 +33,11 @@ def remembers(policy: Any) -> bool:
     return callable(getattr(policy, "remember", None))
 
 
+def remembers_singly(policy: Any) -> bool:
+    """Whether a policy takes one frame per episode, (B, …), as at an inference, without an axis of time."""
+    return remembers_in_rows(policy) and bool(getattr(policy, "remembers_singly", False))
+
+
 def remembers_in_rows(policy: Any) -> bool:
     """Whether a policy can be shown the frames of several episodes in one pass."""
     return remembers(policy) and callable(getattr(policy, "begin_memory", None))
@@ -48,11 +53,12 @@ def recall(
     Args:
         policy: its `remember` may change the memory that it is given in place.
         rows: the episode of each row; its memory is one that `memory_of` returned, or None.
-        preprocess: from frames (T, …), one per row, to the batch that the policy reads.
+        preprocess: from frames (T, …) or (…), one per row, to the batch that the policy reads.
 
     Raises:
         SpecMismatchError: the policy's memory does not have a row for each episode.
     """
+    singly = remembers_singly(policy)
     first = policy.begin_memory(len(rows))
     _check(first, first, len(rows), where="begin_memory")
     begun = [memory_of(first, row) if e.memory is None else e.memory for row, e in enumerate(rows)]
@@ -61,7 +67,7 @@ def recall(
         # A row without a frame at this step computes with its newest one, to no effect.
         frames = [episode.unseen[min(index, len(episode.unseen) - 1)] for episode in rows]
         has_frame = torch.tensor([index < len(episode.unseen) for episode in rows])
-        batch = preprocess([frames_in_time([frame]) for frame in frames])
+        batch = preprocess([frame if singly else frames_in_time([frame]) for frame in frames])
         after = policy.remember(batch, _like(memory, [part.clone() for part in memory]))
         _check(after, memory, len(rows), where="remember")
         memory = _like(memory, [_chosen(has_frame, *parts) for parts in zip(after, memory, strict=True)])

@@ -39,6 +39,11 @@ def chunk_size(config: Any) -> int:
     return n_actions
 
 
+def wrapped_type(config: Any) -> str:
+    """Return lerobot's type of a policy, or of the one to which it adds something and says so by `wraps`."""
+    return str(getattr(config, "wraps", config.type))
+
+
 def noise_shape(config: Any) -> tuple[int, int] | None:
     """Return the shape of one episode's noise for policies that take it from outside; None for others.
 
@@ -47,7 +52,7 @@ def noise_shape(config: Any) -> tuple[int, int] | None:
     own = getattr(config, "noise_shape", None)
     if own is not None:
         return (int(own[0]), int(own[1]))
-    if config.type in ("pi0", "pi05", "smolvla"):
+    if wrapped_type(config) in ("pi0", "pi05", "smolvla"):
         return (int(config.chunk_size), int(config.max_action_dim))
     if config.type == "diffusion" and config.noise_scheduler_type == "DDIM":  # DDPM draws at every step
         return (int(config.horizon), int(config.action_feature.shape[0]))

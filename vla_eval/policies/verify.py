@@ -21,7 +21,9 @@ from vla_eval.policies.lerobot_loading import (
     read_config,
     read_weights,
 )
+from vla_eval.policies.lerobot_memory import remembers_singly
 from vla_eval.policies.lerobot_types import chunk_size, history, noise_shape
+from vla_eval.policies.vla_memory.fields import mask_field
 from vla_eval.policies.weights import check_fit
 
 INSTRUCTION = "pick the cube"
@@ -150,7 +152,10 @@ def _act(loaded: LoadedPolicy) -> Tensor:
     if shape is not None:
         extra["noise"] = torch.randn(1, *shape, generator=draws).to(config.device)
     if callable(getattr(loaded.policy, "remember", None)):
-        extra["memory"] = loaded.policy.remember(loaded.preprocessor(random_batch(config, (0,), draws)), None)
+        times = () if remembers_singly(loaded.policy) else (0,)
+        extra["memory"] = loaded.policy.remember(
+            loaded.preprocessor(random_batch(config, times, draws)), None
+        )
     loaded.policy.reset()
     batch = loaded.preprocessor(random_batch(config, history(config), draws))
     actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))
@@ -167,6 +172,8 @@ def random_batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -
         batch[key] = torch.rand(1, *times, *feature.shape, generator=draws)
         if times:
             batch[f"{key}_is_pad"] = torch.zeros(1, *times, dtype=torch.bool)
+        if key in getattr(config, "memory_fields", ()):
+            batch[mask_field(key)] = torch.ones(1, *times, dtype=torch.bool)
     return batch
 
 

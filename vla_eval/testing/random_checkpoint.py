@@ -20,6 +20,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
 from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, write_facts
 from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.lerobot_loading import config_class
 from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
 from vla_eval.policies.weight_file import write_weights
 from vla_eval.testing import tiny_models
@@ -83,7 +84,7 @@ def stand_in_config(
     """
     changes: dict[str, Any] = {}
     tokenizer: Path | None = None
-    kind = recipe.type
+    kind = getattr(config_class(recipe.type, where="finetune.type"), "wraps", recipe.type)
     if kind in BYTE_TOKENIZER_SIZES:
         own = recipe.policy.get("sizes", {})
         changes |= {"tokenizer_name": "bytes", "sizes": {**BYTE_TOKENIZER_SIZES[kind], **own}}
@@ -102,7 +103,7 @@ def stand_in_config(
     if dtype is not None:
         changes["dtype"] = dtype
     base = recipe.base_checkpoint
-    changed = FinetuneRecipe(type=kind, policy={**recipe.policy, **changes}, base_checkpoint=base)
+    changed = FinetuneRecipe(type=recipe.type, policy={**recipe.policy, **changes}, base_checkpoint=base)
     return assumed_config(changed), tokenizer
 
 
@@ -205,11 +206,11 @@ def built_tiny(kind: str, *, tiny: bool) -> Iterator[None]:
     Raises:
         CheckpointError: a tiny form is asked for, and the type has none but by recipes of its own.
     """
-    if tiny and kind in PI0_FAMILY:
-        family: Any = kind
+    family: Any = getattr(config_class(kind, where="finetune.type"), "wraps", kind)
+    if tiny and family in PI0_FAMILY:
         with tiny_models.tiny_paligemma(family):
             yield
-    elif tiny and kind != "smolvla":
+    elif tiny and family != "smolvla":
         raise CheckpointError(
             f"--tiny is for the π0 family and SmolVLA; '{kind}' has recipes of its own that are tiny."
         )

@@ -32,6 +32,7 @@ from vla_eval.policies.lerobot_loading import (
     make_unfilled_policy,
     read_config,
 )
+from vla_eval.policies.lerobot_memory import remembers_in_rows
 from vla_eval.policies.lerobot_types import history
 from vla_eval.policies.verify import random_batch
 from vla_eval.rollout import RolloutSettings, rollout
@@ -291,7 +292,8 @@ def _rates(folder: Path, device: str, batches: Sequence[int]) -> dict[int, float
         batch = {key: x.repeat_interleave(n, 0) if isinstance(x, Tensor) else x * n for key, x in one.items()}
         for _ in range(2):  # the first one fills caches
             started = time.perf_counter()
-            chunk = loaded.policy.predict_action_chunk(loaded.preprocessor(dict(batch)))
+            extra = {"memory": loaded.policy.begin_memory(n)} if remembers_in_rows(loaded.policy) else {}
+            chunk = loaded.policy.predict_action_chunk(loaded.preprocessor(dict(batch)), **extra)
             loaded.postprocessor(chunk)  # on the CPU at its end, so that the device has finished
             rates[n] = n / (time.perf_counter() - started)
     return rates
@@ -299,7 +301,9 @@ def _rates(folder: Path, device: str, batches: Sequence[int]) -> dict[int, float
 
 def _cameras(config: Any) -> dict[str, str]:
     """Return the field that each camera's images have in the checkpoint."""
-    return dict(zip(CAMERA_KEYS, config.image_features, strict=True))
+    not_cameras = getattr(config, "memory_fields", ())
+    fields = [field for field in config.image_features if field not in not_cameras]
+    return dict(zip(CAMERA_KEYS, fields, strict=True))
 
 
 def _check_memory(limit: int, device: str) -> None:

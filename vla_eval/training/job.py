@@ -20,6 +20,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
 from vla_eval.policies.lerobot_device import choose_device
+from vla_eval.policies.vla_memory.fields import SampleMemory
 from vla_eval.seeding import SeedRange
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.failures import chosen_episodes
@@ -84,6 +85,12 @@ class TrainingJob:
         return kind
 
     @property
+    def sample_memory(self) -> SampleMemory | None:
+        """What a sample has beside its own frame, see `RememberedFramesDataset`; None: nothing."""
+        memory: SampleMemory | None = getattr(self.policy, "sample_memory", None)
+        return memory
+
+    @property
     def facts(self) -> TrainingFacts:
         """What is written beside each checkpoint's weights."""
         dataset, features = self.dataset, self.dataset.meta.features
@@ -146,6 +153,7 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         held_out_task=task,
     )
     needs = "whole episodes" if job.whole_episodes else "rewards" if job.reward is not None else None
+    needs = "earlier frames" if job.sample_memory is not None else needs
     if needs is not None and not recipe.decode_ahead:
         raise RecipeError(
             f"finetune.decode_ahead is false; '{recipe.type}' is trained on {needs}, which are served "

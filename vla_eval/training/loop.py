@@ -36,6 +36,7 @@ from lerobot.utils.utils import cycle, has_method, init_logging
 from tqdm import tqdm
 
 from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
 from vla_eval.training.checkpoints import load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
@@ -43,6 +44,7 @@ from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.model import local_files_only, make_model, make_processors
 from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE
+from vla_eval.training.segments import preprocessed
 
 MAX_UINT8 = 255.0
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
@@ -115,10 +117,8 @@ class _Training:
         torch.backends.cudnn.benchmark = True
         torch.backends.cuda.matmul.allow_tf32 = True
         with accelerator.main_process_first():  # the others find the decoded frames
-            dataset = make_dataset(self.config)
-            if job.recipe.decode_ahead:
-                dataset = DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes, reward=job.reward)
-        self.cameras = dataset.meta.camera_keys
+            dataset = _dataset(job, self.config)
+        self.images = getattr(dataset, "image_fields", dataset.meta.camera_keys)
         self.tracker = new_tracker(job, dataset, accelerator)
         set_seed(job.run_seed)
         model = make_model(job, dataset.meta)
@@ -147,10 +147,10 @@ class _Training:
         """Do one gradient step, the `step`-th counted from 1."""
         tracker, started = self.tracker, time.perf_counter()
         batch = next(self.batches)
-        for key in self.cameras:
+        for key in self.images:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(dtype=torch.float32) / MAX_UINT8
-        batch = self.before(batch)
+        batch = preprocessed(self.before, batch)
         loaded = time.perf_counter()
         seed_step(self.job.run_seed, step - 1, self.accelerator.process_index)
         self.policy.train()
@@ -197,6 +197,16 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
     if getattr(policy, "use_amp", False) and not hasattr(policy, "dtype"):
         return torch.get_autocast_dtype(torch.device(device).type)
     return LAUNCHED.get(os.environ.get(LAUNCHED_PRECISION, ""))
+
+
+def _dataset(job: TrainingJob, config: Any) -> Any:
+    """Return lerobot's dataset, or one that serves the same from decoded frames."""
+    dataset = make_dataset(config)
+    if job.sample_memory is not None:
+        return RememberedFramesDataset(dataset, job.sample_memory)
+    if job.recipe.decode_ahead:
+        return DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes, reward=job.reward)
+    return dataset
 
 
 def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:

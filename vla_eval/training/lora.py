@@ -27,9 +27,14 @@ def peft_config(recipe: FinetuneRecipe) -> PeftConfig | None:
     return PeftConfig(
         r=lora.rank,
         lora_alpha=lora.alpha or lora.rank,
-        target_modules=lora.target_modules or LORA_TARGETS.get(recipe.type),
+        target_modules=lora.target_modules or LORA_TARGETS.get(_wrapped(recipe.type)),
         full_training_modules=list(lora.full_modules) or None,
     )
+
+
+def _wrapped(kind: str) -> str:
+    """Return lerobot's type of a policy, or of the one to which it adds something."""
+    return str(getattr(config_class(kind, where="finetune.type"), "wraps", kind))
 
 
 def check_lora_targets(recipe: FinetuneRecipe) -> None:
@@ -63,7 +68,14 @@ def check_adapters(model: Any, recipe: FinetuneRecipe, policy: Any) -> None:
     """
     if recipe.lora is None:
         return
+    if getattr(policy, "memory_tokens", 0) and "memory_tokens" not in recipe.lora.full_modules:
+        raise RecipeError(
+            "finetune.lora: new memory tokens have nothing to adapt. Train them in full: "
+            "finetune.lora.full_modules: [memory_tokens]"
+        )
     own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
-    target = recipe.lora.target_modules or LORA_TARGETS.get(policy.type) or own.get("target_modules")
+    target = (
+        recipe.lora.target_modules or LORA_TARGETS.get(_wrapped(policy.type)) or own.get("target_modules")
+    )
     if target is not None:
         check_lora(model, target, tuple(recipe.lora.full_modules or own.get("modules_to_save") or ()))

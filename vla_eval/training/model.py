@@ -160,7 +160,9 @@ def tokenizer_from(folder: str | None, kind: str) -> Iterator[None]:
     if folder is None:
         yield
         return
-    name = config_class(kind, where="finetune.type").__module__.replace("configuration_", "processor_")
+    cls = config_class(kind, where="finetune.type")
+    cls = config_class(getattr(cls, "wraps", kind), where="finetune.type")  # whose processors it takes
+    name = cls.__module__.replace("configuration_", "processor_")
     processing: Any = importlib.import_module(name)
     if not Path(folder).is_dir() or not hasattr(processing, TOKENIZER_STEP):
         raise RecipeError(

@@ -158,13 +158,15 @@ def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
     folder = find_checkpoint(Path(recipe.base_checkpoint))
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
-    if kind != recipe.type:
+    cls = config_class(recipe.type, where="finetune.type")
+    expected = dict.fromkeys((getattr(cls, "wraps", recipe.type), recipe.type))
+    if kind not in expected:
         raise RecipeError(
             f"finetune.base_checkpoint: {recipe.base_checkpoint} holds a '{kind}', expected a "
-            f"'{recipe.type}'."
+            f"{' or a '.join(repr(one) for one in expected)}."
         )
     data = with_local_files(data, folder, tokenizer=recipe.tokenizer)
-    check_config(config_class(recipe.type, where="finetune.type"), data, where=str(folder / CONFIG_FILE))
+    check_config(cls, data, where=str(folder / CONFIG_FILE))
     return {**data, "use_peft": False, "pretrained_path": None}
 
 

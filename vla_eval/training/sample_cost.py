@@ -12,7 +12,7 @@ from typing import Any, NamedTuple  # Any: lerobot is untyped
 
 from torch import Tensor, nn
 
-from vla_eval.training.stages import HEAD, STAGES, stage_of
+from vla_eval.training.stages import EPISODE_STEPS, HEAD, STAGES, stage_of
 
 SAVED_PER_LINEAR = 1.3
 """Numbers that a layer keeps for the backward pass, per token and per input and output of its linear layers.
@@ -92,12 +92,13 @@ def sample_cost(model: Any, config: Any) -> SampleCost | None:
     counted = count(model, config)
     saved = counted.saved * SAVED_PER_LINEAR_OF.get(config.type, SAVED_PER_LINEAR)
     saved += counted.inputs + counted.working
+    alone, through = config.n_passes(EPISODE_STEPS) if hasattr(config, "n_passes") else (0, 1)
     n_bytes = 2 if getattr(config, "dtype", None) == "bfloat16" or getattr(config, "use_amp", False) else 4
     return SampleCost(
         inference_operations=counted.forward,
         inference_bytes=counted.largest * n_bytes,
-        step_operations=counted.step,
-        saved_bytes=saved * n_bytes,
+        step_operations=counted.forward * alone + counted.step * through,
+        saved_bytes=saved * n_bytes * through,
     )
 
 

@@ -47,11 +47,13 @@ def _n_images(config: Any) -> int:
 
 def _pi0(config: Any) -> tuple[Stage, ...]:
     images = _n_images(config) * PATCHES
-    own = 1 if config.type == "pi0" else 0  # π0.5 has its state in the prompt
+    own = 0 if config.type.endswith("pi05") else 1  # π0.5 has its state in the prompt
+    memory = getattr(config, "memory_tokens", 0)
     return (
         Stage(r"lm_head", 0, EXPERT),
         Stage(r"vision_tower|multi_modal_projector", images, VISION),
-        Stage(r"paligemma\.", images + config.tokenizer_max_length, LANGUAGE),
+        Stage(r"memory_tokens\.", memory, LANGUAGE),
+        Stage(r"paligemma\.", images + config.tokenizer_max_length + memory, LANGUAGE),
         Stage(r"gemma_expert|action_|time_mlp|state_proj", config.chunk_size + own, EXPERT),
     )
 
@@ -66,13 +68,15 @@ def _pi0_fast(config: Any) -> tuple[Stage, ...]:
 
 
 def _smolvla(config: Any) -> tuple[Stage, ...]:
-    n_images = _n_images(config)
+    n_images, memory = _n_images(config), getattr(config, "memory_tokens", 0)
+    prefix = n_images * SMOLVLM_TOKENS + config.tokenizer_max_length + 1 + memory
     return (
         Stage(r"lm_head", 0, EXPERT),
+        Stage(r"memory_tokens\.", memory, LANGUAGE),
         Stage(r"vision_model", n_images * SMOLVLM_PATCHES, VISION),
         Stage(r"connector", n_images * SMOLVLM_TOKENS, VISION),
         Stage(r"state_proj", 1, LANGUAGE),  # its token passes through the language model
-        Stage(r"\.vlm\.", n_images * SMOLVLM_TOKENS + config.tokenizer_max_length + 1, LANGUAGE),
+        Stage(r"\.vlm\.", prefix, LANGUAGE),
         Stage(r"lm_expert|action_", config.chunk_size, EXPERT),
     )
 
@@ -170,6 +174,9 @@ STAGES: Mapping[str, Callable[[Any], tuple[Stage, ...]]] = {
     "pi05": _pi0,
     "pi0_fast": _pi0_fast,
     "smolvla": _smolvla,
+    "mikasa_pi0": _pi0,
+    "mikasa_pi05": _pi0,
+    "mikasa_smolvla": _smolvla,
     "mikasa_openvla": _openvla,
     "mikasa_spatialvla": _spatialvla,
     "mikasa_octo": _octo,
