@@ -37,6 +37,8 @@ BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
         ("pi05_lora", True),
         ("pi0_fast", True),
         ("smolvla", True),
+        ("smolvla_frames", True),
+        ("pi05_memory_tokens", True),
     ],
 )
 def test_a_tiny_recipe_is_written_loaded_and_acts(recipe: str, tiny: bool, tmp_path: Path) -> None:
