@@ -19,6 +19,7 @@ from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
     MIKASA_FOLDER,
+    MIXTURE_FILE,
     RECORDING_FILE,
     REPLAY_FILE,
     DatasetFacts,
@@ -32,6 +33,7 @@ from vla_eval.data.manifest import (
     read_replay,
     to_json,
 )
+from vla_eval.data.mixture import MixtureFacts, MixtureSource, read_mixture
 from vla_eval.data.shard_writer import SHARD_EPISODES, shard_episodes
 
 EMPTY = FileDigest(n_bytes=0, sha256="e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
@@ -96,6 +98,26 @@ IMPORT = ImportFacts(
     files={"meta/info.json": EMPTY},
     vla_eval_version="1",
 )
+SOURCE = MixtureSource(
+    name="demo",
+    task=None,
+    task_version=1,
+    instructions=("x",),
+    n_episodes=1,
+    n_frames=2,
+    sha256="ab",
+    seeds=(1000,),
+    failed_seeds=(),
+    was_replayed=False,
+)
+MIXTURE = MixtureFacts(
+    complete=True,
+    state="eef",
+    control_mode="pd_joint_pos",
+    sources=(SOURCE,),
+    files={"meta/info.json": EMPTY},
+    vla_eval_version="1",
+)
 FEATURE = {"dtype": "video", "shape": [128, 128, 3], "names": None}
 INFO = {
     **{"codebase_version": "v3.0", "robot_type": "panda", "fps": 20, "total_episodes": 1, "total_frames": 2},
@@ -110,6 +132,7 @@ WRITTEN: dict[Path, dict[str, Any]] = {
     RECORDING_FILE: json.loads(to_json(FACTS)),
     REPLAY_FILE: json.loads(to_json(REPORT)),
     IMPORT_FILE: json.loads(json.dumps({"format_version": 1, **dataclasses.asdict(IMPORT)})),
+    MIXTURE_FILE: json.loads(json.dumps({"format_version": 1, **dataclasses.asdict(MIXTURE)})),
 }
 READERS: dict[Path, Callable[[Path], object]] = {
     MANIFEST_FILE: lambda root: [episode.action_rows() for episode in read_manifest(root)],
@@ -117,6 +140,7 @@ READERS: dict[Path, Callable[[Path], object]] = {
     RECORDING_FILE: check_dataset,
     REPLAY_FILE: read_replay,
     IMPORT_FILE: read_import,
+    MIXTURE_FILE: read_mixture,
     INFO_FILE: check_info,
 }
 FILES = st.dictionaries(
@@ -146,6 +170,7 @@ def root(tmp_path: Path) -> Path:
         (RECORDING_FILE, FACTS),
         (REPLAY_FILE, REPORT),
         (IMPORT_FILE, IMPORT),
+        (MIXTURE_FILE, MIXTURE),
         (INFO_FILE, None),
     ],
     ids=str,
@@ -184,7 +209,7 @@ def test_other_bytes_are_accepted_or_refused_with_a_message(
 
 
 @pytest.mark.parametrize("file", ["../x", "/etc/passwd", "a/../../x", "", "a" * 300, "\0", "a\nb"])
-@pytest.mark.parametrize("name", [RECORDING_FILE, IMPORT_FILE], ids=str)
+@pytest.mark.parametrize("name", [RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE], ids=str)
 def test_a_file_outside_of_the_dataset_is_not_looked_at(root: Path, name: Path, file: str) -> None:
     data = {**WRITTEN[name], "files": {file: dataclasses.asdict(EMPTY)}}
     (root / name).write_bytes(as_bytes(data))

@@ -1,4 +1,4 @@
-"""`mikasa-vla dataset …`: convert, check, describe and share demonstrations."""
+"""`mikasa-vla dataset …`: convert, mix, check, describe and share demonstrations."""
 
 import argparse
 import sys
@@ -11,7 +11,9 @@ from vla_eval.cli.arguments import add_workers, seeds_argument
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the actions and their arguments."""
-    parser = subparsers.add_parser("dataset", help="convert, describe or share datasets", allow_abbrev=False)
+    parser = subparsers.add_parser(
+        "dataset", help="convert, mix, describe or share datasets", allow_abbrev=False
+    )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
 
     convert = actions.add_parser(
@@ -30,6 +32,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     convert.add_argument("--state", choices=("eef", "joints"), help="what observation.state is (eef)")
 
     add_workers(convert, default="auto")
+
+    mix = actions.add_parser(
+        "mix", help="make one dataset of several, for a policy that learns several tasks", allow_abbrev=False
+    )
+    mix.add_argument("datasets", metavar="DIR", type=Path, nargs="+", help="complete datasets, one per task")
+    mix.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
 
     leak = actions.add_parser(
         "check-leak",
@@ -118,6 +126,20 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
     return 0
 
 
+def _mix(args: argparse.Namespace) -> int:
+    from vla_eval.data.mixing import mix_datasets
+
+    facts = mix_datasets(args.datasets, args.out)
+    for source in facts.sources:
+        print(f"{source.name}: {source.n_episodes} episodes, {source.n_frames} frames")
+    n_episodes = sum(source.n_episodes for source in facts.sources)
+    print(f"{args.out}: {len(facts.tasks)} tasks, {n_episodes} episodes, {facts.n_frames} frames")
+    if not facts.was_replayed:
+        names = ", ".join(source.name for source in facts.sources if not source.was_replayed)
+        print(f"not replayed: {names}. `finetune` asks for --allow-unreplayed.")
+    return 0
+
+
 def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.config.dataset import EVALUATION_SEEDS
     from vla_eval.data.initial_states import read_initial_states
@@ -179,6 +201,7 @@ def _pull(args: argparse.Namespace) -> int:
 
 _ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
     "convert": _convert,
+    "mix": _mix,
     "check-leak": _check_leak,
     "card": _card,
     "push": _push,

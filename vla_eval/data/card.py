@@ -28,8 +28,8 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
 
     Args:
         root: the dataset.
-        license_id: licence as the Hub names it; by default that of this project for recordings, and none
-            for imports.
+        license_id: licence as the Hub names it; by default that of this project for recordings and for
+            mixtures of them, and none for imports.
 
     Raises:
         DatasetError: the dataset is not complete, or damaged.
@@ -45,7 +45,7 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
 
 def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> str:
     """Return the card of a dataset."""
-    if license_id is None and summary.facts is not None:
+    if license_id is None and _is_recorded_here(summary):
         license_id = OWN_LICENSE
     sections = [f"# {_title(summary)}\n", _introduction(summary)]
     for heading, section in _SECTIONS.items():
@@ -65,7 +65,16 @@ def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> st
     return str(DatasetCard(f"---\n{data.to_yaml()}\n---\n\n{text}"))
 
 
+def _is_recorded_here(summary: DatasetSummary) -> bool:
+    if summary.mixture is not None:
+        return all(source.task_version is not None for source in summary.mixture.sources)
+    return summary.facts is not None
+
+
 def _title(summary: DatasetSummary) -> str:
+    if summary.mixture is not None:
+        n_tasks, n_sources = len(summary.mixture.tasks), len(summary.mixture.sources)
+        return f"{n_tasks} tasks of {n_sources} datasets: {len(summary.lengths)} demonstrations"
     task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
     n_episodes = len(summary.lengths)
     all_succeed = summary.n_success in (None, n_episodes)
@@ -79,9 +88,10 @@ def _introduction(summary: DatasetSummary) -> str:
     sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
     height_px, width_px = summary.image_size_px
     size = f"{height_px} × {width_px}"
+    heading = "Instruction" if len(summary.instructions) == 1 else "Instructions"
     return (
         f"{about}Two cameras of {size} pixels, 20 frames per second, one frame per control step, as a "
-        f"LeRobotDataset v3.\n\nInstruction:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
+        f"LeRobotDataset v3.\n\n{heading}:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
     )
 
 
@@ -186,6 +196,33 @@ def _import(summary: DatasetSummary) -> str:
     return "\n".join([*lines, ""])
 
 
+def _mixture(summary: DatasetSummary) -> str:
+    """Say of which datasets a mixture was made."""
+    if summary.mixture is None:
+        return ""
+    rows = [
+        (
+            markdown_cell(one.name),
+            "—" if one.task is None else markdown_cell(one.task),
+            "—" if one.task_version is None else str(one.task_version),
+            str(one.n_episodes),
+            str(one.n_frames),
+            f"{min(one.seeds)} to {max(one.seeds)}" if one.seeds else "—",
+            "yes" if one.was_replayed else "no",
+            markdown_code(one.sha256),
+        )
+        for one in summary.mixture.sources
+    ]
+    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return (
+        "Mixed by `mikasa-vla dataset mix`; episodes are in this order. `meta/mikasa/mixture.json` has the "
+        "seeds and the digests of all files. A mixture has no manifest: replay its sources.\n\n"
+        "| dataset | task | rules | episodes | frames | seeds | replayed | sha256 |\n"
+        f"|:--|:--|--:|--:|--:|:--|:--|:--|\n{lines}\n\nActions are for the control mode "
+        f"{markdown_code(summary.mixture.control_mode)}.\n"
+    )
+
+
 def _differences(summary: DatasetSummary) -> str:
     """Say how a recording differs from the data that the paper's policies were trained on."""
     facts = summary.facts
@@ -240,5 +277,6 @@ _SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {
     "Fields": _fields,
     "Origin and proof": _origin,
     "Import": _import,
+    "Sources": _mixture,
     "Differences from the paper's data": _differences,
 }

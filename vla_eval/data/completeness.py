@@ -1,15 +1,17 @@
-"""Whether a dataset is complete: a finished recording or import, whose files are as they were."""
+"""Whether a dataset is complete: a finished recording, import or mixture, whose files are as they were."""
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
 from vla_eval.data.dataset_folder import check_dataset, digest_file
 from vla_eval.data.imported import IMPORT_FILE, ImportFacts, read_import
-from vla_eval.data.manifest import RECORDING_FILE, DatasetFacts, FileDigest
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, DatasetFacts, FileDigest
+from vla_eval.data.mixture import MixtureFacts, read_mixture
 from vla_eval.errors import DatasetError
 
 
-def check_complete(root: Path) -> DatasetFacts | ImportFacts:
+def check_complete(root: Path) -> DatasetFacts | ImportFacts | MixtureFacts:
     """Return what a dataset says of itself, after comparing all of its files with their digests.
 
     Raises:
@@ -18,18 +20,29 @@ def check_complete(root: Path) -> DatasetFacts | ImportFacts:
     if (root / RECORDING_FILE).exists():
         return check_dataset(root)
     imported = read_import(root)
-    if imported is None:
+    if imported is not None:
+        _check_files(root, imported.files, made="converted", remedy="Convert the source again.")
+        return imported
+    mixture = read_mixture(root)
+    if mixture is None:
         raise DatasetError(
-            f"{root}: not a complete dataset of this project: neither {RECORDING_FILE} nor {IMPORT_FILE}, "
-            f"which are written last, is there. Run the command that makes it again: it resumes."
+            f"{root}: not a complete dataset of this project: none of {RECORDING_FILE}, {IMPORT_FILE} and "
+            f"{MIXTURE_FILE}, which are written last, is there. Run the command that makes it again: a "
+            f"recording resumes."
         )
-    _check_files(root, imported.files)
-    return imported
+    _check_files(root, mixture.files, made="mixed", remedy="Mix its sources again.")
+    return mixture
 
 
-def _check_files(root: Path, files: Mapping[str, FileDigest]) -> None:
+def files_sha256(files: Mapping[str, FileDigest]) -> str:
+    """Return one digest for all files of a dataset."""
+    lines = (f"{name}\0{digest.sha256}\n" for name, digest in sorted(files.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _check_files(root: Path, files: Mapping[str, FileDigest], *, made: str, remedy: str) -> None:
     for name, expected in files.items():
         if not (root / name).is_file():
-            raise DatasetError(f"{root}: the file {name} is missing. Convert the source again.")
+            raise DatasetError(f"{root}: the file {name} is missing. {remedy}")
         if digest_file(root / name) != expected:
-            raise DatasetError(f"{root / name}: not what was converted. Convert the source again.")
+            raise DatasetError(f"{root / name}: not what was {made}. {remedy}")

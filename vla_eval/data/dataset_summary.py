@@ -21,6 +21,7 @@ from vla_eval.data.manifest import (
     read_manifest,
     read_replay,
 )
+from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.viz.contact_sheet import SheetRow, contact_sheet
@@ -50,8 +51,9 @@ class DatasetSummary:
     """What a card is written from.
 
     Attributes:
-        facts, episodes, failed, replay: what a recording says of itself; None and empty for an import.
-        imported: what a conversion says of itself; None for a recording.
+        facts, episodes, failed, replay: what a recording says of itself; None and empty for others.
+        imported: what a conversion says of itself; None for others.
+        mixture: of what the dataset was mixed; None for others.
         lengths: (E,) frames per episode.
         n_success: episodes in which the success rule held at some frame; None if that is not stored.
         instructions: every sentence that occurs.
@@ -65,6 +67,7 @@ class DatasetSummary:
     failed: tuple[FailedSeed, ...]
     replay: ReplayReport | None
     imported: ImportFacts | None
+    mixture: MixtureFacts | None
     lengths: tuple[int, ...]
     n_success: int | None
     instructions: tuple[str, ...]
@@ -77,7 +80,7 @@ def summarize(root: Path) -> DatasetSummary:
     """Read a complete dataset.
 
     Raises:
-        DatasetError: it is neither a finished recording nor a finished import, or it is damaged.
+        DatasetError: it is no finished recording, import or mixture, or it is damaged.
     """
     found = check_complete(root)
     facts = found if isinstance(found, DatasetFacts) else None
@@ -93,6 +96,7 @@ def summarize(root: Path) -> DatasetSummary:
         failed=read_failed(root) if facts else (),
         replay=read_replay(root) if facts else None,
         imported=found if isinstance(found, ImportFacts) else None,
+        mixture=found if isinstance(found, MixtureFacts) else None,
         lengths=tuple(int(n) for n in np.bincount(numbers)),
         n_success=None if success is None else len(np.unique(numbers[success])),
         instructions=tuple(sorted(str(task) for task in dataset.meta.tasks.index)),

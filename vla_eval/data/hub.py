@@ -1,8 +1,8 @@
 """Push a complete dataset to the Hugging Face Hub, and pull one, by huggingface_hub's own means.
 
-What travels can be checked: a recording or an import that is complete and undamaged, in one commit, with
-the tag by which lerobot finds its format's version. Not `LeRobotDataset.push_to_hub`, which replaces the
-card by a template and leaves stale files behind.
+What travels can be checked: a recording, an import or a mixture that is complete and undamaged, in one
+commit, with the tag by which lerobot finds its format's version. Not `LeRobotDataset.push_to_hub`, which
+replaces the card by a template and leaves stale files behind.
 """
 
 import shutil
@@ -19,12 +19,12 @@ from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.imported import IMPORT_FILE
-from vla_eval.data.manifest import RECORDING_FILE, REPLAY_FILE
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, REPLAY_FILE
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import publish
 
 REPO_TYPE = "dataset"
-BESIDES = (RECORDING_FILE, IMPORT_FILE, REPLAY_FILE, CARD_FILE, SHEET_FILE)
+BESIDES = (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE, REPLAY_FILE, CARD_FILE, SHEET_FILE)
 """Files that belong to a dataset but are not among those it has digests of."""
 PARTIAL_SUFFIX = ".partial"
 

@@ -3,15 +3,12 @@
 A dataset that was recorded here has `recording.json` instead (`manifest`). Knows nothing of lerobot.
 """
 
-import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest, check_file_names
-from vla_eval.errors import DatasetError
-from vla_eval.storage.durable import replace_file
-from vla_eval.strict_json import Count, Positive, Source, as_dataclass, read_file, read_json, read_version
+from vla_eval.data.facts_file import FactsFile
+from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest
+from vla_eval.strict_json import Count, Positive
 
 IMPORT_FILE = MIKASA_FOLDER / "import.json"
 FORMAT_VERSION = 1
@@ -73,11 +70,19 @@ class ImportFacts:
     vla_eval_version: str
 
 
+_FILE = FactsFile(
+    cls=ImportFacts,
+    path=IMPORT_FILE,
+    version=FORMAT_VERSION,
+    what="what a conversion says of a dataset",
+    made_by="the conversion",
+    remedy="convert the source again.",
+)
+
+
 def write_import(dataset: Path, facts: ImportFacts) -> None:
     """Write `import.json`, whole or not at all."""
-    (dataset / MIKASA_FOLDER).mkdir(parents=True, exist_ok=True)
-    data = {"format_version": FORMAT_VERSION, **dataclasses.asdict(facts)}
-    replace_file(dataset / IMPORT_FILE, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
+    _FILE.write(dataset, facts)
 
 
 def read_import(dataset: Path) -> ImportFacts | None:
@@ -86,20 +91,4 @@ def read_import(dataset: Path) -> ImportFacts | None:
     Raises:
         DatasetError: the file is damaged, of another version, or the conversion did not finish.
     """
-    path = dataset / IMPORT_FILE
-    source = Source(
-        where=str(path),
-        what="what a conversion says of a dataset",
-        remedy="The file was changed by another program; convert the source again.",
-        error=DatasetError,
-    )
-    try:
-        data = read_json(read_file(path, source), source)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    read_version(data, "format_version", FORMAT_VERSION, source)
-    facts = as_dataclass(ImportFacts, data, source)
-    check_file_names(facts.files, where=path)
-    if not facts.complete:
-        raise source.refuse("complete False", "the conversion did not finish")
-    return facts
+    return _FILE.read(dataset)

@@ -17,6 +17,7 @@ from vla_eval.data.import_writer import eef_of_proprio
 from vla_eval.data.imported import IMPORT_FILE, read_import
 from vla_eval.data.layouts import LEROBOT_CAMERAS, Source, SourceEpisode
 from vla_eval.data.manifest import RECORDING_FILE, read_facts, read_manifest
+from vla_eval.data.mixture import read_mixture
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import PROPRIO_KEYS, STATE_KEY, StateKind
@@ -135,7 +136,18 @@ def _of_lerobot(source: Source) -> InitialStates:
 
 
 def _recorded_facts(root: Path, n_episodes: int) -> tuple[Sequence[int | None], str | None, Simulator]:
-    """Return seeds, task and simulator as far as `meta/mikasa` knows them."""
+    """Return seeds, task and simulator as far as `meta/mikasa` knows them.
+
+    Raises:
+        DatasetError: the dataset is one of several tasks, whose seeds are episodes of each.
+    """
+    mixture = read_mixture(root)
+    if mixture is not None:
+        names = ", ".join(source.name for source in mixture.sources)
+        raise DatasetError(
+            f"{root}: was mixed of several datasets ({names}). Compare each of those with the evaluation's "
+            "episodes of its task: mikasa-vla dataset check-leak DIR"
+        )
     seeds: Sequence[int | None] = [None] * n_episodes
     task: str | None = None
     simulator: Simulator = "maniskill"

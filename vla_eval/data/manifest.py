@@ -5,6 +5,8 @@
     recording.json  `DatasetFacts`: recipe, environment, counts, digest of every file; written last
     replay.json     `ReplayReport`: what a replay of the stored actions found
 
+An imported dataset has `import.json` instead (`imported`), one that was mixed of several has `mixture.json`.
+
 A folder of its own, because lerobot drops keys of `info.json` that it does not know. Standard library
 and numpy only: it knows nothing of lerobot.
 """
@@ -43,6 +45,7 @@ MANIFEST_FILE = MIKASA_FOLDER / "manifest.jsonl"
 FAILED_FILE = MIKASA_FOLDER / "failed.jsonl"
 RECORDING_FILE = MIKASA_FOLDER / "recording.json"
 REPLAY_FILE = MIKASA_FOLDER / "replay.json"
+MIXTURE_FILE = MIKASA_FOLDER / "mixture.json"
 
 FETCH_AGAIN = "The file was changed by another program; fetch or record the dataset again."
 MAX_NAME = 255  # bytes; what file systems take
@@ -310,6 +313,11 @@ def _content(path: Path) -> bytes:
     try:
         return read_file(path, Source(where=str(path), what="a file", remedy=remedy, error=DatasetError))
     except (FileNotFoundError, NotADirectoryError) as exc:
+        if path.with_name(MIXTURE_FILE.name).is_file():
+            raise DatasetError(
+                f"{path}: is not there: this dataset was mixed of several, which {MIXTURE_FILE} names. Name "
+                f"one of those."
+            ) from exc
         raise DatasetError(
             f"{path}: is not there: this is no dataset that `mikasa-vla record` has finished. Name the "
             f"folder of one task, OUT/TASK."

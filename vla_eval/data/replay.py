@@ -19,6 +19,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.episode_check import STATE_TOLERANCE
 from vla_eval.data.manifest import (
+    MIXTURE_FILE,
     RECORDING_FILE,
     DatasetFacts,
     RecordedEpisode,
@@ -121,7 +122,7 @@ def find_datasets(path: Path) -> tuple[Path, ...]:
     Raises:
         DatasetError: there is none.
     """
-    if (path / RECORDING_FILE).exists():
+    if (path / RECORDING_FILE).exists() or (path / MIXTURE_FILE).exists():  # of a mixture nothing is replayed
         return (path,)
     below = sorted(place.parent.parent.parent for place in path.glob(f"*/{RECORDING_FILE}"))
     if not below:

@@ -52,7 +52,7 @@ class TrainingFacts:
     Attributes:
         run: name of the fine-tuning run.
         dataset, dataset_sha256: which demonstrations; the digest names their content.
-        task: the task of the demonstrations.
+        task: the task of the demonstrations; empty if they are of several, or of none that is known.
         state: which proprioception `observation.state` was: `eef` or `joints`.
         images: image fields of the dataset, in the policy's order -> (height_px, width_px).
         fps: control steps per second.
@@ -61,6 +61,7 @@ class TrainingFacts:
         run_seed: seed of the training run.
         seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
             another episode, and earlier versions did not note them.
+        tasks: all tasks of the demonstrations; empty where they are not known.
     """
 
     run: str
@@ -74,6 +75,7 @@ class TrainingFacts:
     control_mode: str
     run_seed: int
     seeds: dict[str, tuple[SeedRange, ...]] | None = None
+    tasks: tuple[str, ...] = ()
 
 
 def find_checkpoint(path: Path) -> Path:

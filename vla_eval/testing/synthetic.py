@@ -5,6 +5,7 @@ was simulated and there is no manifest, so it is not a complete dataset.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +31,23 @@ INSTRUCTIONS = ("look, wait, choose", "follow the ball")
 
 
 def write_synthetic_dataset(
-    root: Path, *, n_episodes: int, n_frames: int, state: StateKind = "eef", seed: int = 0
+    root: Path,
+    *,
+    n_episodes: int,
+    n_frames: int,
+    state: StateKind = "eef",
+    seed: int = 0,
+    instructions: Sequence[str] = INSTRUCTIONS,
 ) -> Path:
     """Write a `LeRobotDataset` of synthetic episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
 
     Args:
         root: the folder to create.
-        n_episodes: number of episodes; two instructions alternate.
+        n_episodes: number of episodes.
         n_frames: length of the shortest.
         state: which proprioception `observation.state` is.
         seed: of all random values.
+        instructions: they alternate.
     """
     features = dataset_features(state)
     dataset = LeRobotDataset.create(
@@ -64,7 +72,7 @@ def write_synthetic_dataset(
                     REWARD_KEY: rng.random(1, dtype=np.float32),
                     SUCCESS_KEY: np.array([step == length - 1]),
                     DONE_KEY: np.array([step == length - 1]),
-                    "task": INSTRUCTIONS[episode % len(INSTRUCTIONS)],
+                    "task": instructions[episode % len(instructions)],
                 }
             )
         dataset.save_episode()

@@ -1,7 +1,5 @@
 """What a fine-tuning reads from a dataset, which has to be complete and replayed."""
 
-import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -9,12 +7,13 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 
 from vla_eval.control_modes import CONTROL_MODES
-from vla_eval.data.completeness import check_complete
+from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
-from vla_eval.data.manifest import FileDigest, read_manifest
+from vla_eval.data.manifest import DatasetFacts, read_manifest
+from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError, some_of
@@ -30,7 +29,8 @@ class TrainingDataset:
         root: its folder.
         name: the folder's name.
         sha256: digest of the digests of all its files.
-        task: task id; empty for an import that names none.
+        task: task id; empty for an import that names none, and for several tasks.
+        tasks: all task ids.
         state, control_mode: see `TrainingFacts`.
         was_replayed: whether a replay has confirmed it.
         seeds: see `TrainingFacts`.
@@ -44,6 +44,7 @@ class TrainingDataset:
     name: str
     sha256: str
     task: str
+    tasks: tuple[str, ...]
     state: str
     control_mode: str
     was_replayed: bool
@@ -79,10 +80,9 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
     """
     root = _one_dataset(root)
     facts = check_complete(root)
-    is_import = isinstance(facts, ImportFacts)
-    report = None if is_import else require_passed(root)
-    if report is None and not allow_unreplayed:
-        way = "It was imported and cannot be replayed" if is_import else f"Run mikasa-vla replay {root}"
+    was_replayed = _was_replayed(root, facts)
+    if not was_replayed and not allow_unreplayed:
+        way = _to_replay(root, facts)
         raise DatasetError(
             f"{root}: no replay has confirmed this dataset: it is not known whether its actions lead to what "
             f"its images show. {way}; or train on it all the same with --allow-unreplayed, which is noted "
@@ -94,19 +94,21 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
             f"execute (they take {', '.join(CONTROL_MODES)}). A policy that is trained on it could not be "
             f"evaluated."
         )
-    opened = open_local_dataset(root) if is_import else open_recorded(root)
+    opened = open_recorded(root) if isinstance(facts, DatasetFacts) else open_local_dataset(root)
     missing = [key for key in CAMERA_KEYS.values() if key not in opened.meta.features]
     if missing:
         raise DatasetError(f"{root}: expected the images {', '.join(missing)}, found none of that name.")
+    tasks = facts.tasks if isinstance(facts, MixtureFacts) else (facts.task,) if facts.task else ()
     return TrainingDataset(
         root=root,
         name=root.resolve().name,
         sha256=files_sha256(facts.files),
         task=facts.task or "",
+        tasks=tasks,
         state=facts.state,
         control_mode=facts.control_mode,
-        was_replayed=report is not None,
-        seeds=None if is_import else demonstrated_seeds(root),
+        was_replayed=was_replayed,
+        seeds=_seeds(root, facts),
         meta=opened.meta,
         failed=_failed(root) if SUCCESS_KEY in opened.meta.features else (),
     )
@@ -130,6 +132,34 @@ def demonstrated_seeds(root: Path) -> dict[str, tuple[SeedRange, ...]]:
     return {task: seed_ranges(own) for task, own in seeds.items()}
 
 
+def _seeds(
+    root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts
+) -> dict[str, tuple[SeedRange, ...]] | None:
+    if isinstance(facts, MixtureFacts):
+        return facts.seeds
+    return demonstrated_seeds(root) if isinstance(facts, DatasetFacts) else None
+
+
+def _was_replayed(root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts) -> bool:
+    """Whether a replay has confirmed a dataset; an import cannot be replayed.
+
+    Raises:
+        DatasetError: a replay found a mismatch.
+    """
+    if isinstance(facts, MixtureFacts):
+        return facts.was_replayed
+    return isinstance(facts, DatasetFacts) and require_passed(root) is not None
+
+
+def _to_replay(root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts) -> str:
+    if isinstance(facts, ImportFacts):
+        return "It was imported and cannot be replayed"
+    if isinstance(facts, DatasetFacts):
+        return f"Run mikasa-vla replay {root}"
+    names = ", ".join(source.name for source in facts.sources if not source.was_replayed)
+    return f"Of what it was mixed of, {names} had not been replayed: replay these and mix again"
+
+
 def _one_dataset(root: Path) -> Path:
     """Return the folder itself, or the one dataset in it: `record --out DIR` makes DIR/TASK."""
     if not root.is_dir():
@@ -140,12 +170,6 @@ def _one_dataset(root: Path) -> Path:
     if len(held) > 1:
         raise DatasetError(
             f"{root}: expected one dataset, found {len(held)}: {some_of(path.name for path in held)}. Name "
-            f"one, for example --dataset {held[0]}"
+            f"one, for example --dataset {held[0]}, or make one of them (`mikasa-vla dataset mix`)."
         )
     return held[0] if held else root
-
-
-def files_sha256(files: Mapping[str, FileDigest]) -> str:
-    """Return one digest for all files of a dataset."""
-    lines = (f"{name}\0{digest.sha256}\n" for name, digest in sorted(files.items()))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -73,6 +73,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
     )
     if dataset.failed:
         say(about_failures(dataset))
+    if len(dataset.tasks) > 1:
+        say(f"tasks: {', '.join(dataset.tasks)}")
     warning = shared_seeds_warning(dataset)
     if warning is not None:
         say(warning)
@@ -153,6 +155,7 @@ def _open(job: TrainingJob, command: str) -> Path | None:
         "policy": job.name,
         "recipe_sha256": job.recipe_sha256,
         "dataset_was_replayed": job.dataset.was_replayed,
+        "tasks": job.dataset.tasks,
         "environment": collect_environment(),
         "command": command,
     }

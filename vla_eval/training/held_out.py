@@ -15,6 +15,7 @@ from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
+from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.policies.checkpoint import MODEL_FOLDER
@@ -153,9 +154,9 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
         )
     task = settings.task or dataset.task
     if not task:
+        names = f"is of {', '.join(dataset.tasks)}" if dataset.tasks else "names no task"
         raise RecipeError(
-            f"held_out.task: {dataset.name} names no task; say which one to evaluate on (`mikasa-vla list "
-            "tasks`)."
+            f"held_out.task: {dataset.name} {names}; say which one to evaluate on (`mikasa-vla list tasks`)."
         )
     return task_spec(task).id
 
@@ -177,6 +178,9 @@ def shared_seeds_warning(dataset: TrainingDataset) -> str | None:
 
 def _seeds_of(dataset: TrainingDataset) -> set[int]:
     """Return the seeds that demonstrations were tried at; none for an import, whose seeds are not ours."""
+    mixture = read_mixture(dataset.root)
+    if mixture is not None:
+        return {seed for one in mixture.sources for seed in (*(one.seeds or ()), *one.failed_seeds)}
     if not (dataset.root / MANIFEST_FILE).is_file():
         return set()
     kept = {episode.seed for episode in read_manifest(dataset.root)}

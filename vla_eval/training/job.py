@@ -106,6 +106,7 @@ class TrainingJob:
             control_mode=dataset.control_mode,
             run_seed=self.run_seed,
             seeds=self._seeds,
+            tasks=dataset.tasks,
         )
 
     @property

@@ -1,0 +1,43 @@
+"""A dataset of another task that counts as recorded, beside the fixture `recorded`."""
+
+import dataclasses
+from pathlib import Path
+
+from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.manifest import (
+    FAILED_FILE,
+    MANIFEST_FILE,
+    MIKASA_FOLDER,
+    RECORDING_FILE,
+    read_facts,
+    read_manifest,
+    write_entry,
+    write_lines,
+)
+from vla_eval.features import StateKind
+from vla_eval.testing.synthetic import write_synthetic_dataset
+
+TASK, SENTENCE = "ShellGameTouch-v0", "touch the cup"
+
+
+def write_second_task(recorded: Path, *, state: StateKind = "eef") -> Path:
+    """Write 2 episodes of 13 and 14 frames, of seeds 2000 and 2001, beside a recorded dataset."""
+    root = recorded.parent / TASK
+    write_synthetic_dataset(root, n_episodes=2, n_frames=13, state=state, seed=1, instructions=[SENTENCE])
+    (root / MIKASA_FOLDER).mkdir()
+    like = zip(read_manifest(recorded)[:2], (2000, 2001), strict=True)
+    episodes = [dataclasses.replace(e, task=TASK, instruction=SENTENCE, seed=seed) for e, seed in like]
+    write_lines(root / MANIFEST_FILE, episodes)
+    write_lines(root / FAILED_FILE, [])
+    facts = dataclasses.replace(
+        read_facts(recorded),
+        task=TASK,
+        instruction=SENTENCE,
+        state=state,
+        n_episodes=2,
+        n_frames=27,
+        n_failed_seeds=0,
+        files=digest_files(root),
+    )
+    write_entry(root / RECORDING_FILE, facts)
+    return root
