@@ -6,9 +6,12 @@ A training sample is an episode. Knows no network.
 from dataclasses import dataclass
 from typing import Any, ClassVar  # lerobot is untyped
 
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.policies.eef_state import STATE
 from vla_eval.policies.ported_config import PortedConfig
+
+SENTENCES = ("none", "words")
+"""`words`: which words are in it, see `sentence.SentenceEncoder`."""
 
 
 @dataclass
@@ -35,6 +38,8 @@ class EpisodeConfig(PortedConfig):
             arm begins to move after it waited, one of the episode's at random. What happens then has to be
             known from memory; a step later the demonstration's own motion gives it away.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
+        sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
+            one of several has to know which is meant, where the images do not show it.
         mix_colors: the three colours of an episode's images change places at random in training.
         scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
     """
@@ -50,6 +55,7 @@ class EpisodeConfig(PortedConfig):
     decision_share: float = 0.0
     goal_weight: float = 1.0
     mix_colors: bool = False
+    sentence: str = "none"
 
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
@@ -64,6 +70,8 @@ class EpisodeConfig(PortedConfig):
         for name in ("first_action_weight", "waiting_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+        if self.sentence not in SENTENCES:
+            raise unknown_name("sentence", self.sentence, SENTENCES, where=f"policy ({self.type})")
         if not 0 <= self.decision_share <= 1:
             raise RecipeError(f"decision_share is {self.decision_share}, expected a number in [0, 1]")
 
@@ -79,6 +87,11 @@ class EpisodeConfig(PortedConfig):
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
             raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
+
+    @property
+    def reads_sentence(self) -> bool:
+        """Whether it acts by the instruction."""
+        return self.sentence != "none"
 
     @property
     def n_window_steps(self) -> int:

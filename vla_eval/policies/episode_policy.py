@@ -14,6 +14,7 @@ from torch import Tensor
 from vla_eval.features import STATE_KEY
 from vla_eval.policies.episode_config import EpisodeConfig
 from vla_eval.policies.lerobot_memory import Memory
+from vla_eval.policies.sentence import TASK_KEY
 
 
 class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -57,7 +58,8 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes."""
         if self._remembers:
-            frames = {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
+            frames: dict[str, Any] = {TASK_KEY: batch.get(TASK_KEY)}
+            frames |= {key: batch[key][:, None] for key in (STATE_KEY, *self.config.image_features)}
             self._shown = self._remember(frames, self._shown)
         if not self._queue:
             chunk = self.predict_action_chunk(batch, self._shown)

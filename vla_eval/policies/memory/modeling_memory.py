@@ -21,6 +21,7 @@ from vla_eval.policies.memory.goal_layer import by_camera
 from vla_eval.policies.memory.joint_layer import action_units
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.policies.memory.sizes import NetworkSizes
+from vla_eval.policies.sentence import said_at_each_step
 
 SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
@@ -49,7 +50,8 @@ class MikasaMemoryPolicy(EpisodePolicy):
         scaled = {**batch, ACTION_KEY: batch[ACTION_KEY] / self.units}
         same = SAME_JOINTS if config.joint_targets else SAME_ACTION
         episodes = episodes_of(scaled, config, training=self.training, same_action=same)
-        answer = self.network(episodes.images, episodes.state)
+        said = said_at_each_step(self.network.sentence, batch, episodes.state.shape[1])
+        answer = self.network(episodes.images, episodes.state, said)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()
@@ -74,7 +76,9 @@ class MikasaMemoryPolicy(EpisodePolicy):
         """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
         images, state = stacked_images(batch, self.config), batch[STATE_KEY]
         shape = state.shape[:2]
-        sight = self.network.see(images.flatten(0, 1), state.flatten(0, 1))
+        said = said_at_each_step(self.network.sentence, batch, shape[1])
+        flat = None if said is None else said.flatten(0, 1)
+        sight = self.network.see(images.flatten(0, 1), state.flatten(0, 1), flat)
         before = self.network.begin(shape[0]) if memory is None else memory
         after = self.network.write(sight, shape, before)
         return Memory(*(part[:, -1] for part in after))
@@ -90,7 +94,8 @@ class MikasaMemoryPolicy(EpisodePolicy):
         self.eval()
         self.check_shown(memory)
         images, state = stacked_images(batch, self.config), batch[STATE_KEY]
-        sight = self.network.see(images, state)
+        said = said_at_each_step(self.network.sentence, batch, 1)
+        sight = self.network.see(images, state, None if said is None else said[:, 0])
         if memory is None:
             after = self.network.write(sight, (len(state), 1), self.network.begin(len(state)))
             memory = Memory(*(part[:, 0] for part in after))
@@ -157,4 +162,5 @@ def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
         longest_span_steps=config.longest_span_steps,
         free_translation=config.free_translation,
         joint_targets=config.joint_targets,
+        reads_sentence=config.reads_sentence,
     )

@@ -24,6 +24,7 @@ from vla_eval.policies.memory.goal_layer import GoalLayer
 from vla_eval.policies.memory.joint_layer import JointLayer
 from vla_eval.policies.memory.sizes import KNOWN, PLACE, NetworkSizes
 from vla_eval.policies.memory.vision_encoder import Keys, Likeness, Places, StandingOut, VisionEncoder
+from vla_eval.policies.sentence import SentenceEncoder, with_sentence
 from vla_eval.policies.steps.precision import in_float32
 
 IMPORTANCE_OF_STANDING_OUT = 4.0  # to begin with: what stands out e^1 more counts e^4 more
@@ -128,6 +129,7 @@ class MemoryNetwork(nn.Module):
             hidden=hidden, chunk=sizes.chunk, action=sizes.decided_action, free=sizes.free_translation
         )
         self.joints = JointLayer() if sizes.joint_targets else None
+        self.sentence = SentenceEncoder(hidden) if sizes.reads_sentence else None
         with torch.no_grad():
             nn.init.zeros_(self.asks.weight)
             nn.init.zeros_(self.asks.bias)
@@ -142,23 +144,27 @@ class MemoryNetwork(nn.Module):
         nothing = like.new_full(things.shape[:2], NOTHING)
         return Memory(things, nothing, like.expand(n_episodes, -1))
 
-    def see(self, images: Tensor, state: Tensor) -> Sight:
+    def see(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Sight:
         """Return what is seen at each step.
+
+        What an instruction says is in the summary: so it has a part in what is kept, in what is asked of the
+        images, and in the action.
 
         Args:
             images: (N, cameras, 3, H, W) in [0, 1].
             state: (N, state) in SI units.
+            said: (N, hidden) by `sentence`; None where no instruction is read.
         """
-        return self._sight([eye(images[:, index]) for index, eye in enumerate(self.eyes)], state)
+        return self._sight([eye(images[:, index]) for index, eye in enumerate(self.eyes)], state, said)
 
     @in_float32
-    def _sight(self, places: list[Places], state: Tensor) -> Sight:
+    def _sight(self, places: list[Places], state: Tensor, said: Tensor | None) -> Sight:
         keys = [key(place) for key, place in zip(self.keys, places, strict=True)]
         looks = zip(self.standing_out, places, keys, strict=True)
         things = torch.cat([look(place, key) for look, place, key in looks], dim=1)
         strongest = [place.strongest() for place in places]
         known = torch.cat([things.flatten(1), *strongest, state * POSITION_SCALE], dim=-1)
-        return Sight(places, keys, things, self.summary(known))
+        return Sight(places, keys, things, with_sentence(self.summary, known, said))
 
     @in_float32
     def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
@@ -235,16 +241,17 @@ class MemoryNetwork(nn.Module):
             evidence=goals.evidence,
         )
 
-    def forward(self, images: Tensor, state: Tensor) -> Answer:
+    def forward(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Answer:
         """Answer for each step of episodes from their beginning.
 
         Args:
             images: (B, T, cameras, 3, H, W) in [0, 1].
             state: (B, T, state) in SI units.
+            said: (B, T, hidden), see `see`.
         """
         shape = state.shape[:2]
         flat_state = state.flatten(0, 1)
-        sight = self.see(images.flatten(0, 1), flat_state)
+        sight = self.see(images.flatten(0, 1), flat_state, None if said is None else said.flatten(0, 1))
         memories = self.write(sight, shape, self.begin(shape[0]))
         flat = Memory(*(part.flatten(0, 1) for part in memories))
         return Answer(*(by_episode(part, shape) for part in self.act(sight, flat, flat_state)))

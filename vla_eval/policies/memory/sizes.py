@@ -30,6 +30,7 @@ class NetworkSizes:
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
         free_translation: whether a part of the translation does not depend on the goal.
         joint_targets: whether an action is joint positions and the gripper.
+        reads_sentence: whether the instruction is read.
     """
 
     on_arm: tuple[bool, ...] = (False, True)
@@ -45,6 +46,7 @@ class NetworkSizes:
     longest_span_steps: float = 100.0
     free_translation: bool = False
     joint_targets: bool = False
+    reads_sentence: bool = False
 
     @property
     def decided_action(self) -> int:

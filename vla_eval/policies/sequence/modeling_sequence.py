@@ -17,6 +17,7 @@ from vla_eval.policies.episode_samples import (
     weighted_mean,
 )
 from vla_eval.policies.returns import returns_to_go, rewards_in
+from vla_eval.policies.sentence import SentenceEncoder, said_at_each_step, with_sentence
 from vla_eval.policies.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
 from vla_eval.policies.sequence.core import CoreMemory
 from vla_eval.policies.sequence.cores import make_core
@@ -97,18 +98,24 @@ class SequenceNetwork(nn.Module):
         if config.reads_returns:
             self.returns = nn.Linear(1, width)
             self.executed = nn.Linear(self.shape[1], width)
+        self.sentence = SentenceEncoder(width) if config.reads_sentence else None
 
     def begin(self, n_episodes: int) -> CoreMemory:
         """Return the memory before the first step; its last tensor is the core's answer, (B, width)."""
         nothing = self.actions.weight.new_zeros(n_episodes, self.actions.in_features)
         return (*self.core.begin(n_episodes), nothing)
 
-    def tokens(self, images: Tensor, state: Tensor) -> Tensor:
-        """Return (B, T, width) of images (B, T, cameras, 3, H, W) in [0, 1] and state (B, T, state)."""
+    def tokens(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Tensor:
+        """Return (B, T, width) of what is seen.
+
+        Args:
+            images: (B, T, cameras, 3, H, W) in [0, 1].
+            state: (B, T, state).
+            said: (B, T, width) by `sentence`; None where no instruction is read.
+        """
         seen = self.encoders(images)
         read = [seen, state * POSITION_SCALE] if self.config.state_in_token else [seen]
-        token: Tensor = self.token(torch.cat(read, dim=-1))
-        return token
+        return with_sentence(self.token, torch.cat(read, dim=-1), said)
 
     def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
         """Return the core's answers (B, T, width) to the observations of whole demonstrations.
@@ -177,7 +184,9 @@ class MikasaSequencePolicy(EpisodePolicy):
         episodes = episodes_of(batch, config, training=self.training)
         real = episodes.counts[..., 0] > 0
         # Images are most of the work: those of padding are not encoded.
-        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None])[0]
+        said = said_at_each_step(network.sentence, batch, real.shape[1])
+        said = None if said is None else said[real][None]
+        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None], said)[0]
         tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
         predicted = network.predict(tokens, answers)
@@ -203,7 +212,9 @@ class MikasaSequencePolicy(EpisodePolicy):
         self.eval()
         state = batch[STATE_KEY]
         before = self.network.begin(len(state)) if memory is None else memory
-        _, after = self.network.read(self.network.tokens(stacked_images(batch, self.config), state), before)
+        said = said_at_each_step(self.network.sentence, batch, state.shape[1])
+        tokens = self.network.tokens(stacked_images(batch, self.config), state, said)
+        _, after = self.network.read(tokens, before)
         return after
 
     @torch.no_grad()
@@ -217,7 +228,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         self.eval()
         self.check_shown(memory)
         images, state = stacked_images(batch, self.config)[:, None], batch[STATE_KEY][:, None]
-        tokens = self.network.tokens(images, state)
+        tokens = self.network.tokens(images, state, said_at_each_step(self.network.sentence, batch, 1))
         if memory is None:
             _, memory = self.network.read(tokens, self.network.begin(len(tokens)))
         return self.network.predict(tokens, memory[-1][:, None]).actions[:, 0].clamp(-1, 1)
