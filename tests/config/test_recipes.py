@@ -158,7 +158,8 @@ class TestFinding:
             assert load_recipe("policies", name, PolicyRecipe).value.description
         tables = [name for name in list_recipes("configs") if is_model_table(name)]
         assert tables == [load_model_table(name).name for name in tables]
-        assert tables == ["ablations", "memory_table", "paper_vla_table"]
+        papers = ["paper_offline_small", "paper_offline_table", "paper_vla_table"]
+        assert tables == ["ablations", "memory_table", *papers]
         for name in list_recipes("configs").keys() - set(tables):
             loaded = load_recipe("configs", name, EvalConfig).value
             assert loaded.name == name

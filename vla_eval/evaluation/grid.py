@@ -109,6 +109,7 @@ class ModelTable:
         controls: scripted policies beside the rows of a task, at each of their numbers of action steps.
         protocol: the published protocol whose summary figure is printed below the table; None: none.
         simulator: what the evaluations run on.
+        env: arguments of all tasks, such as the control mode of the datasets.
         render, stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
         allow_unreplayed: see `FinetuneConfig`.
@@ -126,6 +127,7 @@ class ModelTable:
     controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
     protocol: str | None = None
     simulator: Simulator = "maniskill"
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the tasks check their arguments
     render: RenderSettings = field(default_factory=RenderSettings)
     stop_at_success: bool = False
     finetune: dict[str, Any] | None = None  # Any: decoded with each row's recipe
@@ -292,6 +294,7 @@ def _evaluation(
         seed_start=table.seed_start,
         protocol=table.protocol,
         simulator=table.simulator,
+        env=table.env,
         render=table.render,
         stop_at_success=table.stop_at_success,
         slots_per_worker=slots_per_worker,

@@ -68,6 +68,7 @@ def tiny_table(table: ModelTable, out: Path) -> tuple[ModelTable, dict[str, str]
         run_seeds=table.run_seeds[:2],
         episodes=N_EPISODES,
         simulator="fake",
+        env={},  # the fake simulator has the default control mode alone
         allow_unreplayed=True,
     )
     return tiny, adapters
