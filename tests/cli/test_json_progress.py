@@ -54,6 +54,7 @@ def plan(n_episodes: int) -> Plan:
         normalization={},
         servers={},
         task_versions={},
+        training_seeds={},
         policy_names=("p",),
         shared={},
         left_out=(),

@@ -1,7 +1,7 @@
 """Put complete datasets of several tasks together as one LeRobotDataset, for a policy that learns them all.
 
 lerobot's `aggregate_datasets` does it: tables and videos stay files of their own, videos byte for byte;
-episodes, frames and sentences are numbered anew. Everything is checked before anything is written, and the
+episodes, frames and sentences are numbered again. Everything is checked before anything is written, and the
 new dataset appears whole or not at all. The sources stay as they are.
 """
 
