@@ -44,7 +44,7 @@ def test_unknown_values_are_dashes_and_contested_ones_are_marked() -> None:
     assert any("0.09 ± 0.03 in the appendix" in note for note in rates.notes)
     assert {row[0] for row in how.rows} == {row[0] for row in rates.rows}
     here = [row[0].removesuffix(" [measured here]") for row in rates.rows if "[measured here]" in row[0]]
-    assert here == ["memory", "memory_color3 in the official code", "cue_blind"]
+    assert here == ["memory", "memory in the official code", "cue_blind"]
 
 
 @pytest.mark.parametrize("fmt", ["markdown", "latex", "html-table"])
