@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from numpy.typing import NDArray
 
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.frame_table import read_columns
@@ -68,12 +69,10 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         _set_window(config, dataset)
     _check_features(config, dataset)
     if hasattr(config, "fit_to_actions"):
-        columns = read_columns(dataset.root)
-        chosen = ~np.isin(columns["episode_index"], dataset.left_out)
-        actions = torch.from_numpy(columns[ACTION_KEY][chosen].astype(np.float32))
+        actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
         config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
     if hasattr(config, "fit_to_rewards"):
-        config.fit_to_rewards(read_columns(dataset.root))
+        config.fit_to_rewards(_columns_trained_on(dataset))
     if not masks_padding(config):
         # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
         config.drop_n_last_frames = max(config.action_delta_indices)
@@ -94,6 +93,13 @@ def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
     except Exception as exc:  # draccus, lerobot and torchvision raise what they like
         raise RecipeError(f"finetune.image_transforms: {exc}") from exc
     return config
+
+
+def _columns_trained_on(dataset: TrainingDataset) -> dict[str, NDArray[Any]]:
+    """Return field -> (N, …) of the frames of the episodes that are trained on."""
+    columns = read_columns(dataset.root)
+    chosen = ~np.isin(columns["episode_index"], dataset.left_out)
+    return {key: values[chosen] for key, values in columns.items()}
 
 
 def _check_features(config: Any, dataset: TrainingDataset) -> None:
