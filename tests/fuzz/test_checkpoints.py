@@ -12,7 +12,6 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from safetensors.numpy import save_file
 
 from tests.fuzz.json_cases import accepted_or_refused
-from vla_eval.policies import lerobot_loading
 from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import checkpoint_sha256
 from vla_eval.policies.checkpoint_notes import normalization_notes
@@ -80,10 +79,8 @@ FILES = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path) -> Path:
     """A checkpoint as far as reading goes."""
-    # It looks through all installed packages: a tenth of a second per case.
-    monkeypatch.setattr(lerobot_loading, "register_third_party_plugins", lambda: None)
     for name in ("model.safetensors", "state.safetensors"):
         save_file({}, tmp_path / name)
     for name, data in ((CONFIG, VALID_CONFIG), (PREPROCESSOR, {"steps": []})):

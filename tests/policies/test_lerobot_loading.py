@@ -1,6 +1,7 @@
 """Checkpoints of LeRobot: nothing loads half or runs code, and each folder of one is the same policy."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,16 @@ from tests.policies.small_checkpoints import FACTS, TASK, context_for, copied
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
 from vla_eval.evaluation import evaluate as evaluate_module
+from vla_eval.policies import lerobot_loading
 from vla_eval.policies.checkpoint import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_empty_policy, read_config
+from vla_eval.policies.lerobot_loading import (
+    LoadOptions,
+    config_class,
+    load_weights,
+    make_empty_policy,
+    read_config,
+)
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
@@ -169,6 +177,22 @@ class TestTypesThatHideFrames:
         }
         with pytest.raises(RuntimeError, match="non-empty TensorList"):
             make_empty_policy(config).predict_action_chunk(frames)
+
+
+class TestPlugins:
+    def test_packages_are_looked_through_again_only_when_one_was_installed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        looks: list[int] = []
+        monkeypatch.syspath_prepend(tmp_path)
+        os.utime(tmp_path, (0, 0))  # its next change is at another time, however coarse the clock
+        monkeypatch.setattr(lerobot_loading, "register_third_party_plugins", lambda: looks.append(1))
+        for _ in range(3):
+            assert config_class("act", where="here").__name__ == "ACTConfig"
+        assert len(looks) == 1
+        (tmp_path / "lerobot_policy_late-1.0.dist-info").mkdir()
+        config_class("act", where="here")
+        assert len(looks) == 2
 
 
 class TestFolders:

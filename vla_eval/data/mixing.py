@@ -22,7 +22,7 @@ from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import DatasetFacts, read_failed, read_manifest
 from vla_eval.data.mixture import MixtureFacts, MixtureSource, write_mixture
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.opening import light_metadata, open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import whole_folder
@@ -148,14 +148,15 @@ def _refuse_repetition(sources: Sequence[MixtureSource]) -> None:
 
 def _aggregate(roots: Sequence[Path], draft: Path) -> None:
     try:
-        aggregate_datasets(
-            repo_ids=[f"local/{root.resolve().name}" for root in roots],
-            aggr_repo_id=f"local/{draft.name}",
-            roots=list(roots),
-            aggr_root=draft,
-            concatenate_videos=False,
-            concatenate_data=False,
-        )
+        with light_metadata():
+            aggregate_datasets(
+                repo_ids=[f"local/{root.resolve().name}" for root in roots],
+                aggr_repo_id=f"local/{draft.name}",
+                roots=list(roots),
+                aggr_root=draft,
+                concatenate_videos=False,
+                concatenate_data=False,
+            )
     except ValueError as exc:
         raise DatasetError(
             f"lerobot cannot put {', '.join(str(root) for root in roots)} together: {exc!s:.300}"

@@ -1,12 +1,19 @@
 """Open a dataset on this machine, never the network: lerobot looks on the Hub for whatever is missing."""
 
+import contextlib
 import functools
 import importlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
+import pyarrow.parquet as pq
+from datasets import Dataset  # type: ignore[attr-defined]  # mypy sees the folder of recipes
+from lerobot.datasets import dataset_metadata
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import EPISODES_DIR
+from lerobot.utils.utils import SuppressProgressBars
 
 from vla_eval.data.info_file import check_info
 from vla_eval.errors import DatasetError
@@ -31,6 +38,35 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
                 f"dataset; `mikasa-vla dataset pull` fetches one from the Hub."
             )
     check_info(root)
+    with light_metadata():
+        return _open(root, options)
+
+
+@contextlib.contextmanager
+def light_metadata() -> Iterator[None]:
+    """Let lerobot read of `meta/episodes` only the columns that it keeps.
+
+    It reads the statistics of each episode, too (140 columns of a recording), and drops them. `datasets`
+    describes a table again for each of its columns: 0.15 s for each opening, and 0.01 s without them.
+    """
+    before = dataset_metadata.load_episodes
+    dataset_metadata.load_episodes = _episodes_without_statistics
+    try:
+        yield
+    finally:
+        dataset_metadata.load_episodes = before
+
+
+def _episodes_without_statistics(root: Path) -> Dataset:
+    paths = sorted((root / EPISODES_DIR).glob("*/*.parquet"))
+    if not paths:
+        raise FileNotFoundError(f"{root / EPISODES_DIR}: there are no tables of episodes.")
+    kept = [name for name in pq.read_schema(paths[0]).names if not name.startswith("stats/")]
+    with SuppressProgressBars():
+        return Dataset.from_parquet([str(path) for path in paths], columns=kept)
+
+
+def _open(root: Path, options: dict[str, Any]) -> LeRobotDataset:
     repo_id = f"local/{root.resolve().name}"
     try:
         meta = LeRobotDatasetMetadata(repo_id, root=root)

@@ -21,7 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
-from vla_eval.data.opening import video_decoder
+from vla_eval.data.opening import light_metadata, video_decoder
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
     ACTION_NAMES,
@@ -159,12 +159,13 @@ def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ..
     Returns:
         The episodes, in order.
     """
-    aggregate_datasets(
-        repo_ids=[f"local/{shard.name}" for shard in shards],
-        aggr_repo_id=f"local/{root.name}",
-        roots=list(shards),
-        aggr_root=root,
-    )
+    with light_metadata():
+        aggregate_datasets(
+            repo_ids=[f"local/{shard.name}" for shard in shards],
+            aggr_repo_id=f"local/{root.name}",
+            roots=list(shards),
+            aggr_root=root,
+        )
     histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
     for shard in shards:
         with np.load(shard / SHARD_HISTOGRAMS) as stored:

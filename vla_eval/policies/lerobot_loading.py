@@ -7,7 +7,9 @@ Only safetensors are read; nothing is downloaded unless `HF_HUB_OFFLINE=0` is se
 
 import contextlib
 import dataclasses
+import functools
 import os
+import sys
 from collections.abc import Mapping, Sequence
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
@@ -157,7 +159,7 @@ def config_class(kind: str, *, where: str) -> Any:
     Raises:
         CheckpointError: there is no such type, or one that this loop cannot ask for chunks.
     """
-    register_third_party_plugins()
+    _register_plugins(_search_path())
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
         error = unknown_name("LeRobot policy type", kind[:100], known, where=where)
@@ -171,6 +173,18 @@ def config_class(kind: str, *, where: str) -> Any:
             "LeRobot's own loop: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
         )
     return PreTrainedConfig.get_choice_class(kind)
+
+
+@functools.cache
+def _register_plugins(_where: tuple[tuple[str, int], ...]) -> None:
+    """Import installed plugins. lerobot reads the metadata of each package for it, at each call."""
+    register_third_party_plugins()
+
+
+def _search_path() -> tuple[tuple[str, int], ...]:
+    """Return the folders that packages are found in, with the time of the last change of each."""
+    folders = [(place or ".", Path(place or ".")) for place in sys.path]
+    return tuple((place, folder.stat().st_mtime_ns) for place, folder in folders if folder.exists())
 
 
 def make_empty_policy(config: Any, **kwargs: Any) -> Any:
