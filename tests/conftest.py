@@ -1,6 +1,7 @@
 """For all tests: no access to the Hub; workers fork from one server; fixtures that several rooms use."""
 
 import contextlib
+import gc
 import os
 import shutil
 import socket
@@ -47,6 +48,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run a test that takes `sampled_task` on every task of the catalogue."""
     if "sampled_task" in metafunc.fixturenames:
         metafunc.parametrize("sampled_task", SAMPLED_TASKS)
+
+
+def pytest_collection_finish() -> None:
+    """Keep what is imported by now from being searched for garbage, which ManiSkill does at each reset."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

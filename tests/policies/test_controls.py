@@ -330,9 +330,18 @@ def test_an_arm_that_sees_one_frame_at_a_time_meets_the_ball(task: str) -> None:
 CHOICES = [task for task in sorted(TASKS) if kind_of(TASKS[task]) == "choice"]
 
 
-@pytest.mark.parametrize("policy", ["tour", "body_memory", "cue_touch"])
+def is_in_every_run(task: str, policy: str) -> bool:
+    """All move to a picked mug as to a touched one; that it is chosen by lifting it, one of them shows."""
+    return task in SAMPLE and (task != "ShellGamePick-v0" or policy == "tour")
+
+
 @pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=() if task in SAMPLE else pytest.mark.slow) for task in CHOICES]
+    ("task", "policy"),
+    [
+        pytest.param(task, policy, marks=() if is_in_every_run(task, policy) else pytest.mark.slow)
+        for policy in ("tour", "body_memory", "cue_touch")
+        for task in CHOICES
+    ],
 )
 def test_under_the_strict_protocol_neither_a_tour_nor_a_body_knows_more_than_chance(
     task: str, policy: str
