@@ -41,6 +41,9 @@ class EpisodeConfig(PortedConfig):
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.
         mix_colors: the three colours of an episode's images change places at random in training.
+        shift_px: the images of an episode are moved by up to so many pixels in each direction in training,
+            those of each camera by an amount of their own, the same in all frames (random shifts, Kostrikov
+            et al. 2020, "Image Augmentation Is All You Need"). 0: they are not.
         scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
     """
 
@@ -55,6 +58,7 @@ class EpisodeConfig(PortedConfig):
     decision_share: float = 0.0
     goal_weight: float = 1.0
     mix_colors: bool = False
+    shift_px: int = 0
     sentence: str = "none"
 
     optimizer_lr: float = 2e-3
@@ -74,6 +78,8 @@ class EpisodeConfig(PortedConfig):
             raise unknown_name("sentence", self.sentence, SENTENCES, where=f"policy ({self.type})")
         if not 0 <= self.decision_share <= 1:
             raise RecipeError(f"decision_share is {self.decision_share}, expected a number in [0, 1]")
+        if self.shift_px < 0:
+            raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""

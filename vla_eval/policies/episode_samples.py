@@ -46,8 +46,8 @@ def episodes_of(
     Args:
         batch: as `config` asks for it by its delta indices.
         config: of the policy.
-        training: leave waiting out, end some episodes at a decision and mix colours, at random by torch's
-            generator; else take every step.
+        training: leave waiting out, end some episodes at a decision, mix colours and move images, at random
+            by torch's generator; else take every step.
         same_action: actions that differ by less are waiting.
     """
     n_steps = config.n_window_steps
@@ -77,6 +77,8 @@ def episodes_of(
     images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
     if training and config.mix_colors:
         images = _mixed(images)
+    if training and config.shift_px:
+        images = _moved(images, config.shift_px)
     return Episodes(
         images=images,
         state=taken(batch[STATE_KEY][:, :n_steps]),
@@ -133,6 +135,20 @@ def _mixed(images: Tensor) -> Tensor:
     """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
     orders = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
     return images.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
+
+
+def _moved(images: Tensor, most_px: int) -> Tensor:
+    """Move what each camera saw of each episode (B, T, cameras, 3, H, W); the edges are repeated."""
+    moved = torch.empty_like(images)
+    height, width = (torch.arange(size, device=images.device) for size in images.shape[-2:])
+    by = torch.randint(-most_px, most_px + 1, (len(images), images.shape[2], 2)).tolist()
+    for episode, cameras in enumerate(by):
+        for camera, (down, right) in enumerate(cameras):
+            rows = (height - down).clamp(0, len(height) - 1)
+            columns = (width - right).clamp(0, len(width) - 1)
+            seen = images[episode, :, camera]
+            moved[episode, :, camera] = seen.index_select(-2, rows).index_select(-1, columns)
+    return moved
 
 
 def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:

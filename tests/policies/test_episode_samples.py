@@ -1,0 +1,99 @@
+"""What is done to the images of episodes that are trained on."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import Tensor
+
+from vla_eval.errors import RecipeError
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.policies.episode_samples import episodes_of
+from vla_eval.policies.sequence.configuration_sequence import MikasaSequenceConfig
+
+CAMERAS = ("observation.images.base", "observation.images.wrist")
+N_EPISODES, N_STEPS, CHUNK, EDGE_PX, MOST_PX = 6, 5, 8, 16, 3
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(7)
+        yield
+
+
+def config(**fields: object) -> MikasaSequenceConfig:
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, EDGE_PX, EDGE_PX))
+    return MikasaSequenceConfig(
+        device="cpu",
+        window_steps=N_STEPS,
+        waiting_share=1.0,
+        input_features={
+            **dict.fromkeys(CAMERAS, image),
+            STATE_KEY: PolicyFeature(type=FeatureType.STATE, shape=(10,)),
+        },
+        output_features={ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
+        **fields,  # type: ignore[arg-type]  # fields of a dataclass
+    )
+
+
+def batch() -> dict[str, Tensor]:
+    """Return episodes whose every pixel has a value of its own in each frame."""
+    n_pixels = N_EPISODES * (N_STEPS + 1) * 3 * EDGE_PX**2
+    images = (torch.randperm(n_pixels) / n_pixels).reshape(N_EPISODES, N_STEPS + 1, 3, EDGE_PX, EDGE_PX)
+    n_actions = N_STEPS - 1 + CHUNK
+    return {
+        CAMERAS[0]: images,
+        CAMERAS[1]: 1 - images,
+        STATE_KEY: torch.zeros(N_EPISODES, N_STEPS + 1, 10),
+        f"{STATE_KEY}_is_pad": torch.zeros(N_EPISODES, N_STEPS + 1, dtype=torch.bool),
+        ACTION_KEY: torch.rand(N_EPISODES, n_actions, 7),
+        ACTION_PADDING_KEY: torch.zeros(N_EPISODES, n_actions, dtype=torch.bool),
+    }
+
+
+def found_shift(seen: Tensor, moved: Tensor) -> tuple[int, int]:
+    """Return the one shift (down, right) that makes `moved` (3, H, W) of `seen`, pixel by pixel."""
+    fits = []
+    for down in range(-EDGE_PX, EDGE_PX + 1):
+        for right in range(-EDGE_PX, EDGE_PX + 1):
+            from_y = [min(max(y - down, 0), EDGE_PX - 1) for y in range(EDGE_PX)]
+            from_x = [min(max(x - right, 0), EDGE_PX - 1) for x in range(EDGE_PX)]
+            if torch.equal(seen[:, from_y][:, :, from_x], moved):
+                fits.append((down, right))
+    assert len(fits) == 1
+    return fits[0]
+
+
+def test_the_images_of_an_episode_are_moved_together_and_those_of_each_camera_by_their_own_amount() -> None:
+    given = batch()
+    images = episodes_of(given, config(shift_px=MOST_PX), training=True).images
+
+    shifts = [
+        [
+            found_shift(given[key][episode, 0], images[episode, 0, camera])
+            for camera, key in enumerate(CAMERAS)
+        ]
+        for episode in range(N_EPISODES)
+    ]
+    for episode in range(N_EPISODES):
+        for camera, key in enumerate(CAMERAS):
+            last = given[key][episode, N_STEPS - 1]
+            assert found_shift(last, images[episode, N_STEPS - 1, camera]) == shifts[episode][camera]
+    amounts = {shift for of_episode in shifts for shift in of_episode}
+    assert len(amounts) > N_EPISODES
+    assert max(abs(px) for shift in amounts for px in shift) <= MOST_PX
+    assert any(base != wrist for base, wrist in shifts)
+
+
+def test_images_are_not_moved_at_zero_pixels_nor_outside_training() -> None:
+    given = batch()
+    shown = torch.stack([given[key][:, :N_STEPS] for key in CAMERAS], dim=2)
+    assert torch.equal(episodes_of(given, config(), training=True).images, shown)
+    assert torch.equal(episodes_of(given, config(shift_px=MOST_PX), training=False).images, shown)
+
+
+def test_a_negative_shift_is_refused() -> None:
+    with pytest.raises(RecipeError, match="shift_px is -1, expected a number of pixels ≥ 0"):
+        config(shift_px=-1)
