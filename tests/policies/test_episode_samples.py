@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.policies.episode_samples import episodes_of
+from vla_eval.policies.episode_samples import episodes_of, in_numbers
 from vla_eval.policies.sequence.configuration_sequence import MikasaSequenceConfig
 
 CAMERAS = ("observation.images.base", "observation.images.wrist")
@@ -97,3 +97,16 @@ def test_images_are_not_moved_at_zero_pixels_nor_outside_training() -> None:
 def test_a_negative_shift_is_refused() -> None:
     with pytest.raises(RecipeError, match="shift_px is -1, expected a number of pixels ≥ 0"):
         config(shift_px=-1)
+
+
+def test_images_in_bytes_are_those_numbers() -> None:
+    as_bytes = batch()
+    for key in CAMERAS:
+        as_bytes[key] = (as_bytes[key] * 255).to(torch.uint8)
+    as_numbers = as_bytes | {key: as_bytes[key].to(torch.float32) / 255 for key in CAMERAS}
+    of_bytes, of_numbers = (
+        episodes_of(given, config(), training=False).images for given in (as_bytes, as_numbers)
+    )
+    assert of_bytes.dtype == torch.uint8
+    assert torch.equal(in_numbers(of_bytes), of_numbers)
+    assert torch.equal(in_numbers(of_numbers), of_numbers)

@@ -27,6 +27,8 @@ class EpisodeConfig(PortedConfig):
 
     Attributes:
         whole_episodes: `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it.
+        takes_bytes: `mikasa-vla finetune` hands over images as bytes, so that numbers are made only of the
+            frames that are used.
         masks_padding: actions beyond an episode's end count nothing, see `episode_samples`.
         window_steps: frames of history in a training sample; at least the longest episode, so that no
             memory begins in its middle. None: our `finetune` takes the dataset's longest.
@@ -48,6 +50,7 @@ class EpisodeConfig(PortedConfig):
     """
 
     whole_episodes: ClassVar[bool] = True
+    takes_bytes: ClassVar[bool] = True
     masks_padding: ClassVar[bool] = True
 
     window_steps: int | None = None

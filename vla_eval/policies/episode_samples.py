@@ -10,6 +10,7 @@ from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
 
 LEAST_VARIANCE_M2 = 1e-6
+MAX_UINT8 = 255
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 
 
@@ -17,7 +18,7 @@ class Episodes(NamedTuple):
     """A batch of B episodes of T steps, from their beginning; padding comes last.
 
     Attributes:
-        images: (B, T, cameras, 3, H, W) in [0, 1].
+        images: (B, T, cameras, 3, H, W), as they were handed over: see `in_numbers`.
         state: (B, T, state).
         actions: (B, T, chunk, action).
         counts: (B, T, chunk) float, 0 for what is beyond the episode.
@@ -33,6 +34,11 @@ class Episodes(NamedTuple):
     steps: Tensor
 
 
+def in_numbers(images: Tensor) -> Tensor:
+    """Return images in [0, 1], given that or bytes. Of bytes it takes a while: leave padding out first."""
+    return images.to(torch.float32) / MAX_UINT8 if images.dtype == torch.uint8 else images
+
+
 def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
     """Return the images (…, cameras, 3, H, W), in the order of the configuration."""
     return torch.stack([batch[key] for key in config.image_features], dim=-4)
@@ -44,7 +50,7 @@ def episodes_of(
     """Return the steps to train on, moved together: those of the episode, most waiting left out.
 
     Args:
-        batch: as `config` asks for it by its delta indices.
+        batch: as `config` asks for it by its delta indices; images in [0, 1], or bytes.
         config: of the policy.
         training: leave waiting out, end some episodes at a decision, mix colours and move images, at random
             by torch's generator; else take every step.

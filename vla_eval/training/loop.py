@@ -148,7 +148,7 @@ class _Training:
         """Do one gradient step, the `step`-th counted from 1."""
         tracker, started = self.tracker, time.perf_counter()
         batch = next(self.batches)
-        for key in self.images:
+        for key in () if self.job.takes_bytes else self.images:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(dtype=torch.float32) / MAX_UINT8
         batch = preprocessed(self.before, batch)

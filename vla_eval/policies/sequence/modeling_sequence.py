@@ -13,6 +13,7 @@ from vla_eval.policies.episode_samples import (
     Episodes,
     episodes_of,
     goal_missed,
+    in_numbers,
     stacked_images,
     weighted_mean,
 )
@@ -186,7 +187,8 @@ class MikasaSequencePolicy(EpisodePolicy):
         # Images are most of the work: those of padding are not encoded.
         said = said_at_each_step(network.sentence, batch, real.shape[1])
         said = None if said is None else said[real][None]
-        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None], said)[0]
+        images = in_numbers(episodes.images[real])
+        encoded = network.tokens(images[None], episodes.state[real][None], said)[0]
         tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
         predicted = network.predict(tokens, answers)
