@@ -1,7 +1,10 @@
 """A dataset of another task that counts as recorded, beside the fixture `recorded`."""
 
 import dataclasses
+import functools
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.manifest import (
@@ -20,10 +23,21 @@ from vla_eval.testing.synthetic import write_synthetic_dataset
 TASK, SENTENCE = "ShellGameTouch-v0", "touch the cup"
 
 
+@functools.cache
+def _frames(state: StateKind) -> TemporaryDirectory[str]:
+    """Encode the videos once per process."""
+    folder = TemporaryDirectory()
+    Path(folder.name).rmdir()  # lerobot wants to make it
+    write_synthetic_dataset(
+        Path(folder.name), n_episodes=2, n_frames=13, state=state, seed=1, instructions=[SENTENCE]
+    )
+    return folder
+
+
 def write_second_task(recorded: Path, *, state: StateKind = "eef") -> Path:
     """Write 2 episodes of 13 and 14 frames, of seeds 2000 and 2001, beside a recorded dataset."""
     root = recorded.parent / TASK
-    write_synthetic_dataset(root, n_episodes=2, n_frames=13, state=state, seed=1, instructions=[SENTENCE])
+    shutil.copytree(_frames(state).name, root)
     (root / MIKASA_FOLDER).mkdir()
     like = zip(read_manifest(recorded)[:2], (2000, 2001), strict=True)
     episodes = [dataclasses.replace(e, task=TASK, instruction=SENTENCE, seed=seed) for e, seed in like]
