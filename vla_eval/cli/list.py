@@ -1,9 +1,10 @@
 """`mikasa-vla list`: which tasks, families, policies, configs, prompts, datasets, protocols there are."""
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from vla_eval.cli.screen import NARROWEST, filled, screen_width
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
@@ -55,21 +56,36 @@ def run(args: argparse.Namespace) -> int:
     for kind in kinds:
         if len(kinds) > 1:
             print(f"{kind}:")
-        for line in _lines(_tasks(args.suite) if kind == "tasks" else _LISTS[kind]()):
-            print(f"  {line}" if len(kinds) > 1 else line)
+        groups = _tasks(args.suite) if kind == "tasks" else _LISTS[kind]()
+        print_rows(groups, indent="  " if len(kinds) > 1 else "")
     return 0
 
 
-def _lines(groups: Groups) -> Iterator[str]:
-    """Yield headings and rows; columns stand below each other in all groups, the last one is not padded."""
+def print_rows(groups: Groups, *, indent: str = "") -> None:
+    """Print headings and rows; columns stand below each other in all groups, the last one is not padded.
+
+    On a terminal, the last column is folded below itself, or has lines of its own if it is narrow.
+    """
     rows = [row for group in groups.values() for row in group]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     for heading, group in groups.items():
         if heading and group:
-            yield f"{heading}:"
+            print(f"{indent}{heading}:")
         for row in group:
-            line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            yield f"  {line}" if heading else line
+            _print_row(row, widths, f"{indent}  " if heading else indent)
+
+
+def _print_row(row: Row, widths: Sequence[int], indent: str) -> None:
+    cells = [cell.ljust(width) for cell, width in zip(row[:-1], widths[:-1], strict=True)]
+    first, last = f"{indent}{'  '.join(cells)}", row[-1]
+    screen = screen_width(widest=None)
+    if screen is None or len(first) + len("  ") + len(last) <= screen or not last:
+        print(f"{first}  {last}".rstrip())
+    elif screen - len(first) >= NARROWEST:
+        print(filled(last, screen, first=f"{first}  ", rest=" " * (len(first) + len("  "))))
+    else:
+        print(first.rstrip())
+        print(filled(last, screen, first=f"{indent}    ", rest=f"{indent}    "))
 
 
 def _tasks(suite: Suite = "paper") -> Groups:

@@ -40,8 +40,8 @@ FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
   {PROGRAM} eval demo
       scripted policies with and without memory on two tasks; minutes, no GPU
   {PROGRAM} check POLICY
-      does your policy keep the contract? POLICY: a name, a recipe, a checkpoint or ws://HOST:PORT
-  {PROGRAM} eval --task RememberColor3-v0 --policy POLICY cue_blind oracle random
+      does it keep the contract? POLICY: name, file, checkpoint or ws://HOST:PORT
+  {PROGRAM} eval --task RememberColor3-v0 --policy POLICY cue_blind oracle
       your policy beside chance and ceiling, on the same episodes
 
 `{PROGRAM} list` shows tasks and policies, `{PROGRAM} --help` every verb."""

@@ -1,21 +1,60 @@
-"""Fit Markdown to the terminal that it is printed on. In a file or a pipe, a paragraph stays one line."""
+"""Fit text to the terminal that it is printed on. In a file or a pipe, a paragraph stays one line."""
 
+import os
+import re
 import shutil
 import sys
 import textwrap
+from typing import TextIO
 
 WIDEST, NARROWEST = 100, 40
 """Characters. Longer lines are hard to read, shorter ones hold no sentence."""
 ITEM = "- "  # of a list
 UNKNOWN_LINES = 24  # `get_terminal_size` wants them; nobody asks
+UNBROKEN = re.compile(r"\S*`[^`]+`\S*|(?<=: )mikasa-vla .*|\S+")
+"""Words; a command in quotes, or from a colon to the end, is one: what is copied must not hold a line break."""
 
 
-def screen_width() -> int | None:
-    """Return how many characters a printed line may have; None where standard output is no terminal."""
+def screen_width(*, widest: int | None = WIDEST) -> int | None:
+    """Return how many characters a printed line may have; None where standard output is no terminal.
+
+    Args:
+        widest: a table may take the whole terminal: None.
+    """
     if not sys.stdout.isatty():
         return None
     columns = shutil.get_terminal_size((WIDEST, UNKNOWN_LINES)).columns
-    return min(max(columns, NARROWEST), WIDEST)
+    return max(columns if widest is None else min(columns, widest), NARROWEST)
+
+
+def message_width(stream: TextIO) -> int | None:
+    """Return how many characters a line of a message may have; None where the stream is no terminal."""
+    try:
+        if not stream.isatty():
+            return None
+        columns = os.get_terminal_size(stream.fileno()).columns or WIDEST  # 0: the terminal does not know
+    except (OSError, ValueError):  # no descriptor, or closed
+        return None
+    return max(min(columns, WIDEST), NARROWEST)
+
+
+def folded(text: str, width: int) -> str:
+    """Return a message whose lines have at most so many characters, but for commands and long words.
+
+    Lines that begin with a blank (code, a bar) stay as they are.
+    """
+    return "".join(_folded_line(line, width) for line in text.splitlines(keepends=True))
+
+
+def _folded_line(line: str, width: int) -> str:
+    if len(line.rstrip("\n")) <= width or line[0].isspace():
+        return line
+    lines = [""]
+    for word in UNBROKEN.findall(line):
+        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return "\n".join(lines) + ("\n" if line.endswith("\n") else "")
 
 
 def print_markdown(text: str) -> None:
@@ -33,11 +72,16 @@ def _wrapped_line(line: str, width: int) -> str:
     if len(line) <= width or line.startswith("|"):
         return line
     mark = ITEM if line.startswith(ITEM) else ""
+    return filled(line.removeprefix(mark), width, first=mark, rest=" " * len(mark))
+
+
+def filled(text: str, width: int, *, first: str, rest: str) -> str:
+    """Return the text in lines of at most so many characters that begin with `first`, then with `rest`."""
     return textwrap.fill(
-        line.removeprefix(mark),
+        text,
         width,
-        initial_indent=mark,
-        subsequent_indent=" " * len(mark),
+        initial_indent=first,
+        subsequent_indent=rest,
         break_long_words=False,
         break_on_hyphens=False,
     )

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
+from vla_eval.cli.screen import folded, message_width
 from vla_eval.errors import VlaEvalError
 
 STDOUT_FD, STDERR_FD = 1, 2
@@ -47,6 +48,16 @@ class _Stream:
         """Drop what cannot be written: there is no other stream to report it on."""
 
 
+class _Messages(_Stream):
+    """Standard error; on a terminal, sentences are folded to its width."""
+
+    def write(self, text: str) -> int:
+        """Write the text."""
+        width = message_width(self._stream)
+        super().write(text if width is None or "\r" in text else folded(text, width))
+        return len(text)
+
+
 class _Output(_Stream):
     def _meet(self, exc: OSError) -> None:
         if isinstance(exc, BrokenPipeError):  # the reader has seen enough (`| head`)
@@ -66,7 +77,7 @@ def standard_streams() -> Iterator[None]:
     out = sys.stdout or os.fdopen(STDOUT_FD, "w", encoding="utf-8", closefd=False)
     error = sys.stderr or os.fdopen(STDERR_FD, "w", encoding="utf-8", closefd=False)
     errors = [_escape(stream) for stream in (out, error)]
-    sys.stdout, sys.stderr = cast(TextIO, _Output(out)), cast(TextIO, _Stream(error))
+    sys.stdout, sys.stderr = cast(TextIO, _Output(out)), cast(TextIO, _Messages(error))
     try:
         yield
     finally:
