@@ -127,8 +127,7 @@ def test_where_a_terminal_leaves_too_little_room_the_last_column_has_a_line_of_i
         "      sentence sentence sentence",
         "      sentence sentence sentence",
         "      sentence sentence sentence",
-        "  a_longer_name  9 steps",
-        "      one",
+        "  a_longer_name  9 steps   one",
     ]
 
 

@@ -152,10 +152,20 @@ def test_arrow_keys_show_the_same_seed_of_all_policies(browser: Browser, tmp_pat
         browser.press(key)
     (chosen,) = browser.rows("#episode-table tbody tr[aria-selected]")
     assert chosen[1:5] == ["p", "1", "0", "1"]  # the second row: seed 1 of p at K = 1
-    beside = browser.rows("#episode-beside tr")
-    assert [(row[1], row[2], row[4]) for row in beside] == [
-        (policy, k, "1") for policy, k in (("p", "1"), ("p", "4"), ("random", "1"), ("random", "4"))
-    ]
+    headings, *beside = browser.rows("#episode-beside tr")
+    assert headings == ["policy", "K", "outcome", "success step", "target", "first choice"]
+    assert [row[:2] for row in beside] == [["p", "1"], ["p", "4"], ["random", "1"], ["random", "4"]]
+    assert "seed 1" in browser.ask("document.querySelector('#episode-beside h3').textContent")
+
+
+def test_the_task_is_a_column_of_the_list_only_where_there_are_several(
+    browser: Browser, tmp_path: Path
+) -> None:
+    shown = "getComputedStyle(document.querySelector('#episode-table tbody td')).display"
+    browser.open(write_page([full_run()], tmp_path / "several"))
+    assert browser.ask(shown) == "table-cell"
+    browser.open(write_page([stored(episode("p", 1, True))], tmp_path / "one"))
+    assert browser.ask(shown) == "none"
 
 
 def test_captures_are_linked_from_the_page_to_where_they_are(browser: Browser, tmp_path: Path) -> None:
@@ -177,6 +187,21 @@ def test_captures_are_linked_from_the_page_to_where_they_are(browser: Browser, t
         ["rrd", rrd_file(run.path, filmed).as_uri()],
     ]
     assert browser.complaints == []
+
+
+def test_a_poster_is_covered_by_controls_only_where_one_points_at_it(
+    browser: Browser, tmp_path: Path
+) -> None:
+    run = replace(full_run(), path=tmp_path / "run")
+    video = video_file(run.path, run.records[0])
+    video.parent.mkdir(parents=True)
+    video.write_bytes(b"not a video, but bytes")
+    browser.open(write_page([run], tmp_path / "page"))
+    has_controls = "document.querySelector('.episodes video').controls"
+    assert browser.ask(has_controls) is False
+    for kind, expected in (("pointerenter", True), ("pointerleave", False), ("focus", True), ("blur", False)):
+        browser.ask(f"document.querySelector('.episodes video').dispatchEvent(new Event('{kind}'))")
+        assert browser.ask(has_controls) is expected
 
 
 def test_a_phone_shows_the_page_without_scrolling_sideways(browser: Browser, tmp_path: Path) -> None:

@@ -97,18 +97,30 @@ def test_the_controls_of_the_caption_are_the_scripted_policies() -> None:
 @pytest.mark.parametrize("runs", [1, 2])
 def test_latex_sets_the_tables_within_one_line_width(tmp_path: Path, runs: int) -> None:
     table = a_table(*TASKS, runs=runs)
-    sweep = compare_runs([stored(*(episodes("p", "+-", n_action_steps=k) for k in (1, 4)))])
+    names = ("p", "a_policy_with_a_long_name")
+    wide = [
+        episodes(name, "+-", task=task, n_action_steps=k) for name in names for task in TASKS for k in (1, 4)
+    ]
+    narrow = [episodes("p", "+-", n_action_steps=k) for k in (1, 4)]
     body = [
         preset(table),
-        r"\clearpage\tiny\hoffset-1in\hsize=40in\noindent",  # of the others only that they compile
+        *(render_sweep(compare_runs([stored(*groups)]), "latex") for groups in (wide, narrow)),
+        r"\clearpage\typeout{WIDE FROM HERE}\tiny\hoffset-1in\hsize=40in\noindent",  # only that it compiles
         render(table, "latex", paper=True),
-        render_sweep(sweep, "latex"),
     ]
-    packages = r"\documentclass{article}\usepackage{booktabs}\begin{document}"
+    packages = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}"
     source = "\n".join([packages, *body, r"\end{document}"])
     (tmp_path / "table.tex").write_text(source, encoding="utf-8")
     command = [PDFLATEX or "", "-interaction=nonstopmode", "-halt-on-error", "table.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:]
-    assert "Overfull" not in done.stdout.partition("[1")[0]
+    widths = (tmp_path / "table.log").read_text(encoding="latin-1").partition("WIDE FROM HERE")[0]
+    assert "Overfull" not in widths
     assert (tmp_path / "table.pdf").stat().st_size > 0
+
+
+def test_a_comparison_says_once_what_all_its_rows_share() -> None:
+    runs = [stored(*(episodes("p", "+-", n_action_steps=k) for k in (1, 4)))]
+    above, _, table = render_sweep(compare_runs(runs), "latex").partition(r"\begin{tabular}")
+    assert rf"All rows: task {COLOR}, policy p, episodes 2" in above
+    assert COLOR not in table and table.splitlines()[2].startswith("K & ")

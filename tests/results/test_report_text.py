@@ -237,7 +237,25 @@ def test_without_a_measured_chance_the_verdict_begins_with_the_best_and_keeps_th
 
     (verdict,) = verdicts(build_table([stored(records)]))
 
-    assert [text.partition(" succeeds")[0] for text in verdict.sentences] == ["good, K=1", "good, K=8", "bad"]
+    *said, last = verdict.sentences
+    assert [text.partition(" succeeds")[0] for text in said] == ["good, K=1", "good, K=8", "bad"]
+    assert not verdict.is_compared
+    # Of the task, so once: 1/3 for three candidates.
+    assert last == (
+        "Chance is 0.33 by arithmetic: without cue_blind on the same episodes, nothing is said of memory."
+    )
+
+
+def test_a_verdict_says_at_which_n_action_steps_chance_was_not_measured() -> None:
+    records = [*episodes("p", "+" * 8, n_action_steps=1), *episodes("cue_blind", "-" * 8, n_action_steps=1)]
+    records += [episode("p", seed, "+", n_action_steps=8) for seed in range(101, 109)]  # other episodes
+
+    (verdict,) = verdicts(build_table([stored(records)]))
+
+    assert verdict.is_compared
+    assert verdict.sentences[0].startswith("p, K=1 beats chance by +1.00")
+    assert verdict.sentences[1].startswith("p, K=8 succeeds in 1.00")
+    assert verdict.sentences[2].startswith("Chance at K = 8 is ")
 
 
 def test_a_verdict_is_said_once_for_all_n_action_steps_at_which_it_is_the_same() -> None:

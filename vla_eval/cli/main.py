@@ -40,7 +40,7 @@ FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
   {PROGRAM} eval demo
       scripted policies with and without memory on two tasks; minutes, no GPU
   {PROGRAM} check POLICY
-      does it keep the contract? POLICY: name, file, checkpoint or ws://HOST:PORT
+      does it keep the contract? POLICY: a name, checkpoint or ws://HOST:PORT
   {PROGRAM} eval --task RememberColor3-v0 --policy POLICY cue_blind oracle
       your policy beside chance and ceiling, on the same episodes
 

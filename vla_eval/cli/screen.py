@@ -12,7 +12,7 @@ WIDEST, NARROWEST = 100, 40
 ITEM = "- "  # of a list
 UNKNOWN_LINES = 24  # `get_terminal_size` wants them; nobody asks
 UNBROKEN = re.compile(r"\S*`[^`]+`\S*|(?<=: )mikasa-vla .*|\S+")
-"""Words; a command in quotes, or from a colon to the end, is one: what is copied must not hold a line break."""
+"""Words; a command in quotes, or from a colon to the end, is one: it must be copied without a line break."""
 
 
 def screen_width(*, widest: int | None = WIDEST) -> int | None:

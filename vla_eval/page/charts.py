@@ -5,7 +5,7 @@ This module imports matplotlib, so only code that builds a page imports it.
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -84,7 +84,14 @@ class Chart(NamedTuple):
     narrow: Markup | None = None
 
 
-def forest(bars: Sequence[Bar], *, title: str, description: str, width_px: float = FOREST_WIDTH_PX) -> Chart:
+def forest(
+    bars: Sequence[Bar],
+    *,
+    title: str,
+    description: str,
+    width_px: float = FOREST_WIDTH_PX,
+    label_px: float = 0,
+) -> Chart:
     """Draw rates with intervals, one below the other, chance and ceiling as ticks.
 
     Args:
@@ -92,19 +99,25 @@ def forest(bars: Sequence[Bar], *, title: str, description: str, width_px: float
         title: of the plot.
         description: what it shows, for screen readers.
         width_px: of the axis, where the screen is not narrow.
+        label_px: room for labels at least, so that the axes of several plots begin at the same place.
     """
     label = f"{title}. {description}"
     with own_style():
         return Chart(
             title,
-            inline_svg(_forest(bars, width_px), label=label, css_class="wide"),
-            inline_svg(_forest(bars, NARROW_FOREST_WIDTH_PX), label=label, css_class="narrow"),
+            inline_svg(_forest(bars, width_px, label_px), label=label, css_class="wide"),
+            inline_svg(_forest(bars, NARROW_FOREST_WIDTH_PX, label_px), label=label, css_class="narrow"),
         )
 
 
-def _forest(bars: Sequence[Bar], width_px: float) -> Figure:
+def labels_width_px(labels: Iterable[str]) -> float:
+    """Return the width of the longest label."""
+    return max((text_width_px(_printable(label)) for label in labels), default=0)
+
+
+def _forest(bars: Sequence[Bar], width_px: float, label_px: float) -> Figure:
     labels = [_printable(bar.label) for bar in bars]
-    left = 16 + max(text_width_px(label) for label in labels)
+    left = 16 + max(label_px, labels_width_px(labels))
     figure, axes = _plot(width_px, ROW_HEIGHT_PX * len(bars), left=left, right=20, top=4, bottom=26)
     axes.set(xlim=(0, 1), ylim=(len(bars) - 0.5, -0.5))
     axes.set_xticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])

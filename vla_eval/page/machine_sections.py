@@ -33,6 +33,7 @@ class LatencyTable:
 def latency(material: Material) -> LatencyTable:
     """Return times of inferences by run, task, policy and K."""
     rows, n_unknown = [], 0
+    several_tasks = len(material.tasks) > 1
     for run in material.runs:
         results = [record for record in run.records if record.outcome != "error"]
         for group in dict.fromkeys(record.key[:3] for record in results):
@@ -45,7 +46,7 @@ def latency(material: Material) -> LatencyTable:
             seconds = (measured.median_seconds, measured.slowest_seconds)
             rows.append(
                 [
-                    f"{task} · {policy} · K={size}",
+                    f"{task} · {policy} · K={size}" if several_tasks else f"{policy} · K={size}",
                     str(run.path),
                     str(measured.n_episodes),
                     *(f"{value * 1000:.2f}" for value in seconds),

@@ -49,8 +49,13 @@ class Material:
         return self.grouping.groups[key_of(row)]
 
     def name_of(self, row: Row, *, with_task: bool = False) -> str:
-        """Return the name of a row within its task: policy, K, and the letter of its variant."""
-        parts = [row.task] if with_task else []
+        """Return the name of a row within its task: policy, K, and the letter of its variant.
+
+        Args:
+            row: of the table.
+            with_task: begin with the task, if the page has several.
+        """
+        parts = [row.task] if with_task and len(self.tasks) > 1 else []
         name = " · ".join([*parts, row.policy, f"K={row.n_action_steps}"])
         return f"{name} ({self.variants[row.variant]})" if row.variant else name
 

@@ -16,6 +16,7 @@ from vla_eval.page.charts import (
     Series,
     curves,
     forest,
+    labels_width_px,
     reference_sign,
     sign,
 )
@@ -111,6 +112,7 @@ def _layout_table(layout: Layout, caption: str) -> PageTable:
 def success_plots(material: Material) -> Plots:
     """Draw success once by task, with intervals, chance and ceiling."""
     charts = []
+    label_px = labels_width_px(material.name_of(row) for row in material.table.rows)
     for task in material.tasks:
         bars = [
             Bar(
@@ -125,7 +127,8 @@ def success_plots(material: Material) -> Plots:
             for row in material.rows_of(task)
         ]
         described = "; ".join(f"{bar.label}: {_rate(bar.value)} ({_interval(bar)})" for bar in bars)
-        charts.append(forest(bars, title=f"{task}: success once", description=described))
+        title = f"{task}: success once"
+        charts.append(forest(bars, title=title, description=described, label_px=label_px))
     return Plots(legend=_reference_signs(), charts=tuple(charts))
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from vla_eval.probe.retention import Range
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
 from vla_eval.results.estimates import Interval
-from vla_eval.results.latex import latex_table, latex_text
+from vla_eval.results.latex import fitted, latex_table, latex_text
 
 ProbeFormat = Literal["markdown", "csv", "json", "latex", "html-table"]
 ReadableFormat = Literal["markdown", "latex", "html-table"]
@@ -36,8 +36,8 @@ def shown_table(
     is_number = [title not in text_titles for title in titles]
     if fmt == "latex":
         footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
-        table = latex_table(titles, rows, is_number, ruled_by_first=True)
-        return "\n".join(["% needs \\usepackage{booktabs}", *table, *footnotes])
+        table = fitted(latex_table(titles, rows, is_number, ruled_by_first=True))
+        return "\n".join([*table, *footnotes])
     if fmt == "html-table":
         items = [f"<li>{html_text(line)}</li>" for line in said]
         return "\n".join([html_table(titles, rows, is_number), "<ul>", *items, "</ul>"])

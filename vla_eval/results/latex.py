@@ -56,6 +56,16 @@ def latex_table(
     return [*lines, "\\bottomrule", "\\end{tabular}"]
 
 
+def fitted(lines: Sequence[str]) -> list[str]:
+    r"""Return a table that is scaled down to `\linewidth` where it is wider; needs booktabs and graphicx."""
+    return [
+        "% needs \\usepackage{booktabs,graphicx}",
+        "\\noindent\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%",
+        *lines,
+        "}",
+    ]
+
+
 def latex_row(cells: Sequence[str]) -> str:
     """Return one row of names and numbers."""
     first, *others = cells

@@ -6,8 +6,9 @@ import json
 
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
-from vla_eval.results.latex import latex_table, latex_text
+from vla_eval.results.latex import fitted, latex_table, latex_text
 from vla_eval.results.sweep import Sweep, SweepRow
+from vla_eval.results.table_columns import sentence_of
 from vla_eval.results.table_formats import Format, markdown_table
 
 JSON_VERSION = 1
@@ -33,15 +34,26 @@ def render_sweep(sweep: Sweep, fmt: Format) -> str:
     if fmt == "json":
         return _json(sweep, notes)
     if fmt == "latex":
-        lines = ["% needs \\usepackage{booktabs}", *latex_table(titles, rows, is_number, ruled_by_first=True)]
-        return "\n".join(
-            [*lines, *(f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes)]
-        )
+        return _latex(titles, rows, notes)
     if fmt == "html-table":
         items = [f"<li>{html_text(note)}</li>" for note in notes]
         return "\n".join([html_table(titles, rows, is_number), "<ul>", *items, "</ul>"])
     return f"{markdown_table(titles, rows, is_number)}\n\n" + "\n".join(
         f"- {markdown_text(note)}" for note in notes
+    )
+
+
+def _latex(titles: list[str], rows: list[list[str]], notes: list[str]) -> str:
+    """Return a table of the columns that differ, below a line of those that do not, in one line width."""
+    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
+    same = [(title, column[0]) for title, column in cells.items() if len(rows) > 1 and len(set(column)) == 1]
+    kept = [title for title in titles if title not in dict(same)]
+    shown = [list(row) for row in zip(*(cells[title] for title in kept), strict=True)]
+    said = [latex_text(sentence_of(same))] if same else []
+    table = fitted(latex_table(kept, shown, [title not in TEXTS for title in kept], ruled_by_first=True))
+    below = [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
+    return "\n".join(
+        [*(f"\\noindent{{\\footnotesize {line}\\par}}\\smallskip" for line in said), *table, *below]
     )
 
 

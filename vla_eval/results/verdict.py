@@ -30,10 +30,12 @@ class Verdict(NamedTuple):
     Attributes:
         task: its id.
         sentences: the best policy first; one for all n_action_steps of a policy at which the same was found.
+        is_compared: whether any policy was compared with chance.
     """
 
     task: str
     sentences: tuple[str, ...]
+    is_compared: bool
 
 
 def verdicts(table: Table) -> list[Verdict]:
@@ -52,8 +54,10 @@ def verdicts(table: Table) -> list[Verdict]:
             key = (row.policy, row.variant, finding, None if finding in VERBS else row.n_action_steps)
             groups.setdefault(key, []).append(row)
         sentences = [_sentence(group, rows) for group in groups.values()]
+        if any(_finding(row) == "chance unknown" for row in told):
+            sentences.append(_unknown_chance(told))
         if sentences:
-            found.append(Verdict(task, tuple(sentences)))
+            found.append(Verdict(task, tuple(sentences), any(_finding(row) in VERBS for row in told)))
     return found
 
 
@@ -80,11 +84,7 @@ def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
     if finding == "no result":
         return f"{name} has no result yet."
     if finding == "chance unknown":
-        known = "not measured" if row.chance is None else f"{row.chance:.2f} by arithmetic"
-        return (
-            f"{name} succeeds in {row.success_once:.2f} of its episodes. Chance is {known}: without "
-            f"{CHANCE_POLICY} on the same episodes, nothing is said of memory{_choice(row)}."
-        )
+        return f"{name} succeeds in {row.success_once:.2f} of its episodes{_choice(row)}."
     verb = VERBS[finding]
     if len(group) == 1:
         return f"{name} {verb}{' by' if finding == 'beats' else ':'} {_said(row)}."
@@ -95,6 +95,18 @@ def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
     )
 
 
+def _unknown_chance(rows: Sequence[Row]) -> str:
+    """Say once why some or all rows of a task were not compared with chance."""
+    unknown = [row for row in rows if _finding(row) == "chance unknown"]
+    compared = any(_finding(row) in VERBS for row in rows)
+    steps = sorted({row.n_action_steps for row in unknown})
+    which = f" at K = {_listed(steps)}" if compared else ""
+    known = "not measured" if unknown[0].chance is None else f"{unknown[0].chance:.2f} by arithmetic"
+    return (
+        f"Chance{which} is {known}: without {CHANCE_POLICY} on the same episodes, nothing is said of memory."
+    )
+
+
 def _said(row: Row) -> str:
     assert row.paired_p is not None  # as in every row whose chance was measured
     difference = f"{row.paired_difference:+.2f} [{row.paired_low:+.2f}, {row.paired_high:+.2f}]"
@@ -102,7 +114,8 @@ def _said(row: Row) -> str:
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    return f"{', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
+    *before, last = map(str, numbers)
+    return f"{', '.join(before)} and {last}" if before else last
 
 
 def _name(group: Sequence[Row], rows: Sequence[Row]) -> str:

@@ -26,27 +26,32 @@
       step, itemOf(episode, "target"), itemOf(episode, "chosen")];
   };
 
+  // Task, run and seed are in the title of what stands beside the list.
+  const notInTitle = ([, policy, k, , , ...rest]) => [policy, k, ...rest];
+
   function fill(name, values) {
     const several = [...new Set(values)];
     for (const value of several) form.elements[name].add(new Option(value, value));
     form.elements[name].closest("label").hidden = several.length < (name === "error" ? 1 : 2);
   }
   fill("task", data.rows.map((row) => row.task));
+  const isOneTask = new Set(data.rows.map((row) => row.task)).size < 2;
+  document.getElementById("episode-table").classList.toggle("one-task", isOneTask);
   fill("policy", data.rows.map((row) => row.policy));
   fill("k", data.rows.map((row) => String(row.k)));
   fill("outcome", data.outcomes);
   fill("error", data.errors.map((text) => text.split(":")[0]));
 
-  function line(episode) {
+  function line(episode, cells) {
     const tr = document.createElement("tr");
-    for (const text of cellsOf(episode)) tr.insertCell().textContent = text;
+    for (const text of cells) tr.insertCell().textContent = text;
     tr.className = outcomeOf(episode);
     return tr;
   }
   function show(n) {
     const parts = document.createDocumentFragment();
     for (; shown < Math.min(n, found.length); shown++) {
-      const tr = line(found[shown]);
+      const tr = line(found[shown], cellsOf(found[shown]));
       const index = shown;
       tr.addEventListener("click", () => choose(index));
       parts.append(tr);
@@ -83,8 +88,12 @@
     const title = document.createElement("h3");
     title.textContent = `${rowOf(one).task}, run ${one[at.run]}, seed ${one[at.seed]}: all policies`;
     const table = document.createElement("table");
+    const headings = table.createTHead().insertRow();
+    for (const cell of notInTitle([...document.querySelectorAll("#episode-table th")])) {
+      headings.append(cell.cloneNode(true));
+    }
     for (const other of same) {
-      const tr = line(other);
+      const tr = line(other, notInTitle(cellsOf(other)));
       if (other === one) tr.setAttribute("aria-selected", "true");
       const last = tr.insertCell();
       last.textContent = errorOf(other);
@@ -109,4 +118,13 @@
     choose(chosen + step);
   });
   filter();
+
+  // At rest, a player's controls cover the lower half of the poster.
+  for (const video of document.querySelectorAll(".episodes video")) {
+    const isNew = () => video.paused && video.currentTime === 0;
+    video.tabIndex = 0;
+    video.controls = false;
+    for (const kind of ["pointerenter", "focus"]) video.addEventListener(kind, () => { video.controls = true; });
+    for (const kind of ["pointerleave", "blur"]) video.addEventListener(kind, () => { video.controls = !isNew(); });
+  }
 })();
