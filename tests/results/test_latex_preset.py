@@ -123,4 +123,6 @@ def test_a_comparison_says_once_what_all_its_rows_share() -> None:
     runs = [stored(*(episodes("p", "+-", n_action_steps=k) for k in (1, 4)))]
     above, _, table = render_sweep(compare_runs(runs), "latex").partition(r"\begin{tabular}")
     assert rf"All rows: task {COLOR}, policy p, episodes 2" in above
+    assert "---" not in above  # no ceiling: a column of nothing is not there
     assert COLOR not in table and table.splitlines()[2].startswith("K & ")
+    assert table.count(r"\midrule") == 1  # rules stand between tasks

@@ -49,8 +49,11 @@ def _latex(titles: list[str], rows: list[list[str]], notes: list[str]) -> str:
     same = [(title, column[0]) for title, column in cells.items() if len(rows) > 1 and len(set(column)) == 1]
     kept = [title for title in titles if title not in dict(same)]
     shown = [list(row) for row in zip(*(cells[title] for title in kept), strict=True)]
-    said = [latex_text(sentence_of(same))] if same else []
-    table = fitted(latex_table(kept, shown, [title not in TEXTS for title in kept], ruled_by_first=True))
+    known = [(title, cell) for title, cell in same if cell != UNKNOWN]
+    said = [latex_text(sentence_of(known))] if known else []
+    table = fitted(
+        latex_table(kept, shown, [title not in TEXTS for title in kept], ruled_by_first=kept[0] == "task")
+    )
     below = [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
     return "\n".join(
         [*(f"\\noindent{{\\footnotesize {line}\\par}}\\smallskip" for line in said), *table, *below]
