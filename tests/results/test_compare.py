@@ -180,3 +180,15 @@ def test_the_cues_default_length_is_the_simulators() -> None:
     source = (Path(__file__).parents[2] / "vla_eval/tasks/memory_env.py").read_text()
     assert CHOICE_DEFAULTS["cue_steps"] == DEFAULT_CUE_STEPS
     assert f"cue_steps: StepRange = {DEFAULT_CUE_STEPS}," in source
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_on_a_terminal_a_comparison_fits_and_says_what_it_leaves_out(width: int) -> None:
+    runs = [stored(episodes("one", 1, "+-+-"), episodes("one", 8, "++--"))]
+    text = render_sweep(compare_runs(runs), "markdown", width=width)
+    above, table = text.splitlines()[0], [line for line in text.splitlines() if line.startswith("|")]
+    assert above.startswith("All rows: task ") and "policy one" in above
+    assert max(map(len, table)) <= width
+    for title in ("K", "success", "difference", "p (Holm)"):
+        assert f" {title} |" in table[0]
+    assert ("not shown: " in text) is (width < 100)

@@ -7,6 +7,7 @@ from typing import Any
 
 from vla_eval.cli.arguments import add_verb
 from vla_eval.cli.output import FORMATS, print_in
+from vla_eval.cli.screen import screen_width
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
 chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         reference=args.reference,
         difference=args.difference,
     )
-    print_in(args.format, render_sweep(sweep, args.format))
+    print_in(args.format, render_sweep(sweep, args.format, width=screen_width()))
     if args.format == "csv":  # has no place for them
         for note in sweep_notes(sweep):
             print(f"note: {note}", file=sys.stderr)

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from typing import NamedTuple
 
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
@@ -20,9 +21,24 @@ TITLES = (
 )
 
 
-def render_sweep(sweep: Sweep, fmt: Format) -> str:
-    """Return the comparison as text, without the notes for CSV."""
+LEFT_OUT_FIRST = (
+    *("ceiling", "chance", "p", "cue frames", "episodes", "reference", "episodes to settle", "95 % interval"),
+    "variant",
+)
+
+
+def render_sweep(sweep: Sweep, fmt: Format, *, width: int | None = None) -> str:
+    """Return the comparison as text, without the notes for CSV.
+
+    Args:
+        sweep: what was compared.
+        fmt: of the text.
+        width: of a terminal, which Markdown is to fit: what all rows share is said above the table, and
+            columns that do not fit are left out and named below it.
+    """
     titles, rows = sweep_cells(sweep)
+    if fmt == "markdown" and width is not None:
+        return _on_a_terminal(titles, rows, sweep_notes(sweep), width)
     notes = sweep_notes(sweep)
     is_number = [title not in TEXTS for title in titles]
     if fmt == "csv":
@@ -43,21 +59,57 @@ def render_sweep(sweep: Sweep, fmt: Format) -> str:
     )
 
 
+class _Folded(NamedTuple):
+    """The columns that differ between rows, and what all rows share."""
+
+    same: list[tuple[str, str]]
+    titles: list[str]
+    rows: list[list[str]]
+
+
+def _folded(titles: list[str], rows: list[list[str]]) -> _Folded:
+    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
+    same = {title: column[0] for title, column in cells.items() if len(rows) > 1 and len(set(column)) == 1}
+    known = [(title, cell) for title, cell in same.items() if cell != UNKNOWN]
+    kept = [title for title in titles if title not in same]
+    return _Folded(known, kept, _of_columns(kept, titles, rows))
+
+
+def _of_columns(kept: list[str], titles: list[str], rows: list[list[str]]) -> list[list[str]]:
+    return [[row[titles.index(title)] for title in kept] for row in rows]
+
+
+def _on_a_terminal(titles: list[str], rows: list[list[str]], notes: list[str], width: int) -> str:
+    same, kept, shown = _folded(titles, rows)
+    left_out: list[str] = []
+    table = _markdown(kept, shown)
+    for title in LEFT_OUT_FIRST:
+        if len(table.partition("\n")[0]) <= width:
+            break
+        if title in kept:
+            left_out.append(title)
+            kept = [one for one in kept if one != title]
+            table = _markdown(kept, _of_columns(kept, titles, rows))
+    if left_out:
+        explained = set(left_out) - {"p"}  # its note is about the corrected p, too
+        notes = [note for note in notes if note.partition(":")[0] not in explained]
+        notes = [*notes, f"not shown: {', '.join(left_out)} (a pipe or a file gets every column)."]
+    above = [sentence_of([(title, markdown_text(cell)) for title, cell in same]), ""] if same else []
+    return "\n".join([*above, table, "", *(f"- {markdown_text(note)}" for note in notes)])
+
+
+def _markdown(titles: list[str], rows: list[list[str]]) -> str:
+    return markdown_table(titles, rows, [title not in TEXTS for title in titles])
+
+
 def _latex(titles: list[str], rows: list[list[str]], notes: list[str]) -> str:
     """Return a table of the columns that differ, below a line of those that do not, in one line width."""
-    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
-    same = [(title, column[0]) for title, column in cells.items() if len(rows) > 1 and len(set(column)) == 1]
-    kept = [title for title in titles if title not in dict(same)]
-    shown = [list(row) for row in zip(*(cells[title] for title in kept), strict=True)]
-    known = [(title, cell) for title, cell in same if cell != UNKNOWN]
-    said = [latex_text(sentence_of(known))] if known else []
-    table = fitted(
-        latex_table(kept, shown, [title not in TEXTS for title in kept], ruled_by_first=kept[0] == "task")
-    )
+    same, kept, shown = _folded(titles, rows)
+    said = [f"\\noindent{{\\footnotesize {latex_text(sentence_of(same))}\\par}}\\smallskip"] if same else []
+    is_number = [title not in TEXTS for title in kept]
+    table = fitted(latex_table(kept, shown, is_number, ruled_by_first=kept[0] == "task"))
     below = [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
-    return "\n".join(
-        [*(f"\\noindent{{\\footnotesize {line}\\par}}\\smallskip" for line in said), *table, *below]
-    )
+    return "\n".join([*said, *table, *below])
 
 
 def _json(sweep: Sweep, notes: list[str]) -> str:
