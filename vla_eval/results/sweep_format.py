@@ -21,6 +21,15 @@ TITLES = (
 )
 
 
+SETTINGS = (
+    "task",
+    "policy",
+    "K",
+    "variant",
+    "episodes",
+    "chance",
+    "ceiling",
+)  # said once if all rows share it
 LEFT_OUT_FIRST = (
     *("ceiling", "chance", "p", "cue frames", "episodes", "reference", "episodes to settle", "95 % interval"),
     "variant",
@@ -69,7 +78,8 @@ class _Folded(NamedTuple):
 
 def _folded(titles: list[str], rows: list[list[str]]) -> _Folded:
     cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
-    same = {title: column[0] for title, column in cells.items() if len(rows) > 1 and len(set(column)) == 1}
+    constant = [title for title in SETTINGS if len(rows) > 1 and len(set(cells.get(title, ()))) == 1]
+    same = {title: cells[title][0] for title in constant}
     known = [(title, cell) for title, cell in same.items() if cell != UNKNOWN]
     kept = [title for title in titles if title not in same]
     return _Folded(known, kept, _of_columns(kept, titles, rows))
