@@ -193,33 +193,6 @@ def test_the_page_begins_with_what_is_shown_about_memory() -> None:
     assert words.index("p is not") < words.index("twin is not shown to beat chance: +0.00")
 
 
-def test_how_chance_is_compared_is_explained_only_where_it_was() -> None:
-    def verdict(*policies: str) -> str:
-        return Page(build_page([stored(*(episode(name, 1, True) for name in policies))])).sections["verdict"]
-
-    assert "McNemar" in verdict("p", "cue_blind")
-    assert "McNemar" not in verdict("p", "twin")
-
-
-def test_a_row_is_called_by_its_task_only_where_there_are_several() -> None:
-    alone = Page(build_page([stored(episode("p", 1, True))])).sections["choices"]
-    assert COLOR not in alone and "p · K=1" in alone
-    both = stored(episode("p", 1, True), episode("p", 1, True, task=INTERCEPT))
-    assert f"{COLOR} · p · K=1" in Page(build_page([both])).sections["choices"]
-
-
-def test_the_axes_of_all_tasks_begin_at_the_same_place() -> None:
-    run = stored(
-        *(episode(name, seed, True) for name in ("p", "a_policy_with_a_long_name") for seed in (1, 2)),
-        *(episode("p", seed, True, task=INTERCEPT) for seed in (1, 2)),
-    )
-    section = re.search(r'<section id="success">(.*?)</section>', build_page([run]), re.S)
-    assert section is not None
-    sizes = re.findall(r'<svg viewBox="0 0 ([\d.]+) [^>]*class="wide"', section[1])
-    # The axis is equally wide, so the room for labels is, too.
-    assert len(sizes) == 2 and len(set(sizes)) == 1
-
-
 def test_every_episode_is_in_the_page_once_as_numbers() -> None:
     text = re.search(r'<script type="application/json" id="episode-data">(.*?)</script>', full_page(), re.S)
     assert text is not None
