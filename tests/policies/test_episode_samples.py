@@ -110,3 +110,16 @@ def test_images_in_bytes_are_those_numbers() -> None:
     assert of_bytes.dtype == torch.uint8
     assert torch.equal(in_numbers(of_bytes), of_numbers)
     assert torch.equal(in_numbers(of_numbers), of_numbers)
+
+
+def test_actions_beyond_the_next_decision_do_not_count_where_that_is_asked_for() -> None:
+    """The arm moves at step 0, waits at 1 and 2, moves at 3 and 4: the decision is step 3."""
+    given = batch()
+    given[ACTION_KEY] = torch.zeros(N_EPISODES, N_STEPS - 1 + CHUNK, 7)
+    given[ACTION_KEY][:, 3:] = torch.arange(1.0, N_STEPS - 1 + CHUNK - 2)[:, None] / CHUNK
+    counts = episodes_of(given, config(), training=False).counts[0] > 0
+    assert counts.all()
+    masked = episodes_of(given, config(masks_beyond_decision=True), training=False).counts[0] > 0
+    n_counted = [int(of_step.sum()) for of_step in masked]
+    assert n_counted == [3, 2, 1, CHUNK, CHUNK]
+    assert all(bool(masked[step, :n].all()) for step, n in enumerate(n_counted))

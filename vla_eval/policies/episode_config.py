@@ -39,6 +39,9 @@ class EpisodeConfig(PortedConfig):
         decision_share: share of the episodes of a training batch that end at a decision: a step at which the
             arm begins to move after it waited, one of the episode's at random. What happens then has to be
             known from memory; a step later the demonstration's own motion gives it away.
+        masks_beyond_decision: actions of a frame's chunk from the next decision on do not count: what they
+            depend on has not been seen yet. Otherwise the mean of all motions is learned for them, and a
+            chunk that is executed across the decision takes the arm to where no demonstration has it.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.
@@ -59,6 +62,7 @@ class EpisodeConfig(PortedConfig):
     change_weight: float = 3.0
     waiting_share: float = 0.3
     decision_share: float = 0.0
+    masks_beyond_decision: bool = False
     goal_weight: float = 1.0
     mix_colors: bool = False
     shift_px: int = 0

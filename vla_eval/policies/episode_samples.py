@@ -61,13 +61,16 @@ def episodes_of(
     actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
     counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     change = _change(actions[:, :, 0], real)
+    begins = _decisions(change < same_action, real)
+    if config.masks_beyond_decision:
+        counts = counts * _before_the_next(begins, config.chunk_size)
     kept = real
     if training:
         waits = (change < same_action) & (torch.rand_like(change) > config.waiting_share)
         waits[:, -1] = False  # the frame that was sampled
         kept = real & ~waits
         if config.decision_share:
-            kept = kept & _until_a_decision(change < same_action, real, config.decision_share)
+            kept = kept & _until_a_decision(begins, config.decision_share)
     order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
 
     rows = torch.arange(len(order), device=order.device)[:, None]
@@ -123,17 +126,29 @@ def _change(actions: Tensor, real: Tensor) -> Tensor:
     return change.clamp(max=1.0)
 
 
-def _until_a_decision(waits: Tensor, real: Tensor, share: float) -> Tensor:
-    """Return (B, T): False after a decision, in the share of episodes (B, T) that end at one.
-
-    A decision is a step of motion after one of waiting. An episode without any does not end early.
-    """
+def _decisions(waits: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): whether a step is a decision, one of motion after one of waiting."""
     begins = torch.zeros_like(waits)
     begins[:, 1:] = real[:, :-1] & waits[:, :-1] & ~waits[:, 1:]
-    draws = torch.rand(waits.shape, device=waits.device).masked_fill(~begins, -1.0)
+    return begins
+
+
+def _before_the_next(begins: Tensor, chunk_size: int) -> Tensor:
+    """Return (B, T, chunk): whether no decision (B, T) lies between a step and that of the chunk's action."""
+    so_far = begins.cumsum(dim=1)
+    after = so_far[:, -1:].expand(-1, chunk_size - 1)
+    return torch.cat([so_far, after], dim=1).unfold(1, chunk_size, 1) == so_far[..., None]
+
+
+def _until_a_decision(begins: Tensor, share: float) -> Tensor:
+    """Return (B, T): False after a decision, in the share of episodes (B, T) that end at one.
+
+    An episode without any decision does not end early.
+    """
+    draws = torch.rand(begins.shape, device=begins.device).masked_fill(~begins, -1.0)
     last = draws.argmax(dim=1)
-    ends = begins.any(dim=1) & (torch.rand(len(waits), device=waits.device) < share)
-    steps = torch.arange(waits.shape[1], device=waits.device)
+    ends = begins.any(dim=1) & (torch.rand(len(begins), device=begins.device) < share)
+    steps = torch.arange(begins.shape[1], device=begins.device)
     return ~ends[:, None] | (steps <= last[:, None])
 
 
