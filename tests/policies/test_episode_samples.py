@@ -117,9 +117,20 @@ def test_actions_beyond_the_next_decision_do_not_count_where_that_is_asked_for()
     given = batch()
     given[ACTION_KEY] = torch.zeros(N_EPISODES, N_STEPS - 1 + CHUNK, 7)
     given[ACTION_KEY][:, 3:] = torch.arange(1.0, N_STEPS - 1 + CHUNK - 2)[:, None] / CHUNK
-    counts = episodes_of(given, config(), training=False).counts[0] > 0
-    assert counts.all()
-    masked = episodes_of(given, config(masks_beyond_decision=True), training=False).counts[0] > 0
+    all_of_it = episodes_of(given, config(), training=False)
+    assert (all_of_it.counts > 0).all()
+    assert (all_of_it.goal_counts > 0).all()
+    episodes = episodes_of(given, config(masks_beyond_decision=True), training=False)
+    assert (episodes.goal_counts[0] > 0).tolist() == [False, False, False, True, True]
+    masked = episodes.counts[0] > 0
     n_counted = [int(of_step.sum()) for of_step in masked]
     assert n_counted == [3, 2, 1, CHUNK, CHUNK]
     assert all(bool(masked[step, :n].all()) for step, n in enumerate(n_counted))
+
+
+def test_without_any_decision_the_goal_counts_at_every_step() -> None:
+    given = batch()
+    given[ACTION_KEY] = torch.arange(0.0, N_STEPS - 1 + CHUNK)[:, None].expand(N_EPISODES, -1, 7) / CHUNK
+    episodes = episodes_of(given, config(masks_beyond_decision=True), training=False)
+    assert (episodes.goal_counts > 0).all()
+    assert (episodes.counts > 0).all()

@@ -41,7 +41,8 @@ class EpisodeConfig(PortedConfig):
             known from memory; a step later the demonstration's own motion gives it away.
         masks_beyond_decision: actions of a frame's chunk from the next decision on do not count: what they
             depend on has not been seen yet. Otherwise the mean of all motions is learned for them, and a
-            chunk that is executed across the decision takes the arm to where no demonstration has it.
+            chunk that is executed across the decision takes the arm to where no demonstration has it. The
+            goal does not count before the first decision either: it could only be learned by heart there.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.

@@ -22,6 +22,7 @@ class Episodes(NamedTuple):
         state: (B, T, state).
         actions: (B, T, chunk, action).
         counts: (B, T, chunk) float, 0 for what is beyond the episode.
+        goal_counts: (B, T) float, how much the goal counts at each step.
         goal_m: (B, 3) the tool centre point at the episode's end.
         steps: (B, T) which step of the window each is.
     """
@@ -30,6 +31,7 @@ class Episodes(NamedTuple):
     state: Tensor
     actions: Tensor
     counts: Tensor
+    goal_counts: Tensor
     goal_m: Tensor
     steps: Tensor
 
@@ -71,6 +73,9 @@ def episodes_of(
         kept = real & ~waits
         if config.decision_share:
             kept = kept & _until_a_decision(begins, config.decision_share)
+    can_know = torch.ones_like(change)
+    if config.masks_beyond_decision:
+        can_know = ((begins.cumsum(dim=1) > 0) | ~begins.any(dim=1, keepdim=True)).float()
     order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
 
     rows = torch.arange(len(order), device=order.device)[:, None]
@@ -93,6 +98,7 @@ def episodes_of(
         state=taken(batch[STATE_KEY][:, :n_steps]),
         actions=taken(actions),
         counts=taken(counts),
+        goal_counts=taken(counts.sum(dim=-1) * can_know),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=order,
     )

@@ -196,7 +196,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         imitation = weighted_mean(errors, episodes.counts)
         # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
         # at which the choice has to be made from memory would count for little.
-        goal = goal_missed(predicted.goal_m, episodes.goal_m, episodes.counts.sum(dim=-1))
+        goal = goal_missed(predicted.goal_m, episodes.goal_m, episodes.goal_counts)
         parts = {"imitation": imitation, "goal": goal}
         loss = imitation + config.goal_weight * goal
         return loss, {name: float(part.detach()) for name, part in parts.items()}
