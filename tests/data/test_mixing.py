@@ -195,3 +195,16 @@ def test_the_command_says_what_it_made(
     assert f"{out}: 2 tasks, 6 episodes, 82 frames" in said
     assert "not replayed: RememberColor3-v0" in said
     assert json.loads((out / MIXTURE_FILE).read_text())["complete"] is True
+
+
+def test_sources_with_the_same_scenes_are_named(mixed: Path) -> None:
+    facts = read_mixture(mixed)
+    assert facts is not None
+    assert facts.shared_scenes == ()  # the same seeds, of two tasks
+    first = dataclasses.replace(facts.sources[0], seeds=(1, 2, 3, 7))
+    again = dataclasses.replace(first, name="again", seeds=(2, 3, 9))
+    other_rules = dataclasses.replace(again, name="old", task_version=(first.task_version or 0) + 1)
+    found = dataclasses.replace(facts, sources=(first, again, other_rules)).shared_scenes
+    assert found == (
+        f"{first.name} and again share 2 seeds of {first.task}, from 2 to 3: these scenes count twice.",
+    )

@@ -134,6 +134,8 @@ def _mix(args: argparse.Namespace) -> int:
         print(f"{source.name}: {source.n_episodes} episodes, {source.n_frames} frames")
     n_episodes = sum(source.n_episodes for source in facts.sources)
     print(f"{args.out}: {len(facts.tasks)} tasks, {n_episodes} episodes, {facts.n_frames} frames")
+    for sentence in facts.shared_scenes:
+        print(f"note: {sentence}")
     if not facts.was_replayed:
         names = ", ".join(source.name for source in facts.sources if not source.was_replayed)
         print(f"not replayed: {names}. `finetune` asks for --allow-unreplayed.")

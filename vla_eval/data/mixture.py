@@ -1,6 +1,7 @@
 """`meta/mikasa/mixture.json`: of which datasets one for several tasks was made. Knows nothing of lerobot."""
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 from vla_eval.data.facts_file import FactsFile
@@ -78,6 +79,21 @@ class MixtureFacts:
             if one.task is not None and one.seeds is not None:
                 known.setdefault(one.task, []).extend(one.seeds)
         return {task: seed_ranges(own) for task, own in known.items()} or None
+
+    @property
+    def shared_scenes(self) -> tuple[str, ...]:
+        """A sentence for each two sources that have seeds of one task's rules in common: the same scenes."""
+        found = []
+        for one, other in combinations(self.sources, 2):
+            if one.task is None or (one.task, one.task_version) != (other.task, other.task_version):
+                continue
+            common = sorted(set(one.seeds or ()) & set(other.seeds or ()))
+            if common:
+                found.append(
+                    f"{one.name} and {other.name} share {len(common)} seeds of {one.task}, from "
+                    f"{common[0]} to {common[-1]}: these scenes count twice."
+                )
+        return tuple(found)
 
     @property
     def n_frames(self) -> int:
