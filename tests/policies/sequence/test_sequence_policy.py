@@ -43,6 +43,22 @@ def test_it_acts_frame_by_frame_as_it_was_trained_on_whole_episodes(recorded: Pa
         torch.testing.assert_close(chunk, whole[:, stop - 1].clamp(-1, 1), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("core", ["gru", "transformer", "mlp"])
+def test_under_autocast_all_but_the_encoders_convolutions_stay_in_float32(recorded: Path, core: str) -> None:
+    policy, seen = tiny_policy(recorded, core=core), frames(3, n_episodes=2)
+    network, images = policy.network, torch.stack([seen[BASE], seen[WRIST]], dim=2)
+    with torch.autocast("cpu", torch.bfloat16):
+        encoded = network.encoders[0].features(images[:, 0, 0])
+        tokens = network.tokens(images, seen["observation.state"])
+        answers, memory = network.read(tokens, network.begin(2))
+        predicted = network.predict(tokens, answers)
+    assert encoded.dtype == torch.bfloat16
+    halves = {torch.bfloat16, torch.float16}
+    assert not halves & {x.dtype for x in (tokens, answers, *memory, *predicted)}
+    exact = network.tokens(images, seen["observation.state"])
+    torch.testing.assert_close(tokens, exact, atol=0.02, rtol=0.02)
+
+
 @pytest.mark.parametrize("core", CORES)
 def test_when_it_acts_it_reads_the_target_return_and_the_actions_that_it_has_decided_on(
     recorded: Path, core: str

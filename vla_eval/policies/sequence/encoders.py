@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.sequence.sizes import ENCODERS
+from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3
 KEYPOINTS = 32
@@ -69,7 +70,12 @@ class Keypoints(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (N, outputs) of images (N, 3, H, W) in [-1, 1]."""
-        features = self.features(images)
+        read: Tensor = self.reads_out(self.features(images))
+        return read
+
+    @in_float32
+    def reads_out(self, features: Tensor) -> Tensor:
+        """Return (N, outputs) of maps (N, maps, H, W); half precision would round places to a pixel."""
         relative = functional.instance_norm(features)
         shares = (relative * self.sharpness.exp()[:, None, None]).flatten(2).softmax(dim=-1)
         strong = (shares * features.flatten(2)).sum(dim=-1)
@@ -102,5 +108,7 @@ class Cameras(nn.ModuleList):
     def forward(self, images: Tensor) -> Tensor:
         """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W) in [0, 1]."""
         parts = (2 * images - 1).flatten(0, 1).flatten(1, 2).chunk(len(self), dim=1)
-        seen = [encoder(part) for encoder, part in zip(self, parts, strict=True)]
+        # Convolutions on a CPU are a fifth faster in this order of the same numbers.
+        ordered = [part.contiguous(memory_format=torch.channels_last) for part in parts]
+        seen = [encoder(part) for encoder, part in zip(self, ordered, strict=True)]
         return torch.cat(seen, dim=-1).reshape(*images.shape[:2], self.outputs)

@@ -114,10 +114,15 @@ class SequenceNetwork(nn.Module):
             state: (B, T, state).
             said: (B, T, width) by `sentence`; None where no instruction is read.
         """
-        seen = self.encoders(images)
+        return self._told(self.encoders(images), state, said)
+
+    # Under autocast the encoders alone are in half precision: they are nearly all of the work.
+    @in_float32
+    def _told(self, seen: Tensor, state: Tensor, said: Tensor | None) -> Tensor:
         read = [seen, state * POSITION_SCALE] if self.config.state_in_token else [seen]
         return with_sentence(self.token, torch.cat(read, dim=-1), said)
 
+    @in_float32
     def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
         """Return the core's answers (B, T, width) to the observations of whole demonstrations.
 
@@ -134,6 +139,7 @@ class SequenceNetwork(nn.Module):
         read: Tensor = self.core(steps.flatten(1, 2), begun)[0]
         return read[:, 1 :: steps.shape[2]]
 
+    @in_float32
     def read(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
         """Return the core's answers (B, T, width) to observations, and the memory after the last step.
 
