@@ -182,6 +182,9 @@ def test_the_moments_of_an_episode_are_cue_reveal_and_touch(tmp_path: Path) -> N
     write_stills(tape, tmp_path / "stills.jpg")
     stills = read_stills(tmp_path / "stills.jpg")
     assert [still.shape for still in stills] == [(STILL_PX, STILL_PX, 3)] * 3
+    smaller = tmp_path / "smaller.jpg"  # as they were written once
+    Image.open(tmp_path / "stills.jpg").resize((3 * 128, 128)).save(smaller)
+    assert [still.shape for still in read_stills(smaller)] == [(STILL_PX, STILL_PX, 3)] * 3
 
 
 def test_a_video_that_cannot_be_written_says_where_and_of_what(tmp_path: Path) -> None:
@@ -306,9 +309,10 @@ def test_a_filmstrip_shows_the_captured_seeds_of_a_row_with_an_edge_for_the_outc
     assert [path.name for path in made.files] == [f"{TASK}_cue_blind_K1.png"]
     assert made.not_captured == (f"{TASK} hold K1",)
     sheet = np.asarray(Image.open(made.files[0]))
-    # Two lines of title and one of columns; two seeds, three frames each.
-    assert sheet.shape[:2] == (3 * LABEL_PX + 2 * (STILL_PX + 4) + 4, LEFT_PX + 3 * (STILL_PX + 4) + 4)
-    edges = [tuple(map(int, sheet[3 * LABEL_PX + i * (STILL_PX + 4) + 9, LEFT_PX - 1])) for i in range(2)]
+    # Two lines of title and one of columns, an edge and a margin below them; two seeds, three frames each.
+    top, pitch = 3 * LABEL_PX + 3 + 8, STILL_PX + 8
+    assert sheet.shape[:2] == (top + 2 * pitch + 8, LEFT_PX + 3 * pitch + 8)
+    edges = [tuple(map(int, sheet[top + i * pitch + 9, LEFT_PX - 1])) for i in range(2)]
     outcome = {record.seed: record.outcome for record in run.records if record.policy == "cue_blind"}
     assert edges == [SUCCESS_COLOR if outcome[seed] == "success" else FAILURE_COLOR for seed in (1, 2)]
 

@@ -44,8 +44,7 @@ def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
         if not rows:
             missing.append(_name(key))
             continue
-        has_cue = any(record.n_candidates for record in group.results)
-        columns = ("cue", "reveal", "touch") if has_cue else ("start", "middle", "end")
+        columns = _columns(group.results)
         files.append(folder / f"{re.sub(r'[^A-Za-z0-9._=-]+', '_', _name(key))}.png")
         _write(files[-1], contact_sheet(columns, rows, title=(_name(key), LEGEND)))
     if not files:
@@ -56,6 +55,15 @@ def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
             "--out DIR."
         )
     return Filmstrips(files=tuple(files), not_captured=tuple(missing))
+
+
+def _columns(records: Sequence[EpisodeRecord]) -> tuple[str, str, str]:
+    """Return what stands above the moments of a row's episodes, see `viz.moments.Moments`."""
+    choosing = [record for record in records if record.n_candidates]
+    if not choosing:
+        return "start", "middle", "end"
+    ended = any(record.first_choice is None for record in choosing)
+    return "cue", "reveal", "touch, or end without one" if ended else "touch"
 
 
 def _rows(group: RowEpisodes, where: dict[int, Path]) -> list[SheetRow]:

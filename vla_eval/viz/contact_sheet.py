@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from vla_eval.core import ImageArray
 
-MARGIN_PX = 4
+MARGIN_PX = 8
 LABEL_PX = 14
 LEFT_PX = 86  # for the episodes' names
 EDGE_PX = 3
@@ -42,7 +42,7 @@ def contact_sheet(columns: Sequence[str], rows: Sequence[SheetRow], *, title: Se
         title: lines above everything.
     """
     height, width = rows[0].frames[0].shape[:2]
-    first_top = LABEL_PX * (len(title) + 1)
+    first_top = LABEL_PX * (len(title) + 1) + EDGE_PX + MARGIN_PX
     sheet = np.full(
         (
             first_top + len(rows) * (height + MARGIN_PX) + MARGIN_PX,

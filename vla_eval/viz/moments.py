@@ -10,7 +10,7 @@ from vla_eval.config.environment import HUMAN_CAMERA
 from vla_eval.core import ImageArray
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
-STILL_PX = 128
+STILL_PX = 256
 JPEG_QUALITY = 90
 
 
@@ -52,14 +52,17 @@ def write_stills(tape: EpisodeTape, path: Path) -> None:
 def read_stills(path: Path) -> tuple[ImageArray, ...]:
     """Return the moments that `write_stills` has written, each (STILL_PX, STILL_PX, 3) uint8.
 
+    Those of earlier versions, which were smaller, are scaled.
+
     Raises:
         OSError: the file cannot be read as an image.
     """
-    with Image.open(path) as image:
-        pixels = np.asarray(image.convert("RGB"), dtype=np.uint8)
     n_moments = len(Moments._fields)
-    if pixels.shape != (STILL_PX, n_moments * STILL_PX, 3):
-        raise OSError(f"an image of {pixels.shape[1]} × {pixels.shape[0]} pixels")
+    with Image.open(path) as image:
+        if image.width != n_moments * image.height:
+            raise OSError(f"an image of {image.width} × {image.height} pixels")
+        shown = image.convert("RGB").resize((n_moments * STILL_PX, STILL_PX), Image.Resampling.LANCZOS)
+    pixels = np.asarray(shown, dtype=np.uint8)
     return tuple(np.split(pixels, n_moments, axis=1))
 
 
