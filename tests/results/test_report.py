@@ -294,7 +294,7 @@ def test_a_variant_says_what_is_different() -> None:
     table = build_table(
         [stored(episodes("p", "+")), stored(episodes("p", "-"), path="runs/b", env={"delay_steps": 5})]
     )
-    assert [row.variant for row in table.rows] == ["env.delay_steps=default", "env.delay_steps=5"]
+    assert [row.variant for row in table.rows] == ["default", "env.delay_steps=5"]
 
 
 def test_one_variant_has_no_column() -> None:

@@ -221,7 +221,8 @@ def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
     """Return for each run: task -> the settings that differ, None if none do.
 
     Args:
-        runs: all runs of the table; only values that differ between them are named.
+        runs: all runs of the table; only values that differ between them are named, and of these only what
+            a run sets; it is `DEFAULT` where it sets none of them.
     """
     settings = [_settings(run) for run in runs]
     names = sorted({name for values in settings for name in values})
@@ -232,7 +233,8 @@ def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
             versions[task].add(_task_version(run, task))
     labels = []
     for run, values in zip(runs, settings, strict=True):
-        parts = [f"{name}={values.get(name, DEFAULT)}" for name in differing]
+        own = [f"{name}={values[name]}" for name in differing if name in values]
+        parts = own or ([DEFAULT] if differing else [])
         label_of: dict[str, str | None] = {}
         for task in {record.task for record in run.records}:
             version = [f"task version {_task_version(run, task)}"] if len(versions[task]) > 1 else []
