@@ -21,6 +21,7 @@ TITLES = (
     *("success once", "lowest, highest", "same inferences", "chance"),
 )
 TEXT_TITLES = ("task", "policy", "length", "inferences in the cue")
+FOLDS = ("task", "policy", "chance")
 
 
 def render_grid(table: GridTable, fmt: ProbeFormat) -> str:
@@ -31,7 +32,7 @@ def render_grid(table: GridTable, fmt: ProbeFormat) -> str:
         return rows_as_csv([_flat(cell, part) for cell in table.cells for part in (None, *cell.parts)])
     cells = grid_cells(table)
     said = [*grid_sentences(table), *grid_notes(table)]
-    return shown_table(TITLES, cells, said, fmt, text_titles=TEXT_TITLES)
+    return shown_table(TITLES, cells, said, fmt, text_titles=TEXT_TITLES, folds=FOLDS)
 
 
 def grid_cells(table: GridTable) -> list[list[str]]:

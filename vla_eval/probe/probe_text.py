@@ -24,6 +24,7 @@ TITLES = (
     *("success once", "chance", "left", "kept", "over delay", "p", "p (Holm)"),
 )
 TEXT_TITLES = ("task", "policy", "world")
+FOLDS = ("task", "policy", "K", "pairs", "chance")
 
 
 def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
@@ -33,7 +34,7 @@ def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
     if fmt == "csv":
         return rows_as_csv([json_row(row) for row in table.rows])
     said = [*sentences(table), *notes(table)]
-    return shown_table(TITLES, probe_cells(table), said, fmt, text_titles=TEXT_TITLES)
+    return shown_table(TITLES, probe_cells(table), said, fmt, text_titles=TEXT_TITLES, folds=FOLDS)
 
 
 def probe_cells(table: ProbeTable) -> list[list[str]]:
@@ -168,4 +169,6 @@ def _shown(share: Share | None) -> str:
 
 
 def _shown_p(p_value: float | None) -> str:
-    return UNDEFINED if p_value is None else f"{p_value:.3g}"
+    if p_value is None:
+        return UNDEFINED
+    return "<0.001" if p_value < 0.001 else f"{p_value:.3f}"

@@ -3,17 +3,55 @@
 import csv
 import io
 from collections.abc import Collection, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from vla_eval.probe.retention import Range
-from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
+from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import Interval
 from vla_eval.results.latex import fitted, latex_table, latex_text
+from vla_eval.results.table_columns import sentence_of
+from vla_eval.results.table_formats import markdown_table
 
 ProbeFormat = Literal["markdown", "csv", "json", "latex", "html-table"]
 ReadableFormat = Literal["markdown", "latex", "html-table"]
 UNDEFINED = "—"
 JsonRow = dict[str, Any]  # Any: JSON
+
+
+class Folded(NamedTuple):
+    """A table without the columns that need not be columns.
+
+    Attributes:
+        same: title and cell of each column that has the same cell in all rows.
+        titles, rows: of the other columns that have a value anywhere.
+    """
+
+    same: tuple[tuple[str, str], ...]
+    titles: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    @property
+    def sentence(self) -> str | None:
+        """The line above the table; None if no column has the same cell in all rows."""
+        return sentence_of(self.same) if self.same else None
+
+
+def folded(titles: Sequence[str], rows: Sequence[Sequence[str]], *, folds: Collection[str]) -> Folded:
+    """Leave out columns that are empty, and, of several rows, those that are the same in all.
+
+    Args:
+        titles: of the columns.
+        rows: as many cells each.
+        folds: the columns of which one value for all may stand in a line above.
+    """
+    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
+    same = {title for title in titles if title in folds and len(rows) > 1 and len(set(cells[title])) == 1}
+    kept = [title for title in titles if title not in same and set(cells[title]) != {UNDEFINED}]
+    return Folded(
+        same=tuple((title, cells[title][0]) for title in titles if title in same),
+        titles=tuple(kept),
+        rows=tuple(zip(*(cells[title] for title in kept), strict=True)),
+    )
 
 
 def shown_table(
@@ -23,6 +61,7 @@ def shown_table(
     fmt: ReadableFormat,
     *,
     text_titles: Collection[str],
+    folds: Collection[str],
 ) -> str:
     """Return a table with sentences below it, without a newline at its end.
 
@@ -32,17 +71,24 @@ def shown_table(
         said: the sentences.
         fmt: a format for reading.
         text_titles: columns of words, which are aligned to the left.
+        folds: columns that may be folded, see `folded`.
     """
-    is_number = [title not in text_titles for title in titles]
+    shown = folded(titles, rows, folds=folds)
+    is_number = [title not in text_titles for title in shown.titles]
+    above = [] if shown.sentence is None else [shown.sentence]
     if fmt == "latex":
+        first = [f"{{\\footnotesize {latex_text(line)}\\par}}\\smallskip" for line in above]
         footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
-        table = fitted(latex_table(titles, rows, is_number, ruled_by_first=True))
-        return "\n".join([*table, *footnotes])
+        table = fitted(latex_table(shown.titles, shown.rows, is_number, ruled_by_first=True))
+        return "\n".join([table[0], *first, *table[1:], *footnotes])
     if fmt == "html-table":
         items = [f"<li>{html_text(line)}</li>" for line in said]
-        return "\n".join([html_table(titles, rows, is_number), "<ul>", *items, "</ul>"])
-    lines = [_line(titles), _line([":--"] * len(titles)), *(_line(row) for row in rows)]
-    return "\n".join([*lines, "", *(f"- {markdown_text(line)}" for line in said)])
+        first = [f"<p>{html_text(line)}</p>" for line in above]
+        table_text = html_table(shown.titles, shown.rows, is_number)
+        return "\n".join([*first, table_text, "<ul>", *items, "</ul>"])
+    first = [part for line in above for part in (markdown_text(line), "")]
+    table_text = markdown_table(shown.titles, shown.rows, is_number)
+    return "\n".join([*first, table_text, "", *(f"- {markdown_text(line)}" for line in said)])
 
 
 def rows_as_csv(rows: Sequence[JsonRow]) -> str:
@@ -58,10 +104,6 @@ def shown_rate(rate: float, interval: Interval | Range) -> str:
     """Return `0.50 [0.40, 0.60]`; an end that is not known is `—`."""
     low, high = (UNDEFINED if end is None else f"{end:.2f}" for end in interval)
     return f"{rate:.2f} [{low}, {high}]"
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(markdown_cell(cell) for cell in cells)} |"
 
 
 def _csv_value(value: object) -> object:

@@ -18,6 +18,7 @@ from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, reten
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
+from vla_eval.probe.text_table import folded
 from vla_eval.storage.run_folder import StoredRun
 
 
@@ -36,7 +37,12 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
     table, pairs = found_table(probe.worlds), found_pairs(probe.worlds)
     return ProbeSection(
         title=str(probe.folder),
-        table=_page_table(probe_text.TITLES, probe_text.probe_cells(table), probe_text.TEXT_TITLES),
+        table=_page_table(
+            probe_text.TITLES,
+            probe_text.probe_cells(table),
+            text_titles=probe_text.TEXT_TITLES,
+            folds=probe_text.FOLDS,
+        ),
         sentences=tuple(sentences(table)),
         notes=(*notes(table), *probe.doubles),
         plots=_retention_plots(table) if table.retention else None,
@@ -50,7 +56,12 @@ def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
     table = found_grid(worlds)
     return ProbeSection(
         title=title,
-        table=_page_table(grid_text.TITLES, grid_text.grid_cells(table), grid_text.TEXT_TITLES),
+        table=_page_table(
+            grid_text.TITLES,
+            grid_text.grid_cells(table),
+            text_titles=grid_text.TEXT_TITLES,
+            folds=grid_text.FOLDS,
+        ),
         sentences=tuple(grid_sentences(table)),
         notes=tuple(grid_notes(table)),
         heat=tuple(
@@ -61,12 +72,13 @@ def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
 
 
 def _page_table(
-    titles: Sequence[str], rows: Sequence[Sequence[str]], text_titles: Sequence[str]
+    titles: Sequence[str], rows: Sequence[Sequence[str]], *, text_titles: Sequence[str], folds: Sequence[str]
 ) -> PageTable:
+    shown = folded(titles, rows, folds=folds)
     return PageTable(
-        columns=tuple(Column(title, "text" if title in text_titles else "number") for title in titles),
-        rows=tuple(map(tuple, rows)),
-        caption="Every row",
+        columns=tuple(Column(title, "text" if title in text_titles else "number") for title in shown.titles),
+        rows=shown.rows,
+        caption=shown.sentence or "Every row",
     )
 
 
