@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from vla_eval.probe.interventions import SWAPS
+from vla_eval.probe.interventions import CONTROLS, CONTROLS_OF_ONE, SWAPS
 from vla_eval.probe.mistakes import MISTAKES
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
@@ -124,23 +124,44 @@ def _steps(steps: float | None, half: HalfLife) -> str:
 
 def notes(table: ProbeTable) -> list[str]:
     """Return what a reader of the table has to know, errors and failed controls included."""
-    found = [
-        "sensitivity: share of pairs whose choice differs between the two worlds (for sets: the items "
-        "touched; Rotate: the final angle; other tasks without candidates: the trajectory); "
-        "warranted: the cue is followed in both worlds; value: mean success of both worlds; reliable: "
-        "success in both. Intervals at 95 %: Wilson; of shares left, half-lives, items kept and "
-        "differences, bootstrap over seeds.",
-        "kept: items that are remembered, corrected for guessing; over delay: by how much more the cue is "
-        "followed in another appearance than after the longest delay.",
-        "p: for swaps, exact sign test of following both cues against choosing each world's candidate in the "
-        "other; else exact McNemar test against the world as drawn. Holm's correction over the table.",
-        "Scripted controls read the true state and no image: a blank cue and a reset take nothing from them.",
-    ]
-    found += _failed_controls(table.rows)
-    found += _chunk_and_phase(table.rows)
+    found = [*_columns(table.rows), *_failed_controls(table.rows), *_chunk_and_phase(table.rows)]
     if table.n_errors:
         found.append(
             f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
+        )
+    return found
+
+
+def _columns(rows: Sequence[ProbeRow]) -> list[str]:
+    """Return what the columns mean, as far as any row has a value there."""
+    found = []
+    if any(row.swap for row in rows):
+        found.append(
+            "sensitivity: share of pairs whose choice differs between the two worlds (for sets: the items "
+            "touched; Rotate: the final angle; other tasks without candidates: the trajectory); "
+            "warranted: the cue is followed in both worlds; value: mean success of both worlds; reliable: "
+            "success in both."
+        )
+    if any(row.kept for row in rows):
+        found.append("kept: items that are remembered, corrected for guessing.")
+    if any(row.over_delay for row in rows):
+        found.append(
+            "over delay: by how much more the cue is followed in another appearance than after the longest "
+            "delay."
+        )
+    found.append(
+        "Intervals at 95 %: Wilson; of shares left, half-lives, items kept and differences, bootstrap over "
+        "seeds."
+    )
+    if any(row.p_value is not None for row in rows):
+        found.append(
+            "p: for swaps, exact sign test of following both cues against choosing each world's candidate in "
+            "the other; else exact McNemar test against the world as drawn. Holm's correction over the table."
+        )
+    if any(row.policy in (*CONTROLS, *CONTROLS_OF_ONE) for row in rows):
+        found.append(
+            "Scripted controls read the true state and no image: a blank cue and a reset take nothing from "
+            "them."
         )
     return found
 

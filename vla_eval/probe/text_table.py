@@ -79,7 +79,9 @@ def shown_table(
     if fmt == "latex":
         first = [f"{{\\footnotesize {latex_text(line)}\\par}}\\smallskip" for line in above]
         footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
-        table = fitted(latex_table(shown.titles, shown.rows, is_number, ruled_by_first=True))
+        table = fitted(
+            latex_table(shown.titles, shown.rows, is_number, ruled_by_first="task" in shown.titles)
+        )
         return "\n".join([table[0], *first, *table[1:], *footnotes])
     if fmt == "html-table":
         items = [f"<li>{html_text(line)}</li>" for line in said]
