@@ -20,7 +20,7 @@
   const errorOf = (episode) => (episode[at.error] === null ? "" : data.errors[episode[at.error]]);
   const cellsOf = (episode) => {
     const row = rowOf(episode);
-    const name = row.variant ? `${row.policy} (${row.variant})` : row.policy;
+    const name = row.setting ? `${row.policy} (${row.setting})` : row.policy;
     const step = episode[at.step] === null ? "—" : String(episode[at.step]);
     return [row.task, name, String(row.k), String(episode[at.run]), String(episode[at.seed]), outcomeOf(episode),
       step, itemOf(episode, "target"), itemOf(episode, "chosen")];
