@@ -2,7 +2,8 @@
 
 import pytest
 
-from vla_eval.probe.text_table import UNDEFINED, folded, shown_table
+from vla_eval.probe.text_table import shown_table
+from vla_eval.results.folding import UNDEFINED, folded
 
 TITLES = ("task", "world", "pairs", "left")
 ROWS = (("A", "none", "20", UNDEFINED), ("A", "swap 1", "20", UNDEFINED))

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_table import GridCell, GridPart, GridTable
 from vla_eval.probe.text_table import (
-    UNDEFINED,
     JsonRow,
     ProbeFormat,
     rows_as_csv,
     shown_rate,
     shown_table,
 )
+from vla_eval.results.folding import UNDEFINED
 
 GRID_VERSION = 1
 MOST_LISTED = 8  # first inferences whose steps fit into a cell

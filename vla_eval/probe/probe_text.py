@@ -9,7 +9,6 @@ from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import (
-    UNDEFINED,
     JsonRow,
     ProbeFormat,
     rows_as_csv,
@@ -17,6 +16,7 @@ from vla_eval.probe.text_table import (
     shown_table,
 )
 from vla_eval.results.estimates import Interval
+from vla_eval.results.folding import UNDEFINED
 
 PROBE_VERSION = 1
 TITLES = (

@@ -3,55 +3,18 @@
 import csv
 import io
 from collections.abc import Collection, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from vla_eval.probe.retention import Range
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import Interval
-from vla_eval.results.latex import fitted, latex_table, latex_text
-from vla_eval.results.table_columns import sentence_of
+from vla_eval.results.folding import UNDEFINED, folded
+from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
 from vla_eval.results.table_formats import markdown_table
 
 ProbeFormat = Literal["markdown", "csv", "json", "latex", "html-table"]
 ReadableFormat = Literal["markdown", "latex", "html-table"]
-UNDEFINED = "—"
 JsonRow = dict[str, Any]  # Any: JSON
-
-
-class Folded(NamedTuple):
-    """A table without the columns that need not be columns.
-
-    Attributes:
-        same: title and cell of each column that has the same cell in all rows.
-        titles, rows: of the other columns that have a value anywhere.
-    """
-
-    same: tuple[tuple[str, str], ...]
-    titles: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    @property
-    def sentence(self) -> str | None:
-        """The line above the table; None if no column has the same cell in all rows."""
-        return sentence_of(self.same) if self.same else None
-
-
-def folded(titles: Sequence[str], rows: Sequence[Sequence[str]], *, folds: Collection[str]) -> Folded:
-    """Leave out columns that are empty, and, of several rows, those that are the same in all.
-
-    Args:
-        titles: of the columns.
-        rows: as many cells each.
-        folds: the columns of which one value for all may stand in a line above.
-    """
-    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
-    same = {title for title in titles if title in folds and len(rows) > 1 and len(set(cells[title])) == 1}
-    kept = [title for title in titles if title not in same and set(cells[title]) != {UNDEFINED}]
-    return Folded(
-        same=tuple((title, cells[title][0]) for title in titles if title in same),
-        titles=tuple(kept),
-        rows=tuple(zip(*(cells[title] for title in kept), strict=True)),
-    )
 
 
 def shown_table(
@@ -82,7 +45,7 @@ def shown_table(
         table = fitted(
             latex_table(shown.titles, shown.rows, is_number, ruled_by_first="task" in shown.titles)
         )
-        return "\n".join([table[0], *first, *table[1:], *footnotes])
+        return "\n".join([NEEDS, *first, *table, *footnotes])
     if fmt == "html-table":
         items = [f"<li>{html_text(line)}</li>" for line in said]
         first = [f"<p>{html_text(line)}</p>" for line in above]

@@ -56,10 +56,13 @@ def latex_table(
     return [*lines, "\\bottomrule", "\\end{tabular}"]
 
 
+NEEDS = "% needs \\usepackage{booktabs,graphicx}"
+"""The first line of a file with a table that is `fitted`."""
+
+
 def fitted(lines: Sequence[str]) -> list[str]:
     r"""Return a table that is scaled down to `\linewidth` where it is wider; needs booktabs and graphicx."""
     return [
-        "% needs \\usepackage{booktabs,graphicx}",
         "\\noindent\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%",
         *lines,
         "}",

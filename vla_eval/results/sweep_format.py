@@ -3,17 +3,17 @@
 import csv
 import io
 import json
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
-from vla_eval.results.latex import fitted, latex_table, latex_text
+from vla_eval.results.folding import UNDEFINED, folded
+from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
 from vla_eval.results.sweep import Sweep, SweepRow
 from vla_eval.results.table_columns import sentence_of
 from vla_eval.results.table_formats import Format, markdown_table
 
 JSON_VERSION = 1
-UNKNOWN = "—"
 TEXTS = ("task", "policy", "variant", "95 % interval", "cue frames", "reference")  # the others are numbers
 TITLES = (
     *("task", "policy", "K", "variant", "episodes", "success", "95 % interval", "chance", "ceiling"),
@@ -68,31 +68,15 @@ def render_sweep(sweep: Sweep, fmt: Format, *, width: int | None = None) -> str:
     )
 
 
-class _Folded(NamedTuple):
-    """The columns that differ between rows, and what all rows share."""
-
-    same: list[tuple[str, str]]
-    titles: list[str]
-    rows: list[list[str]]
-
-
-def _folded(titles: list[str], rows: list[list[str]]) -> _Folded:
-    cells = dict(zip(titles, zip(*rows, strict=True), strict=True))
-    constant = [title for title in SETTINGS if len(rows) > 1 and len(set(cells.get(title, ()))) == 1]
-    same = {title: cells[title][0] for title in constant}
-    known = [(title, cell) for title, cell in same.items() if cell != UNKNOWN]
-    kept = [title for title in titles if title not in same]
-    return _Folded(known, kept, _of_columns(kept, titles, rows))
-
-
 def _of_columns(kept: list[str], titles: list[str], rows: list[list[str]]) -> list[list[str]]:
     return [[row[titles.index(title)] for title in kept] for row in rows]
 
 
 def _on_a_terminal(titles: list[str], rows: list[list[str]], notes: list[str], width: int) -> str:
-    same, kept, shown = _folded(titles, rows)
+    found = folded(titles, rows, folds=SETTINGS)
+    same, kept = found.same, list(found.titles)
     left_out: list[str] = []
-    table = _markdown(kept, shown)
+    table = _markdown(kept, found.rows)
     for title in LEFT_OUT_FIRST:
         if len(table.partition("\n")[0]) <= width:
             break
@@ -108,18 +92,18 @@ def _on_a_terminal(titles: list[str], rows: list[list[str]], notes: list[str], w
     return "\n".join([*above, table, "", *(f"- {markdown_text(note)}" for note in notes)])
 
 
-def _markdown(titles: list[str], rows: list[list[str]]) -> str:
+def _markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return markdown_table(titles, rows, [title not in TEXTS for title in titles])
 
 
 def _latex(titles: list[str], rows: list[list[str]], notes: list[str]) -> str:
     """Return a table of the columns that differ, below a line of those that do not, in one line width."""
-    same, kept, shown = _folded(titles, rows)
+    same, kept, shown = folded(titles, rows, folds=SETTINGS)
     said = [f"\\noindent{{\\footnotesize {latex_text(sentence_of(same))}\\par}}\\smallskip"] if same else []
     is_number = [title not in TEXTS for title in kept]
     table = fitted(latex_table(kept, shown, is_number, ruled_by_first=kept[0] == "task"))
     below = [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
-    return "\n".join([*said, *table, *below])
+    return "\n".join([NEEDS, *said, *table, *below])
 
 
 def _json(sweep: Sweep, notes: list[str]) -> str:
@@ -186,17 +170,17 @@ def _cells(row: SweepRow, sweep: Sweep) -> list[str]:
         key.variant or "",
         str(row.n_episodes),
         _rate(measured.success_once),
-        f"{interval.low:.2f}-{interval.high:.2f}" if interval else UNKNOWN,
+        f"{interval.low:.2f}-{interval.high:.2f}" if interval else UNDEFINED,
         _rate(row.chance.rate if row.chance else None),
         _rate(row.ceiling),
-        str(row.cue) if row.cue else UNKNOWN,
-        str(getattr(row.reference, sweep.by)) if row.reference else UNKNOWN,
-        f"{test.difference:+.2f}" if test else UNKNOWN,
-        f"{test.p_value:.3g}" if test else UNKNOWN,
-        f"{row.corrected_p:.3g}" if row.corrected_p is not None else UNKNOWN,
-        str(row.n_to_settle) if row.n_to_settle is not None else UNKNOWN,
+        str(row.cue) if row.cue else UNDEFINED,
+        str(getattr(row.reference, sweep.by)) if row.reference else UNDEFINED,
+        f"{test.difference:+.2f}" if test else UNDEFINED,
+        f"{test.p_value:.3g}" if test else UNDEFINED,
+        f"{row.corrected_p:.3g}" if row.corrected_p is not None else UNDEFINED,
+        str(row.n_to_settle) if row.n_to_settle is not None else UNDEFINED,
     ]
 
 
 def _rate(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{value:.2f}"
+    return UNDEFINED if value is None else f"{value:.2f}"

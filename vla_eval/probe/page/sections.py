@@ -18,7 +18,7 @@ from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, reten
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
-from vla_eval.probe.text_table import folded
+from vla_eval.results.folding import folded
 from vla_eval.storage.run_folder import StoredRun
 
 
