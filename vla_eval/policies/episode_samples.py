@@ -63,7 +63,7 @@ def episodes_of(
     actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
     counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     change = _change(actions[:, :, 0], real)
-    begins = _decisions(change < same_action, real)
+    begins = _begins(change < same_action, real)
     if config.masks_beyond_decision:
         counts = counts * _before_the_next(begins, config.chunk_size)
     kept = real
@@ -132,7 +132,13 @@ def _change(actions: Tensor, real: Tensor) -> Tensor:
     return change.clamp(max=1.0)
 
 
-def _decisions(waits: Tensor, real: Tensor) -> Tensor:
+def decisions(actions: Tensor, *, same_action: float = SAME_ACTION) -> Tensor:
+    """Return (T,): at which steps of an episode, (T, action), the arm begins to move after it waited."""
+    real = torch.ones(1, len(actions), dtype=torch.bool)
+    return _begins(_change(actions[None], real) < same_action, real)[0]
+
+
+def _begins(waits: Tensor, real: Tensor) -> Tensor:
     """Return (B, T): whether a step is a decision, one of motion after one of waiting."""
     begins = torch.zeros_like(waits)
     begins[:, 1:] = real[:, :-1] & waits[:, :-1] & ~waits[:, 1:]

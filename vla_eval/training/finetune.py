@@ -23,6 +23,7 @@ from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
 from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, RUN_FILE, open_folder, read_metrics
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
+from vla_eval.training.waiting import about_decisions
 
 LOCK_FILE = "finetune.lock"
 OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
@@ -73,6 +74,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
     )
     if dataset.failed:
         say(about_failures(dataset))
+    if (told := about_decisions(dataset, job.policy)) is not None:
+        say(told)
     if len(dataset.tasks) > 1:
         say(f"tasks: {', '.join(dataset.tasks)}")
     warning = shared_seeds_warning(dataset)
