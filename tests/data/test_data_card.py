@@ -18,7 +18,7 @@ from vla_eval.data.dataset_summary import ActionStatistics
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.testing.synthetic import write_synthetic_dataset
-from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX, MARGIN_PX, SheetRow, contact_sheet
+from vla_eval.viz.contact_sheet import EDGE_PX, LABEL_PX, LEFT_PX, MARGIN_PX, SheetRow, contact_sheet
 
 
 def front_matter(text: str) -> dict[str, object]:
@@ -105,12 +105,13 @@ def test_the_sheet_shows_cue_delay_choice_and_end_of_three_episodes(recorded: Pa
     sheet = np.asarray(Image.open(recorded / SHEET_FILE))
 
     # Four pictures of the base camera and one of the wrist, 128 px each; episodes 0, 2 and 3.
-    assert sheet.shape == (LABEL_PX + 3 * 132 + MARGIN_PX, LEFT_PX + 5 * 132 + MARGIN_PX, 3)
+    first, pitch = LABEL_PX + EDGE_PX + MARGIN_PX, 128 + MARGIN_PX
+    assert sheet.shape == (first + 3 * pitch + MARGIN_PX, LEFT_PX + 5 * pitch + MARGIN_PX, 3)
     dataset = open_local_dataset(recorded)
     third = 13 + 14  # first frame of episode 2, which is 15 frames long
     for column, step in enumerate((0, 5, 10, 14)):
         seen = dataset[third + step]["observation.images.base"].numpy().transpose(1, 2, 0)
-        left, top = LEFT_PX + column * 132, LABEL_PX + 132
+        left, top = LEFT_PX + column * pitch, first + pitch
         assert np.array_equal(
             sheet[top : top + 128, left : left + 128], (seen * 255).round().astype(np.uint8)
         )

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.io_utils import write_stats
 
@@ -22,7 +21,7 @@ from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import DatasetFacts, read_failed, read_manifest
 from vla_eval.data.mixture import MixtureFacts, MixtureSource, write_mixture
-from vla_eval.data.opening import light_metadata, open_local_dataset
+from vla_eval.data.opening import join_datasets, open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import whole_folder
@@ -148,15 +147,7 @@ def _refuse_repetition(sources: Sequence[MixtureSource]) -> None:
 
 def _aggregate(roots: Sequence[Path], draft: Path) -> None:
     try:
-        with light_metadata():
-            aggregate_datasets(
-                repo_ids=[f"local/{root.resolve().name}" for root in roots],
-                aggr_repo_id=f"local/{draft.name}",
-                roots=list(roots),
-                aggr_root=draft,
-                concatenate_videos=False,
-                concatenate_data=False,
-            )
+        join_datasets(roots, draft, concatenate_videos=False, concatenate_data=False)
     except ValueError as exc:
         raise DatasetError(
             f"lerobot cannot put {', '.join(str(root) for root in roots)} together: {exc!s:.300}"

@@ -3,13 +3,14 @@
 import contextlib
 import functools
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import pyarrow.parquet as pq
 from datasets import Dataset  # type: ignore[attr-defined]  # mypy sees the folder of recipes
 from lerobot.datasets import dataset_metadata
+from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR
@@ -55,6 +56,27 @@ def light_metadata() -> Iterator[None]:
         yield
     finally:
         dataset_metadata.load_episodes = before
+
+
+def join_datasets(roots: Sequence[Path], root: Path, **options: Any) -> None:
+    """Put datasets together as a new one, by lerobot.
+
+    Args:
+        roots: of the datasets, in order.
+        root: of the new one; must not exist.
+        options: of lerobot's `aggregate_datasets`.
+
+    Raises:
+        ValueError: they do not have the same fields.
+    """
+    with light_metadata():
+        aggregate_datasets(
+            repo_ids=[f"local/{one.resolve().name}" for one in roots],
+            aggr_repo_id=f"local/{root.name}",
+            roots=list(roots),
+            aggr_root=root,
+            **options,
+        )
 
 
 def _episodes_without_statistics(root: Path) -> Dataset:

@@ -14,14 +14,13 @@ from typing import Any, Self  # Any: lerobot is untyped
 import av
 import numpy as np
 from lerobot.configs import RGBEncoderConfig
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
 from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
-from vla_eval.data.opening import light_metadata, video_decoder
+from vla_eval.data.opening import join_datasets, video_decoder
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
     ACTION_NAMES,
@@ -159,13 +158,7 @@ def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ..
     Returns:
         The episodes, in order.
     """
-    with light_metadata():
-        aggregate_datasets(
-            repo_ids=[f"local/{shard.name}" for shard in shards],
-            aggr_repo_id=f"local/{root.name}",
-            roots=list(shards),
-            aggr_root=root,
-        )
+    join_datasets(shards, root)
     histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
     for shard in shards:
         with np.load(shard / SHARD_HISTOGRAMS) as stored:

@@ -61,40 +61,27 @@ def episodes_of(
     n_steps = config.n_window_steps
     real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
     actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
-    counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     change = _change(actions[:, :, 0], real)
-    begins = _begins(change < same_action, real)
-    if config.masks_beyond_decision:
-        counts = counts * _before_the_next(begins, config.chunk_size)
-    kept = real
-    if training:
-        waits = (change < same_action) & (torch.rand_like(change) > config.waiting_share)
-        waits[:, -1] = False  # the frame that was sampled
-        kept = real & ~waits
-        if config.decision_share:
-            kept = kept & _until_a_decision(begins, config.decision_share)
+    waits = change < same_action
+    begins = _begins(waits, real)
+    kept = _kept(waits, begins, real, config) if training else real
+    counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     can_know = torch.ones_like(change)
     if config.masks_beyond_decision:
+        counts = counts * _before_the_next(begins, config.chunk_size)
         can_know = ((begins.cumsum(dim=1) > 0) | ~begins.any(dim=1, keepdim=True)).float()
+    counts = (
+        counts * _shares(config, actions) * (1 + config.change_weight * change)[..., None] * kept[..., None]
+    )
     order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
-
     rows = torch.arange(len(order), device=order.device)[:, None]
 
     def taken(values: Tensor) -> Tensor:
         return values[rows, order]
 
-    weights = torch.full((config.chunk_size,), 1.0, device=actions.device)
-    if config.chunk_size > 1:
-        weights = weights * (1 - config.first_action_weight) / (config.chunk_size - 1)
-        weights[0] = config.first_action_weight
-    counts = counts * weights * (1 + config.change_weight * change)[..., None] * kept[..., None]
     images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
-    if training and config.mix_colors:
-        images = _mixed(images)
-    if training and config.shift_px:
-        images = _moved(images, config.shift_px)
     return Episodes(
-        images=images,
+        images=_augmented(images, config) if training else images,
         state=taken(batch[STATE_KEY][:, :n_steps]),
         actions=taken(actions),
         counts=taken(counts),
@@ -102,6 +89,28 @@ def episodes_of(
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=order,
     )
+
+
+def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) -> Tensor:
+    """Return (B, T): the steps that are trained on, drawn by torch's generator."""
+    left_out = waits & (torch.rand(waits.shape, device=waits.device) > config.waiting_share)
+    left_out[:, -1] = False  # the frame that was sampled
+    kept = real & ~left_out
+    return kept & _until_a_decision(begins, config.decision_share) if config.decision_share else kept
+
+
+def _shares(config: EpisodeConfig, actions: Tensor) -> Tensor:
+    """Return (chunk,): what the actions of a chunk count."""
+    shares = torch.full((config.chunk_size,), 1.0, device=actions.device)
+    if config.chunk_size > 1:
+        shares = shares * (1 - config.first_action_weight) / (config.chunk_size - 1)
+        shares[0] = config.first_action_weight
+    return shares
+
+
+def _augmented(images: Tensor, config: EpisodeConfig) -> Tensor:
+    mixed = _mixed(images) if config.mix_colors else images
+    return _moved(mixed, config.shift_px) if config.shift_px else mixed
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:

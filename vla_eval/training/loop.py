@@ -39,6 +39,7 @@ from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import light_metadata
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
+from vla_eval.policies.episode_samples import in_numbers
 from vla_eval.training.checkpoints import load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
@@ -47,7 +48,6 @@ from vla_eval.training.model import local_files_only, make_model, make_processor
 from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE
 from vla_eval.training.segments import preprocessed
 
-MAX_UINT8 = 255.0
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
 LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -149,8 +149,8 @@ class _Training:
         tracker, started = self.tracker, time.perf_counter()
         batch = next(self.batches)
         for key in () if self.job.takes_bytes else self.images:
-            if key in batch and batch[key].dtype == torch.uint8:
-                batch[key] = batch[key].to(dtype=torch.float32) / MAX_UINT8
+            if key in batch:
+                batch[key] = in_numbers(batch[key])
         batch = preprocessed(self.before, batch)
         loaded = time.perf_counter()
         seed_step(self.job.run_seed, step - 1, self.accelerator.process_index)

@@ -38,7 +38,7 @@ def about_decisions(dataset: TrainingDataset, policy: Any) -> str | None:
         return f"decisions: in {n_found} of {n_episodes} episodes the arm begins to move after it waited"
     return (
         f"warning: policy.decision_share is {share:g}, and in none of {n_episodes} episodes does the arm "
-        "begin to move after it waited: samples are whole episodes, and nothing in them asks for memory alone. If "
-        "the task makes the arm wait, its noise is in the recorded actions: record with "
+        "begin to move after it waited: samples are whole episodes, and nothing in them asks for memory "
+        "alone. If the task makes the arm wait, its noise is in the recorded actions: record with "
         "--set stored_action=intended."
     )
