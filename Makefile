@@ -6,8 +6,8 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help setup demo suite90 test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
-# Each takes about 2 GB, and 10 s to start.
-TEST_PROCESSES ?= 2
+# Each takes about 2 GB, and 10 s to start. One more than two cores: tests wait for processes that they stop.
+TEST_PROCESSES ?= 3
 PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 help:  ## list these verbs
