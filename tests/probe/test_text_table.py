@@ -3,7 +3,8 @@
 import pytest
 
 from vla_eval.probe.text_table import shown_table
-from vla_eval.results.folding import UNDEFINED, folded
+from vla_eval.results.folding import folded
+from vla_eval.results.table_columns import UNDEFINED
 
 TITLES = ("task", "world", "pairs", "left")
 ROWS = (("A", "none", "20", UNDEFINED), ("A", "swap 1", "20", UNDEFINED))

@@ -12,7 +12,7 @@ from vla_eval.probe.text_table import (
     shown_rate,
     shown_table,
 )
-from vla_eval.results.folding import UNDEFINED
+from vla_eval.results.table_columns import UNDEFINED
 
 GRID_VERSION = 1
 MOST_LISTED = 8  # first inferences whose steps fit into a cell

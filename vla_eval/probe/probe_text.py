@@ -16,7 +16,7 @@ from vla_eval.probe.text_table import (
     shown_table,
 )
 from vla_eval.results.estimates import Interval
-from vla_eval.results.folding import UNDEFINED
+from vla_eval.results.table_columns import SMALLEST_SHOWN_P, UNDEFINED
 
 PROBE_VERSION = 1
 TITLES = (
@@ -171,4 +171,4 @@ def _shown(share: Share | None) -> str:
 def _shown_p(p_value: float | None) -> str:
     if p_value is None:
         return UNDEFINED
-    return "<0.001" if p_value < 0.001 else f"{p_value:.3f}"
+    return f"<{SMALLEST_SHOWN_P}" if p_value < SMALLEST_SHOWN_P else f"{p_value:.3f}"

@@ -8,8 +8,9 @@ from typing import Any, Literal
 from vla_eval.probe.retention import Range
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import Interval
-from vla_eval.results.folding import UNDEFINED, folded
-from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
+from vla_eval.results.folding import folded
+from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
+from vla_eval.results.table_columns import UNDEFINED
 from vla_eval.results.table_formats import markdown_table
 
 ProbeFormat = Literal["markdown", "csv", "json", "latex", "html-table"]
@@ -41,11 +42,10 @@ def shown_table(
     above = [] if shown.sentence is None else [shown.sentence]
     if fmt == "latex":
         first = [f"{{\\footnotesize {latex_text(line)}\\par}}\\smallskip" for line in above]
-        footnotes = [f"\\par\\smallskip{{\\footnotesize {latex_text(line)}\\par}}" for line in said]
         table = fitted(
             latex_table(shown.titles, shown.rows, is_number, ruled_by_first="task" in shown.titles)
         )
-        return "\n".join([NEEDS, *first, *table, *footnotes])
+        return "\n".join([NEEDS, *first, *table, *footnotes(said)])
     if fmt == "html-table":
         items = [f"<li>{html_text(line)}</li>" for line in said]
         first = [f"<p>{html_text(line)}</p>" for line in above]

@@ -3,9 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-from vla_eval.results.table_columns import sentence_of
-
-UNDEFINED = "—"
+from vla_eval.results.table_columns import UNDEFINED, sentence_of
 
 
 class Folded(NamedTuple):

@@ -1,7 +1,7 @@
 """Escape text for LaTeX and write its tables. Knows nothing of results."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from vla_eval.errors import one_line
 
@@ -67,6 +67,11 @@ def fitted(lines: Sequence[str]) -> list[str]:
         *lines,
         "}",
     ]
+
+
+def footnotes(notes: Iterable[str]) -> list[str]:
+    """Return the lines below a table, a paragraph for each note."""
+    return [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
 
 
 def latex_row(cells: Sequence[str]) -> str:

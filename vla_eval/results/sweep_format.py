@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
-from vla_eval.results.folding import UNDEFINED, folded
-from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
+from vla_eval.results.folding import folded
+from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
 from vla_eval.results.sweep import Sweep, SweepRow
-from vla_eval.results.table_columns import sentence_of
+from vla_eval.results.table_columns import UNDEFINED, sentence_of
 from vla_eval.results.table_formats import Format, markdown_table
 
 JSON_VERSION = 1
@@ -102,8 +102,7 @@ def _latex(titles: list[str], rows: list[list[str]], notes: list[str]) -> str:
     said = [f"\\noindent{{\\footnotesize {latex_text(sentence_of(same))}\\par}}\\smallskip"] if same else []
     is_number = [title not in TEXTS for title in kept]
     table = fitted(latex_table(kept, shown, is_number, ruled_by_first=kept[0] == "task"))
-    below = [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
-    return "\n".join([NEEDS, *said, *table, *below])
+    return "\n".join([NEEDS, *said, *table, *footnotes(notes)])
 
 
 def _json(sweep: Sweep, notes: list[str]) -> str:

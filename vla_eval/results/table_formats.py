@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from vla_eval.errors import ReportError, some_of
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
 from vla_eval.results.estimates import CONFIDENCE
-from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
+from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
 from vla_eval.results.latex_preset import paper_preset
 from vla_eval.results.protocol_table import protocol_side_table
 from vla_eval.results.published_table import paper_side_table, published_side_tables
@@ -207,14 +207,14 @@ def _latex(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
         lines += fitted(
             latex_table(_titles(layout), layout.cells, _is_number(layout), ruled_by_first=by_task)
         )
-    lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in _notes(table, layout)]
+    lines += footnotes(_notes(table, layout))
     for side in sides:
         if side.rows:
             lines += ["", f"\\par\\medskip\\textbf{{{latex_text(side.title)}}}\\par\\smallskip"]
             lines += fitted(
                 latex_table(side.titles, side.rows, side.is_number, ruled_by_first=side.ruled_by_first)
             )
-        lines += [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in side.notes]
+        lines += footnotes(side.notes)
     return "\n".join(lines)
 
 
