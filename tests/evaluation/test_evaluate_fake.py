@@ -12,6 +12,7 @@ from vla_eval.cli.main import main
 from vla_eval.errors import RunChangedError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.evaluation.evaluate import default_run_folder, evaluate
+from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load
 
@@ -131,6 +132,28 @@ def test_an_observer_is_given_the_steps_of_an_episode_while_it_runs(
     counted = [load.n_counted for load in loads if load.n_running]
     # Of its 12 steps, as many as there were by then.
     assert 0 < max(counted) <= 12 and counted == sorted(counted)
+
+
+def test_when_a_record_comes_its_steps_are_no_longer_among_those_under_way(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        evaluate_module, "LOAD_SECONDS", 0.4
+    )  # some of a second are between the last and the end
+    bench.write_policy(pause=0.25)
+    under_way: list[int | None] = []
+    when_recorded: list[int | None] = []
+
+    class Observer(evaluate_module._Silence):
+        def on_load(self, load: Load) -> None:
+            under_way.append(load.n_counted)
+
+        def on_record(self, record: EpisodeRecord) -> None:
+            when_recorded.append(under_way[-1])
+
+    evaluate(bench.config(episodes=1, n_action_steps=[3]), out=bench.folder / "out", observer=Observer())
+
+    assert max(n or 0 for n in under_way) > 0 and when_recorded == [0]
 
 
 class TestResume:

@@ -54,8 +54,6 @@ class EpisodeBar:
     def advance(self, *, n_done: int, n_steps: int = 0, note: str = "") -> None:
         """Count; `n_steps` control steps were executed for it, and `note` says how it goes."""
         self._n_steps += n_steps
-        # Until the workers have been asked again, these are among the running ones, too.
-        self._n_running_steps = max(0, self._n_running_steps - n_steps)
         moved, self._n_done, self._note = n_done - self._n_done, n_done, note
         if self._bar is not None:
             self._bar.update(moved)

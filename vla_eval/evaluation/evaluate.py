@@ -68,7 +68,7 @@ class EvaluationObserver(Protocol):
         """Called with each record once it is durable."""
 
     def on_load(self, load: Load) -> None:
-        """Called about once a second with what the workers are doing."""
+        """Called about once a second, and before records, with what the workers are doing."""
 
     def on_tick(self) -> bool:
         """Called several times a second; returns whether the run has to stop now."""
@@ -264,10 +264,11 @@ def _run(
                 bookkeeper.folder.note_device(event.device)
                 bookkeeper.observer.on_device(event.device)
             else:
-                bookkeeper.store()
-                if time.monotonic() >= next_load:
+                # Before records are handed out: their steps are no longer among those under way.
+                if bookkeeper.unstored or time.monotonic() >= next_load:
                     next_load = time.monotonic() + LOAD_SECONDS
                     bookkeeper.observer.on_load(running.load())
+                bookkeeper.store()
                 if bookkeeper.observer.on_tick():
                     return "stopped"
     return "finished"
