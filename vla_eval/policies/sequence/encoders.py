@@ -2,14 +2,15 @@
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+from vla_eval.policies.episode_samples import in_numbers
 from vla_eval.policies.sequence.sizes import ENCODERS
 from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3
 KEYPOINTS = 32
 NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
+LEAST_VARIANCE = 1e-5  # as torch's instance_norm
 
 
 class Nature(nn.Sequential):
@@ -53,7 +54,7 @@ class Keypoints(nn.Module):
         channels: of an image.
     """
 
-    line: Tensor
+    places: Tensor
 
     def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
         super().__init__()
@@ -66,7 +67,9 @@ class Keypoints(nn.Module):
         )
         self.sharpness = nn.Parameter(torch.full((KEYPOINTS,), 4.0).log())
         self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * KEYPOINTS, outputs)
-        self.register_buffer("line", torch.linspace(-1, 1, image_px // 4), persistent=False)
+        line = torch.linspace(-1, 1, image_px // 4)
+        places = torch.cartesian_prod(line, line).flip(-1)  # (H · W, 2): x, y
+        self.register_buffer("places", places, persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (N, outputs) of images (N, 3, H, W) in [-1, 1]."""
@@ -76,12 +79,14 @@ class Keypoints(nn.Module):
     @in_float32
     def reads_out(self, features: Tensor) -> Tensor:
         """Return (N, outputs) of maps (N, maps, H, W); half precision would round places to a pixel."""
-        relative = functional.instance_norm(features)
-        shares = (relative * self.sharpness.exp()[:, None, None]).flatten(2).softmax(dim=-1)
-        strong = (shares * features.flatten(2)).sum(dim=-1)
-        shares = shares.reshape(features.shape)
-        x = (shares.sum(dim=-2) * self.line).sum(dim=-1)
-        y = (shares.sum(dim=-1) * self.line).sum(dim=-1)
+        maps = features.flatten(2)
+        # Normalised per image. On a CPU this is several times faster than torch's instance_norm.
+        around = maps - maps.mean(dim=-1, keepdim=True)
+        variance = torch.linalg.vector_norm(around, dim=-1).square() / maps.shape[-1]
+        scale = self.sharpness.exp() / (variance + LEAST_VARIANCE).sqrt()
+        shares = (around * scale[..., None]).softmax(dim=-1)
+        x, y = (shares @ self.places).unbind(dim=-1)
+        strong = (shares * maps).sum(dim=-1)
         read: Tensor = self.reads(torch.cat([x, y, strong], dim=-1))
         return read
 
@@ -106,9 +111,16 @@ class Cameras(nn.ModuleList):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W) in [0, 1]."""
-        parts = (2 * images - 1).flatten(0, 1).flatten(1, 2).chunk(len(self), dim=1)
+        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes."""
+        parts = images.flatten(0, 1).flatten(1, 2).chunk(len(self), dim=1)
         # Convolutions on a CPU are a fifth faster in this order of the same numbers.
-        ordered = [part.contiguous(memory_format=torch.channels_last) for part in parts]
-        seen = [encoder(part) for encoder, part in zip(self, ordered, strict=True)]
+        ordered = (part.contiguous(memory_format=torch.channels_last) for part in parts)
+        seen = [encoder(_around_zero(part)) for encoder, part in zip(self, ordered, strict=True)]
         return torch.cat(seen, dim=-1).reshape(*images.shape[:2], self.outputs)
+
+
+def _around_zero(images: Tensor) -> Tensor:
+    """Return images in [-1, 1] of images in [0, 1] or bytes, the same numbers of both."""
+    if images.dtype == torch.uint8:  # a new tensor, so that the rest can be done in place: it is large
+        return in_numbers(images).mul_(2).sub_(1)
+    return 2 * images - 1

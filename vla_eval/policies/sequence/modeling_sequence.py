@@ -13,7 +13,6 @@ from vla_eval.policies.episode_samples import (
     Episodes,
     episodes_of,
     goal_missed,
-    in_numbers,
     stacked_images,
     weighted_mean,
 )
@@ -110,7 +109,7 @@ class SequenceNetwork(nn.Module):
         """Return (B, T, width) of what is seen.
 
         Args:
-            images: (B, T, cameras, 3, H, W) in [0, 1].
+            images: (B, T, cameras, 3, H, W) in [0, 1], or bytes.
             state: (B, T, state).
             said: (B, T, width) by `sentence`; None where no instruction is read.
         """
@@ -193,8 +192,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         # Images are most of the work: those of padding are not encoded.
         said = said_at_each_step(network.sentence, batch, real.shape[1])
         said = None if said is None else said[real][None]
-        images = in_numbers(episodes.images[real])
-        encoded = network.tokens(images[None], episodes.state[real][None], said)[0]
+        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None], said)[0]
         tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
         predicted = network.predict(tokens, answers)
