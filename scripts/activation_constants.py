@@ -31,6 +31,13 @@ VARIANTS: tuple[tuple[str, Mapping[str, Any]], ...] = (
     ("diffusion_small", {}),
     ("memory", {"window_steps": 60}),
     ("memory", {"window_steps": 90, "patch_px": 16}),
+    *(
+        (name, {"window_steps": 60})
+        for name in ("recurrent", "context", "bc_mlp", "decision_transformer", "rate")
+    ),
+    *((name, {"window_steps": 60}) for name in ("gtrxl", "decision_mamba", "elmur")),
+    ("recurrent", {"window_steps": 90, "encoder": "nature"}),
+    *((name, {}) for name in ("cql", "cql_published", "iql")),
 )
 
 

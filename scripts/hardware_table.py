@@ -17,6 +17,8 @@ RECIPES: tuple[tuple[str, str, Change], ...] = (
     ("act", "", {}),
     ("diffusion", "", {}),
     ("memory", "", {}),
+    *((name, "", {}) for name in ("recurrent", "context", "bc_mlp", "decision_transformer", "rate", "gtrxl")),
+    *((name, "", {}) for name in ("decision_mamba", "elmur", "cql", "iql")),
     ("octo_small", "", {}),
     ("octo_small", "full", {"policy": {"trained": "all"}}),
     ("octo_base", "", {}),

@@ -93,7 +93,54 @@ def test_convolutions_and_attention_of_an_act_count_like_linear_layers() -> None
     assert counted.saved == read_and_written
 
 
-@pytest.mark.parametrize("policy", ["act", "diffusion", "memory"])
+def sequence_config(**fields: Any) -> Any:
+    sizes: dict[str, Any] = {"window_steps": 7, "encoder": "keypoints", "core": "gru", "tokens_per_step": 1}
+    images = {name: SimpleNamespace(shape=(3, 32, 32)) for name in ("base", "wrist")}
+    return SimpleNamespace(
+        type="mikasa_sequence", image_features=images, context_steps=5, **{**sizes, **fields}
+    )
+
+
+def test_the_cells_and_the_two_encoders_of_a_plain_network_count_for_each_of_its_steps() -> None:
+    encoder = nn.ModuleDict(
+        {"features": nn.Sequential(nn.Conv2d(3, 8, 8, stride=4)), "reads": nn.Linear(24, 6)}
+    )
+    parts = {"encoders": nn.ModuleList([encoder]), "core": nn.ModuleDict({"cells": nn.GRU(6, 6)})}
+    counted = count(nn.ModuleDict({"network": nn.ModuleDict(parts)}), sequence_config())
+    # Seven steps; a quarter of an image's edge in each direction.
+    assert counted.forward == 2 * 7 * (8 * 8 * (3 * 8 * 8 * 8) + 24 * 6 + 2 * 6 * 18)
+    assert counted.saved == 7 * (8 * 8 * (3 * 16 + 8) + (24 + 6) + 2 * (6 + 18))
+
+
+def test_each_convolution_of_the_plain_encoder_has_the_places_of_its_own_output() -> None:
+    convolutions = [nn.Conv2d(3, 8, 8, stride=4), nn.ReLU(), nn.Conv2d(8, 8, 4, stride=2), nn.ReLU()]
+    encoder = nn.Sequential(*convolutions, nn.Conv2d(8, 8, 3), nn.ReLU(), nn.Flatten(), nn.Linear(8, 6))
+    shapes = []
+    images = torch.zeros(1, 3, 36, 36)
+    for layer in encoder[:6]:
+        images = layer(images)
+        shapes.append(images[0, 0].numel())
+    made = {
+        "sequence": nn.ModuleDict({"encoders": nn.ModuleList([encoder])}),
+        "rl": nn.ModuleDict({"encoder": encoder}),
+    }
+    places = (3 * 8 * 64 * shapes[0], 8 * 8 * 16 * shapes[2], 8 * 8 * 9 * shapes[4])
+    for network, n_steps in ((made["sequence"], 7), (made["rl"], 1)):
+        config = sequence_config(encoder="nature") if n_steps == 7 else sequence_config()
+        config.type = "mikasa_sequence" if n_steps == 7 else "mikasa_offline_rl"
+        config.image_features["base"].shape = (3, 36, 36)
+        counted = count(nn.ModuleDict({"network": network}), config)
+        assert counted.forward == 2 * n_steps * (sum(places) + 8 * 6)
+
+
+def test_decision_transformer_reads_its_window_at_every_step_and_others_read_a_step_once() -> None:
+    network = nn.ModuleDict({"network": nn.ModuleDict({"core": nn.ModuleDict({"feed": nn.Linear(4, 4)})})})
+    for core, n_reads in (("decision_transformer", 5), ("rate", 1)):
+        counted = count(network, sequence_config(core=core, tokens_per_step=3))
+        assert counted.forward == 2 * 16 * 7 * 3 * n_reads
+
+
+@pytest.mark.parametrize("policy", ["act", "diffusion", "memory", "recurrent", "elmur", "iql"])
 def test_a_dry_run_estimates_the_batch_of_a_policy_from_scratch(
     policy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
-from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_KEY
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_unfilled_policy, read_config
 from vla_eval.policies.lerobot_processors import load_processors
 from vla_eval.policies.verify import random_batch
@@ -107,4 +107,8 @@ def random_samples(config: Any, n_samples: int) -> dict[str, Any]:
     n_numbers = int(config.action_feature.shape[0])
     batch[ACTION_KEY] = torch.rand(n_samples, n_actions, n_numbers, generator=draws) * 2 - 1
     batch[ACTION_PADDING_KEY] = torch.zeros(n_samples, n_actions, dtype=torch.bool)
+    n_rewards = len(config.reward_delta_indices or [0])
+    batch[REWARD_KEY] = torch.zeros(n_samples, n_rewards)
+    batch[f"{REWARD_KEY}_is_pad"] = torch.zeros(n_samples, n_rewards, dtype=torch.bool)
+    batch[DONE_KEY] = torch.zeros(n_samples, dtype=torch.bool)
     return batch

@@ -21,11 +21,14 @@ Measured on a CPU (torch 2.11, bfloat16, 256 tokens, SDPA) by counting the tenso
 one layer of true width: SigLIP-so400m 0.89, Llama-2-7B 1.20, Gemma-300M 1.32, Gemma-2B 1.34. Gemma 2 with
 its capped eager attention: 1.91, of which the scores grow with the number of tokens.
 """
-SAVED_PER_LINEAR_OF = {"mikasa_spatialvla": 1.9, "act": 1.04, "diffusion": 1.19, "mikasa_memory": 1.91}
-"""Where it is another number. For the last three, whole networks were measured in float32, at the sizes of
+SAVED_PER_LINEAR_OF = {
+    **{"mikasa_spatialvla": 1.9, "act": 1.04, "diffusion": 1.19},
+    **{"mikasa_memory": 1.91, "mikasa_sequence": 1.3, "mikasa_offline_rl": 1.4},
+}
+"""Where it is another number. For all but the first, whole networks were measured in float32, at the sizes of
 their recipes, by `scripts/activation_constants.py`; convolutions and attention count like linear layers.
 """
-ALL_LAYERS = frozenset({"act", "diffusion", "mikasa_memory"})
+ALL_LAYERS = frozenset(SAVED_PER_LINEAR_OF) - {"mikasa_spatialvla"}
 LAYER = re.compile(r"(.*\.(?:layers|layer|blocks|block)\.\d+)\.")
 
 
@@ -146,5 +149,9 @@ def _layers(model: Any, *, every: bool) -> Iterator[Layer]:
         elif every and isinstance(module, nn.Conv1d | nn.Conv2d | nn.ConvTranspose1d):
             n_read = module.in_channels * math.prod(module.stride)
             yield Layer(name, module.weight, n_read, module.out_channels)
+        elif every and isinstance(module, nn.GRU | nn.LSTM):
+            for key, weight in module.named_parameters():
+                if key.startswith("weight"):  # of an input or a state, to all gates
+                    yield Layer(name, weight, weight.shape[1], weight.shape[0])
         elif every and isinstance(module, nn.MultiheadAttention) and module.in_proj_weight is not None:
             yield Layer(name, module.in_proj_weight, module.embed_dim, 3 * module.embed_dim)

@@ -159,6 +159,38 @@ def _memory(config: Any) -> tuple[Stage, ...]:
     )
 
 
+def _sequence(config: Any) -> tuple[Stage, ...]:
+    n_steps = config.window_steps or EPISODE_STEPS
+    # Decision Transformer reads its window again at every step.
+    n_reads = config.context_steps if config.core == "decision_transformer" else 1
+    return (
+        *_encoder_stages(config, n_steps, nature=config.encoder.startswith("nature")),
+        Stage(r"network\.core\.", n_steps * config.tokens_per_step * n_reads, LANGUAGE),
+        Stage(r"network\.sentence\.", 1, HEAD),
+        Stage(r"network\.", n_steps, HEAD),
+    )
+
+
+def _offline_rl(config: Any) -> tuple[Stage, ...]:
+    return (*_encoder_stages(config, 1, nature=True), Stage(r"network\.targets\.", 0, HEAD))
+
+
+def _encoder_stages(config: Any, n_images: int, *, nature: bool) -> tuple[Stage, ...]:
+    """Return the places of plain encoders of images (`policies/sequence/encoders.py`)."""
+    n_px = _image_shape(config)[-1]
+    encoder = r"network\.(?:encoder|encoders\.\d+)\."
+    if not nature:
+        places = Stage(encoder + r"features\.", n_images * (n_px // 4) ** 2, VISION)
+        return (places, Stage(encoder + "reads", n_images, VISION))
+    first = (n_px - 8) // 4 + 1
+    second = (first - 4) // 2 + 1
+    edges = ((0, first), (2, second), (4, second - 2))
+    return (
+        *(Stage(encoder + rf"{index}\b", n_images * edge**2, VISION) for index, edge in edges),
+        Stage(encoder + r"7\b", n_images, VISION),
+    )
+
+
 def _image_shape(config: Any) -> tuple[int, int, int]:
     channels, height, width = next(iter(config.image_features.values())).shape
     return channels, height, width
@@ -183,4 +215,6 @@ STAGES: Mapping[str, Callable[[Any], tuple[Stage, ...]]] = {
     "act": _act,
     "diffusion": _diffusion,
     "mikasa_memory": _memory,
+    "mikasa_sequence": _sequence,
+    "mikasa_offline_rl": _offline_rl,
 }
