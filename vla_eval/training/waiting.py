@@ -15,12 +15,17 @@ EPISODE_INDEX = "episode_index"
 
 
 def n_with_decisions(dataset: TrainingDataset) -> int:
-    """Return in how many episodes the arm begins to move after it waited."""
+    """Return in how many of the episodes that are trained on the arm begins to move after it waited."""
     columns = read_columns(dataset.root, (EPISODE_INDEX, ACTION_KEY))
     episodes = columns[EPISODE_INDEX]
     bounds = [0, *(np.flatnonzero(episodes[1:] != episodes[:-1]) + 1).tolist(), len(episodes)]
     actions = torch.from_numpy(columns[ACTION_KEY].astype(np.float32))
-    return sum(bool(decisions(actions[first:stop]).any()) for first, stop in pairwise(bounds))
+    left_out = set(dataset.left_out)
+    return sum(
+        bool(decisions(actions[first:stop]).any())
+        for first, stop in pairwise(bounds)
+        if int(episodes[first]) not in left_out
+    )
 
 
 def about_decisions(dataset: TrainingDataset, policy: Any) -> str | None:
@@ -33,7 +38,8 @@ def about_decisions(dataset: TrainingDataset, policy: Any) -> str | None:
     share = getattr(policy, "decision_share", 0.0)
     if not share:
         return None
-    n_found, n_episodes = n_with_decisions(dataset), dataset.meta.total_episodes
+    n_found = n_with_decisions(dataset)
+    n_episodes = dataset.meta.total_episodes - len(dataset.left_out)
     if n_found:
         return f"decisions: in {n_found} of {n_episodes} episodes the arm begins to move after it waited"
     return (
