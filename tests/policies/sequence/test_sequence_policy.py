@@ -79,6 +79,23 @@ def test_when_it_acts_it_reads_the_target_return_and_the_actions_that_it_has_dec
     torch.testing.assert_close(torch.stack(chunks, dim=1), whole, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("core", CORES)
+def test_with_returns_and_without_actions_it_acts_as_if_a_demonstration_had_been_read(
+    recorded: Path, core: str
+) -> None:
+    fields = {"tokens": "return_observation", "reward": "sparse", "target_return": 2.5}
+    policy, seen = tiny_policy(recorded, core=core, **fields), frames(5, n_episodes=2)
+    tokens = policy.network.tokens(torch.stack([seen[BASE], seen[WRIST]], dim=2), seen["observation.state"])
+    given = Demonstrated(returns=torch.full((2, 5), 2.5), actions=torch.full((2, 5, 7), torch.nan))
+    whole = policy.network.predict(tokens, policy.network.answers(tokens, given)).actions
+    memory = None
+    for step in range(5):
+        if CORES[core].remembers:
+            memory = policy.remember(between(seen, step, step + 1), memory)
+        chunk = policy.predict_action_chunk(at(seen, step), memory=memory)
+        torch.testing.assert_close(chunk, whole[:, step].clamp(-1, 1), atol=1e-5, rtol=1e-5)
+
+
 def test_another_target_return_gives_other_actions(recorded: Path) -> None:
     seen = frames(1)
     chunks = []

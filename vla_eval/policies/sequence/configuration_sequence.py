@@ -85,12 +85,17 @@ class MikasaSequenceConfig(EpisodeConfig):
     @property
     def reads_returns(self) -> bool:
         """Whether the return to go is a token."""
+        return self.tokens != "step"
+
+    @property
+    def reads_actions(self) -> bool:
+        """Whether the action of a step is a token."""
         return self.tokens == "return_observation_action"
 
     @property
     def tokens_per_step(self) -> int:
         """Tokens of a step."""
-        return 3 if self.reads_returns else 1
+        return TOKENS[self.tokens]
 
     @property
     def reward_delta_indices(self) -> list[int] | None:
@@ -138,7 +143,7 @@ class MikasaSequenceConfig(EpisodeConfig):
             )
         if not self.reads_returns and (self.reward is not None or self.target_return is not None):
             raise RecipeError(
-                f"reward and target_return belong to tokens=return_observation_action, found {self.tokens}"
+                f"reward and target_return belong to tokens=return_observation[_action], found {self.tokens}"
             )
         if self.reward == "sparse" and self.target_return is None:
             self.target_return = 1.0

@@ -97,6 +97,7 @@ class SequenceNetwork(nn.Module):
         self.goal = nn.Linear(width, SPACE)
         if config.reads_returns:
             self.returns = nn.Linear(1, width)
+        if config.reads_actions:
             self.executed = nn.Linear(self.shape[1], width)
         self.sentence = SentenceEncoder(width) if config.reads_sentence else None
 
@@ -133,8 +134,10 @@ class SequenceNetwork(nn.Module):
         if demonstrated is None:
             alone: Tensor = self.core(tokens, begun)[0]
             return alone
-        returns, executed = self.returns(demonstrated.returns[..., None]), self.executed(demonstrated.actions)
-        steps = torch.stack([returns, tokens, executed], dim=2)
+        parts = [self.returns(demonstrated.returns[..., None]), tokens]
+        if self.config.reads_actions:
+            parts.append(self.executed(demonstrated.actions))
+        steps = torch.stack(parts, dim=2)
         read: Tensor = self.core(steps.flatten(1, 2), begun)[0]
         return read[:, 1 :: steps.shape[2]]
 
@@ -142,8 +145,8 @@ class SequenceNetwork(nn.Module):
     def read(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
         """Return the core's answers (B, T, width) to observations, and the memory after the last step.
 
-        The return to go is the target at every step: no reward is known. The action is the one that the
-        policy itself decides on at the step.
+        The return to go is the target at every step: no reward is known. The action, where it is read, is
+        the one that the policy itself decides on at the step.
         """
         if not self.config.reads_returns:
             answers, kept = self.core(tokens, memory[:-1])
@@ -155,6 +158,8 @@ class SequenceNetwork(nn.Module):
             told = torch.cat([self.returns(target), token], dim=1)
             answer, kept = self.core(told, kept)
             found.append(answer[:, 1:])
+            if not self.config.reads_actions:
+                continue
             action = self.predict(token, found[-1]).actions[:, :, 0].clamp(-1, 1)
             _, kept = self.core(self.executed(action.to(token.dtype)), kept)
         return torch.cat(found, dim=1), (*kept, found[-1][:, 0])

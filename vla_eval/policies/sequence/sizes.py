@@ -179,6 +179,6 @@ ENCODERS = {
     "nature": EncoderRow(),
     "nature_stacked": EncoderRow(shared=True),
 }
-TOKENS = ("step", "return_observation_action")
-"""Tokens of a step: one, or return to go, observation and action, as Decision Transformer reads them."""
+TOKENS = {"step": 1, "return_observation": 2, "return_observation_action": 3}
+"""How many a step has: the observation; with the return to go before it; with the action after it, too."""
 HEADS = ("gated", "linear")
