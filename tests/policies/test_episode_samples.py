@@ -53,6 +53,14 @@ def batch() -> dict[str, Tensor]:
     }
 
 
+def waits_then_moves() -> dict[str, Tensor]:
+    """The arm moves at step 0, waits at 1 and 2, moves at 3 and 4: the decision is step 3."""
+    given = batch()
+    given[ACTION_KEY] = torch.zeros(N_EPISODES, N_STEPS - 1 + CHUNK, 7)
+    given[ACTION_KEY][:, 3:] = torch.arange(1.0, N_STEPS - 1 + CHUNK - 2)[:, None] / CHUNK
+    return given
+
+
 def found_shift(seen: Tensor, moved: Tensor) -> tuple[int, int]:
     """Return the one shift (down, right) that makes `moved` (3, H, W) of `seen`, pixel by pixel."""
     fits = []
@@ -113,10 +121,7 @@ def test_images_in_bytes_are_those_numbers() -> None:
 
 
 def test_actions_beyond_the_next_decision_do_not_count_where_that_is_asked_for() -> None:
-    """The arm moves at step 0, waits at 1 and 2, moves at 3 and 4: the decision is step 3."""
-    given = batch()
-    given[ACTION_KEY] = torch.zeros(N_EPISODES, N_STEPS - 1 + CHUNK, 7)
-    given[ACTION_KEY][:, 3:] = torch.arange(1.0, N_STEPS - 1 + CHUNK - 2)[:, None] / CHUNK
+    given = waits_then_moves()
     all_of_it = episodes_of(given, config(), training=False)
     assert (all_of_it.counts > 0).all()
     assert (all_of_it.goal_counts > 0).all()
@@ -134,3 +139,41 @@ def test_without_any_decision_the_goal_counts_at_every_step() -> None:
     episodes = episodes_of(given, config(masks_beyond_decision=True), training=False)
     assert (episodes.goal_counts > 0).all()
     assert (episodes.counts > 0).all()
+
+
+def test_actions_beyond_the_next_decision_are_those_of_waiting_where_that_is_asked_for() -> None:
+    given = waits_then_moves()
+    given[ACTION_KEY][:, 1:3] = 0.5
+    given[ACTION_KEY][:, 0] = 0.25
+    fields = {"masks_beyond_decision": True, "waits_beyond_decision": True}
+    episodes = episodes_of(given, config(**fields), training=False)
+    assert (episodes.counts > 0).all()
+    first = [of_step[:, 0].tolist() for of_step in episodes.actions[0]]
+    assert first[0] == [0.25, *[0.5] * (CHUNK - 1)]
+    assert first[1] == first[2] == [0.5] * CHUNK
+    assert first[3] == given[ACTION_KEY][0, 3 : 3 + CHUNK, 0].tolist()
+    assert (episodes.goal_counts[0] > 0).tolist() == [False, False, False, True, True]
+    with pytest.raises(RecipeError, match="expected masks_beyond_decision to be true, too"):
+        config(waits_beyond_decision=True)
+
+
+def test_the_frame_of_a_decision_is_shown_up_to_so_many_times_again() -> None:
+    given, n_late = waits_then_moves(), set()
+    for _ in range(8):
+        episodes = episodes_of(given, config(late_steps=3), training=True)
+        for steps, counts, images in zip(episodes.steps, episodes.counts, episodes.images, strict=True):
+            shown = steps[counts[:, 0] > 0].tolist()
+            assert shown == sorted(shown) and set(shown) == set(range(N_STEPS))
+            n_late.add(shown.count(3) - 1)
+            assert len(shown) == N_STEPS + shown.count(3) - 1
+            assert torch.equal(images[shown.index(3)], images[shown.index(4) - 1])
+    assert n_late == {0, 1, 2, 3}
+    once = episodes_of(given, config(late_steps=3), training=False).steps
+    assert once.tolist() == [list(range(N_STEPS))] * N_EPISODES
+
+
+def test_a_late_decision_may_be_where_an_episode_ends() -> None:
+    episodes = episodes_of(waits_then_moves(), config(late_steps=3, decision_share=1.0), training=True)
+    for steps, counts in zip(episodes.steps, episodes.counts, strict=True):
+        shown = steps[counts[:, 0] > 0].tolist()
+        assert shown[:3] == [0, 1, 2] and set(shown[3:]) == {3} and len(shown) <= 7

@@ -43,6 +43,11 @@ class EpisodeConfig(PortedConfig):
             depend on has not been seen yet. Otherwise the mean of all motions is learned for them, and a
             chunk that is executed across the decision takes the arm to where no demonstration has it. The
             goal does not count before the first decision either: it could only be learned by heart there.
+        waits_beyond_decision: with `masks_beyond_decision`, those actions are not left out, but replaced by
+            the one before the decision: to go on waiting. A chunk executed across the decision then keeps
+            the arm where it is until the policy is asked again.
+        late_steps: the frame of a decision is shown up to so many times again in training, at random: a
+            policy that is not asked at every step sees it several times before it may decide.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.
@@ -64,6 +69,8 @@ class EpisodeConfig(PortedConfig):
     waiting_share: float = 0.3
     decision_share: float = 0.0
     masks_beyond_decision: bool = False
+    waits_beyond_decision: bool = False
+    late_steps: int = 0
     goal_weight: float = 1.0
     mix_colors: bool = False
     shift_px: int = 0
@@ -88,6 +95,10 @@ class EpisodeConfig(PortedConfig):
             raise RecipeError(f"decision_share is {self.decision_share}, expected a number in [0, 1]")
         if self.shift_px < 0:
             raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
+        if self.late_steps < 0:
+            raise RecipeError(f"late_steps is {self.late_steps}, expected a number ≥ 0")
+        if self.waits_beyond_decision and not self.masks_beyond_decision:
+            raise RecipeError("waits_beyond_decision is true, expected masks_beyond_decision to be true, too")
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""

@@ -68,27 +68,62 @@ def episodes_of(
     counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     can_know = torch.ones_like(change)
     if config.masks_beyond_decision:
-        counts = counts * _before_the_next(begins, config.chunk_size)
+        before = _before_the_next(begins, config.chunk_size)
+        if config.waits_beyond_decision:
+            actions = _waiting_beyond(actions, before)
+        else:
+            counts = counts * before
         can_know = ((begins.cumsum(dim=1) > 0) | ~begins.any(dim=1, keepdim=True)).float()
     counts = (
         counts * _shares(config, actions) * (1 + config.change_weight * change)[..., None] * kept[..., None]
     )
-    order = (~kept).to(torch.uint8).argsort(dim=1, stable=True)[:, : int(kept.sum(dim=1).max())]
-    rows = torch.arange(len(order), device=order.device)[:, None]
+    steps, is_there = _shown(kept, begins, config.late_steps if training else 0)
+    rows = torch.arange(len(steps), device=steps.device)[:, None]
 
     def taken(values: Tensor) -> Tensor:
-        return values[rows, order]
+        return values[rows, steps]
 
+    counts = taken(counts) * is_there[..., None]
     images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
     return Episodes(
         images=_augmented(images, config) if training else images,
         state=taken(batch[STATE_KEY][:, :n_steps]),
         actions=taken(actions),
-        counts=taken(counts),
-        goal_counts=taken(counts.sum(dim=-1) * can_know),
+        counts=counts,
+        goal_counts=counts.sum(dim=-1) * taken(can_know),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
-        steps=order,
+        steps=steps,
     )
+
+
+def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
+    """Return (B, T) the steps that are shown, in order, and which are no padding.
+
+    Args:
+        kept: (B, steps) those that are trained on.
+        begins: (B, steps) decisions.
+        late_steps: a decision is shown up to so many times again, drawn by torch's generator.
+    """
+    times = kept.long()
+    if late_steps:
+        times = times + torch.randint(0, late_steps + 1, times.shape, device=times.device) * (kept & begins)
+    ends = times.cumsum(dim=1)
+    n_shown = ends[:, -1:]
+    places = torch.arange(int(n_shown.max()), device=times.device).expand(len(times), -1)
+    # Padding is the last step again, which does not count.
+    steps = torch.searchsorted(ends, places.minimum(n_shown - 1).contiguous(), right=True)
+    return steps, places < n_shown
+
+
+def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
+    """Return chunks (B, T, chunk, action) that go on with the last action that is before a decision.
+
+    Args:
+        actions: of each step and those behind it.
+        before: (B, T, chunk) whether an action is before the next decision; the first of a chunk always is.
+    """
+    last = (before.sum(dim=-1, keepdim=True) - 1)[..., None].expand(-1, -1, 1, actions.shape[-1])
+    return torch.where(before[..., None], actions, actions.gather(2, last))
 
 
 def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) -> Tensor:
