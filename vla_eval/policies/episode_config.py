@@ -44,7 +44,7 @@ class EpisodeConfig(PortedConfig):
             chunk that is executed across the decision takes the arm to where no demonstration has it. The
             goal does not count before the first decision either: it could only be learned by heart there.
         waits_beyond_decision: with `masks_beyond_decision`, those actions are not left out, but replaced by
-            the one before the decision: to go on waiting. A chunk executed across the decision then keeps
+            the one before the decision: to continue waiting. A chunk executed across the decision then keeps
             the arm where it is until the policy is asked again.
         late_steps: the frame of a decision is shown up to so many times again in training, at random: a
             policy that is not asked at every step sees it several times before it may decide.

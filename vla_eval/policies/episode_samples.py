@@ -116,7 +116,7 @@ def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tenso
 
 
 def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
-    """Return chunks (B, T, chunk, action) that go on with the last action that is before a decision.
+    """Return chunks (B, T, chunk, action) that continue with the last action before a decision.
 
     Args:
         actions: of each step and those behind it.
