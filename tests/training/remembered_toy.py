@@ -5,34 +5,21 @@ The square is gone before the arm may move. Then a bright bar says that it may: 
 when to go, but not where.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from lerobot.configs import RGBEncoderConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart, FloatArray, ImageArray, StepResult
-from vla_eval.data.opening import open_local_dataset, video_decoder
+from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.shard_writer import new_dataset
 from vla_eval.envs.fake import M_PER_STEP, FakeEnv
-from vla_eval.features import (
-    CAMERA_KEYS,
-    DONE_KEY,
-    FPS,
-    PROPRIO_KEYS,
-    REWARD_KEY,
-    STATE_KEY,
-    SUCCESS_KEY,
-    EncoderSettings,
-    dataset_features,
-    proprioception,
-)
+from vla_eval.features import CAMERA_KEYS, EncoderSettings, dataset_features, frame_values
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
@@ -82,16 +69,8 @@ def make_env() -> SeenCueEnv:
 
 def write_demonstrations(root: Path, *, n_episodes: int) -> TrainingDataset:
     """Write demonstrations of an expert that waits and then goes to the right side."""
-    dataset = LeRobotDataset.create(
-        f"local/{root.name}",
-        fps=FPS,
-        features=dataset_features("eef"),
-        root=root,
-        streaming_encoding=True,
-        encoder_queue_maxsize=ARGUMENTS["horizon_steps"] + 3,
-        rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
-        video_backend=video_decoder(),
-    )
+    max_frames = ARGUMENTS["horizon_steps"]
+    dataset = new_dataset(root, dataset_features("eef"), encoder=EncoderSettings(), max_frames=max_frames)
     for seed in range(1000, 1000 + n_episodes):
         for frame in _frames(seed):
             dataset.add_frame(frame)
@@ -113,24 +92,15 @@ def write_demonstrations(root: Path, *, n_episodes: int) -> TrainingDataset:
 
 def _frames(seed: int) -> Iterator[dict[str, Any]]:
     env = make_env()
-    result = env.reset({0: seed}, render=True)[0]
-    n_after = 0
-    while n_after < 2:
-        action = _expert(env, result)
-        observation, before = result.observation, result.status
-        result = env.step({0: action}, render=frozenset({0}))[0]
-        n_after += before.success
-        numbers = proprioception(observation.state)
-        yield {
-            **{key: observation.images[camera] for camera, key in CAMERA_KEYS.items()},
-            **{PROPRIO_KEYS[kind]: values for kind, values in numbers.items()},
-            STATE_KEY: numbers["eef"],
-            "action": action,
-            REWARD_KEY: np.zeros(1, dtype=np.float32),
-            SUCCESS_KEY: np.array([before.success]),
-            DONE_KEY: np.array([n_after == 2]),
-            "task": INSTRUCTION,
-        }
+    before = env.reset({0: seed}, render=True)[0]
+    n_after = 0  # two frames after the success, too
+    while n_after < 3:
+        action = _expert(env, before)
+        after = env.step({0: action}, render=frozenset({0}))[0]
+        n_after += after.status.success
+        values = frame_values(before, after, action=action, state="eef", is_last=n_after == 3)
+        yield {**values, "task": INSTRUCTION}
+        before = after
 
 
 def _expert(env: SeenCueEnv, result: StepResult) -> FloatArray:
