@@ -93,9 +93,9 @@ def test_convolutions_and_attention_of_an_act_count_like_linear_layers() -> None
     assert counted.saved == read_and_written
 
 
-def sequence_config(**fields: Any) -> Any:
+def sequence_config(*, image_px: int = 32, **fields: Any) -> Any:
     sizes: dict[str, Any] = {"window_steps": 7, "encoder": "keypoints", "core": "gru", "tokens_per_step": 1}
-    images = {name: SimpleNamespace(shape=(3, 32, 32)) for name in ("base", "wrist")}
+    images = {name: SimpleNamespace(shape=(3, image_px, image_px)) for name in ("base", "wrist")}
     return SimpleNamespace(
         type="mikasa_sequence", image_features=images, context_steps=5, **{**sizes, **fields}
     )
@@ -112,25 +112,22 @@ def test_the_cells_and_the_two_encoders_of_a_plain_network_count_for_each_of_its
     assert counted.saved == 7 * (8 * 8 * (3 * 16 + 8) + (24 + 6) + 2 * (6 + 18))
 
 
-def test_each_convolution_of_the_plain_encoder_has_the_places_of_its_own_output() -> None:
+@pytest.mark.parametrize(("kind", "n_steps"), [("mikasa_sequence", 7), ("mikasa_offline_rl", 1)])
+def test_each_convolution_of_the_plain_encoder_has_the_places_of_its_own_output(
+    kind: str, n_steps: int
+) -> None:
     convolutions = [nn.Conv2d(3, 8, 8, stride=4), nn.ReLU(), nn.Conv2d(8, 8, 4, stride=2), nn.ReLU()]
     encoder = nn.Sequential(*convolutions, nn.Conv2d(8, 8, 3), nn.ReLU(), nn.Flatten(), nn.Linear(8, 6))
-    shapes = []
-    images = torch.zeros(1, 3, 36, 36)
+    places, images = [], torch.zeros(1, 3, 36, 36)
     for layer in encoder[:6]:
         images = layer(images)
-        shapes.append(images[0, 0].numel())
-    made = {
-        "sequence": nn.ModuleDict({"encoders": nn.ModuleList([encoder])}),
-        "rl": nn.ModuleDict({"encoder": encoder}),
-    }
-    places = (3 * 8 * 64 * shapes[0], 8 * 8 * 16 * shapes[2], 8 * 8 * 9 * shapes[4])
-    for network, n_steps in ((made["sequence"], 7), (made["rl"], 1)):
-        config = sequence_config(encoder="nature") if n_steps == 7 else sequence_config()
-        config.type = "mikasa_sequence" if n_steps == 7 else "mikasa_offline_rl"
-        config.image_features["base"].shape = (3, 36, 36)
-        counted = count(nn.ModuleDict({"network": network}), config)
-        assert counted.forward == 2 * n_steps * (sum(places) + 8 * 6)
+        places.append(images[0, 0].numel())
+    part = {"encoder": encoder} if n_steps == 1 else {"encoders": nn.ModuleList([encoder])}
+    config = sequence_config(encoder="nature", image_px=36)
+    config.type = kind
+    counted = count(nn.ModuleDict({"network": nn.ModuleDict(part)}), config)
+    convolved = 3 * 8 * 64 * places[0] + 8 * 8 * 16 * places[2] + 8 * 8 * 9 * places[4]
+    assert counted.forward == 2 * n_steps * (convolved + 8 * 6)
 
 
 def test_decision_transformer_reads_its_window_at_every_step_and_others_read_a_step_once() -> None:

@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple  # Any: lerobot is untyped
 
+from vla_eval.policies.sequence.sizes import nature_edges
+
 PATCHES = 256  # of an image of 224 px in patches of 14
 SMOLVLM_PATCHES, SMOLVLM_TOKENS = 1024, 64  # of an image of 512 px in patches of 16, and joined 4 × 4
 DINO_EXTRA = 5  # class token and registers
@@ -182,11 +184,9 @@ def _encoder_stages(config: Any, n_images: int, *, nature: bool) -> tuple[Stage,
     if not nature:
         places = Stage(encoder + r"features\.", n_images * (n_px // 4) ** 2, VISION)
         return (places, Stage(encoder + "reads", n_images, VISION))
-    first = (n_px - 8) // 4 + 1
-    second = (first - 4) // 2 + 1
-    edges = ((0, first), (2, second), (4, second - 2))
+    edges = enumerate(nature_edges(n_px))  # a layer of rectified units follows each convolution
     return (
-        *(Stage(encoder + rf"{index}\b", n_images * edge**2, VISION) for index, edge in edges),
+        *(Stage(encoder + rf"{2 * index}\b", n_images * edge**2, VISION) for index, edge in edges),
         Stage(encoder + r"7\b", n_images, VISION),
     )
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_eval.policies.episode_samples import in_numbers
-from vla_eval.policies.sequence.sizes import ENCODERS
+from vla_eval.policies.sequence.sizes import ENCODERS, NATURE_LAYERS, nature_edges
 from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3
@@ -26,15 +26,13 @@ class Nature(nn.Sequential):
     """
 
     def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
-        edge = image_px
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):
-            edge = (edge - kernel) // stride + 1
+        (first, second, third), edge = NATURE_LAYERS, nature_edges(image_px)[-1]
         super().__init__(
-            nn.Conv2d(channels, 32, 8, stride=4),
+            nn.Conv2d(channels, 32, *first),
             nn.ReLU(),
-            nn.Conv2d(32, 64, 4, stride=2),
+            nn.Conv2d(32, 64, *second),
             nn.ReLU(),
-            nn.Conv2d(64, 64, 3),
+            nn.Conv2d(64, 64, *third),
             nn.ReLU(),
             nn.Flatten(),
             nn.Linear(64 * edge**2, outputs),

@@ -179,6 +179,19 @@ ENCODERS = {
     "nature": EncoderRow(),
     "nature_stacked": EncoderRow(shared=True),
 }
+NATURE_LAYERS = ((8, 4), (4, 2), (3, 1))
+"""Kernel and stride of the convolutions of `nature`, in pixels: Mnih et al. 2015."""
+
+
+def nature_edges(image_px: int) -> tuple[int, ...]:
+    """Return the edges of what these convolutions make of an image, in places."""
+    edges, edge = [], image_px
+    for kernel, stride in NATURE_LAYERS:
+        edge = (edge - kernel) // stride + 1
+        edges.append(edge)
+    return tuple(edges)
+
+
 TOKENS = {"step": 1, "return_observation": 2, "return_observation_action": 3}
 """How many a step has: the observation; with the return to go before it; with the action after it, too."""
 HEADS = ("gated", "linear")
