@@ -106,3 +106,13 @@ def test_where_nothing_was_done_nothing_is_told(capsys: pytest.CaptureFixture[st
     bar.begin(n_done=2, n_total=2)
     bar.close()
     assert capsys.readouterr().err == ""
+
+
+def test_steps_of_an_episode_are_counted_once_when_it_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    bar = EpisodeBar(clock=Clock())
+    bar.begin(n_done=0, n_total=2)
+    bar.load("", n_steps=60 + 42)  # two episodes under way
+    bar.load("", n_steps=42)  # the workers are asked again before a record is handed out
+    bar.advance(n_done=1, n_steps=60)
+    bar.close()
+    assert "1/2 episodes (102 control steps)" in capsys.readouterr().err

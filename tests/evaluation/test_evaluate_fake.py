@@ -137,9 +137,8 @@ def test_an_observer_is_given_the_steps_of_an_episode_while_it_runs(
 def test_when_a_record_comes_its_steps_are_no_longer_among_those_under_way(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        evaluate_module, "LOAD_SECONDS", 0.4
-    )  # some of a second are between the last and the end
+    # The last time before the episode's end is well before it.
+    monkeypatch.setattr(evaluate_module, "LOAD_SECONDS", 0.4)
     bench.write_policy(pause=0.25)
     under_way: list[int | None] = []
     when_recorded: list[int | None] = []
