@@ -23,6 +23,10 @@ from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.sample_cost import SAVED_PER_LINEAR_OF, count
 
 FEW, MORE = 1, 3  # samples
+SEQUENCE_RECIPES = (
+    *("recurrent", "context", "bc_mlp"),
+    *("decision_transformer", "rate", "gtrxl", "decision_mamba", "elmur"),
+)
 VARIANTS: tuple[tuple[str, Mapping[str, Any]], ...] = (
     ("act", {}),
     ("act", {"chunk_size": 64, "dim_model": 256}),
@@ -31,11 +35,7 @@ VARIANTS: tuple[tuple[str, Mapping[str, Any]], ...] = (
     ("diffusion_small", {}),
     ("memory", {"window_steps": 60}),
     ("memory", {"window_steps": 90, "patch_px": 16}),
-    *(
-        (name, {"window_steps": 60})
-        for name in ("recurrent", "context", "bc_mlp", "decision_transformer", "rate")
-    ),
-    *((name, {"window_steps": 60}) for name in ("gtrxl", "decision_mamba", "elmur")),
+    *((name, {"window_steps": 60}) for name in SEQUENCE_RECIPES),
     ("recurrent", {"window_steps": 90, "encoder": "nature"}),
     *((name, {}) for name in ("cql", "cql_published", "iql")),
 )

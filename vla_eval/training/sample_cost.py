@@ -22,8 +22,12 @@ one layer of true width: SigLIP-so400m 0.89, Llama-2-7B 1.20, Gemma-300M 1.32, G
 its capped eager attention: 1.91, of which the scores grow with the number of tokens.
 """
 SAVED_PER_LINEAR_OF = {
-    **{"mikasa_spatialvla": 1.9, "act": 1.04, "diffusion": 1.19},
-    **{"mikasa_memory": 1.91, "mikasa_sequence": 1.3, "mikasa_offline_rl": 1.4},
+    "mikasa_spatialvla": 1.9,
+    "act": 1.04,
+    "diffusion": 1.19,
+    "mikasa_memory": 1.91,
+    "mikasa_sequence": 1.3,
+    "mikasa_offline_rl": 1.4,
 }
 """Where it is another number. For all but the first, whole networks were measured in float32, at the sizes of
 their recipes, by `scripts/activation_constants.py`; convolutions and attention count like linear layers.
