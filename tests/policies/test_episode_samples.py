@@ -172,6 +172,17 @@ def test_the_frame_of_a_decision_is_shown_up_to_so_many_times_again() -> None:
     assert once.tolist() == [list(range(N_STEPS))] * N_EPISODES
 
 
+def test_a_decision_counts_as_much_however_often_it_is_shown() -> None:
+    given = waits_then_moves()
+    once = episodes_of(given, config(), training=False).counts
+    for _ in range(4):
+        episodes = episodes_of(given, config(late_steps=3), training=True)
+        for steps, counts, expected in zip(episodes.steps, episodes.counts, once, strict=True):
+            is_there = counts[:, 0] > 0
+            for step in range(N_STEPS):
+                assert torch.allclose(counts[is_there & (steps == step)].sum(dim=0), expected[step])
+
+
 def test_a_late_decision_may_be_where_an_episode_ends() -> None:
     episodes = episodes_of(waits_then_moves(), config(late_steps=3, decision_share=1.0), training=True)
     for steps, counts in zip(episodes.steps, episodes.counts, strict=True):

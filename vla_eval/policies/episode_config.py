@@ -47,7 +47,8 @@ class EpisodeConfig(PortedConfig):
             the one before the decision: to continue waiting. A chunk executed across the decision then keeps
             the arm where it is until the policy is asked again.
         late_steps: the frame of a decision is shown up to so many times again in training, at random: a
-            policy that is not asked at every step sees it several times before it may decide.
+            policy that is not asked at every step sees it several times before it may decide. All of them
+            together count as much as one.
         goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.

@@ -77,13 +77,13 @@ def episodes_of(
     counts = (
         counts * _shares(config, actions) * (1 + config.change_weight * change)[..., None] * kept[..., None]
     )
-    steps, is_there = _shown(kept, begins, config.late_steps if training else 0)
+    steps, share = _shown(kept, begins, config.late_steps if training else 0)
     rows = torch.arange(len(steps), device=steps.device)[:, None]
 
     def taken(values: Tensor) -> Tensor:
         return values[rows, steps]
 
-    counts = taken(counts) * is_there[..., None]
+    counts = taken(counts) * share[..., None]
     images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
     return Episodes(
         images=_augmented(images, config) if training else images,
@@ -97,7 +97,10 @@ def episodes_of(
 
 
 def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
-    """Return (B, T) the steps that are shown, in order, and which are no padding.
+    """Return (B, T) the steps that are shown, in order, and how much each of them counts; padding nothing.
+
+    A decision that is shown several times counts as much as one that is shown once: else the motion behind
+    it, of which there is one frame each, would be learned less.
 
     Args:
         kept: (B, steps) those that are trained on.
@@ -112,7 +115,7 @@ def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tenso
     places = torch.arange(int(n_shown.max()), device=times.device).expand(len(times), -1)
     # Padding is the last step again, which does not count.
     steps = torch.searchsorted(ends, places.minimum(n_shown - 1).contiguous(), right=True)
-    return steps, places < n_shown
+    return steps, (places < n_shown) / times.gather(1, steps)
 
 
 def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
