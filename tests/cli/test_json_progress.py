@@ -11,7 +11,8 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.json_progress import EvaluationLines, JsonLines, PhaseLines
 from vla_eval.cli.main import main
 from vla_eval.config.environment import EnvSettings
-from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, GroupKey, Plan
+from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
+from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.rollout import RolloutSettings
 from vla_eval.workers.load import Load, MachineLoad

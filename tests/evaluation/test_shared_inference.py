@@ -17,8 +17,9 @@ from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
 from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.evaluation.fingerprint import results_config
 from vla_eval.evaluation.inference_choice import chosen_inference
-from vla_eval.evaluation.plan import Plan, make_plan, results_config
+from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.records import EpisodeRecord
 from vla_eval.workers import local
 from vla_eval.workers.load import Load

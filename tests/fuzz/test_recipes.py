@@ -18,8 +18,9 @@ from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe
 from vla_eval.data.recording_plan import plan_recording
+from vla_eval.evaluation.fingerprint import fingerprint
 from vla_eval.evaluation.grid import ModelTable, finetunings, is_model_table
-from vla_eval.evaluation.plan import fingerprint, make_plan
+from vla_eval.evaluation.plan import make_plan
 
 TASK = "RememberColor3-v0"
 FEW_EPISODES = 1000  # a longer plan takes seconds and is no other

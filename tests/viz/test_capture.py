@@ -21,7 +21,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, VlaEvalError
 from vla_eval.evaluation.evaluate import evaluate
-from vla_eval.evaluation.plan import fingerprint
+from vla_eval.evaluation.fingerprint import fingerprint
 from vla_eval.page.filmstrip import write_filmstrips
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout

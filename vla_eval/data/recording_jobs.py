@@ -13,7 +13,7 @@ from vla_eval.config.files import content_of
 from vla_eval.core import EpisodeStart
 from vla_eval.data.demonstrations import SLOT, Attempt
 from vla_eval.data.manifest import DatasetFacts, FailedSeed
-from vla_eval.evaluation.plan import EpisodeGroup
+from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.storage.run_file import JsonValue
 
 

@@ -9,7 +9,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import load_prompts, sentences_of
 from vla_eval.data.demonstrations import ONE_BY_ONE
 from vla_eval.data.recording_jobs import TaskPlan
-from vla_eval.evaluation.plan import EpisodeGroup, GroupKey
+from vla_eval.evaluation.episode_jobs import EpisodeGroup, GroupKey
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import default_run_folder, worker_count
 from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import JobQueue
-from vla_eval.evaluation.plan import EpisodeJob, Plan
+from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.rendered import images_read, n_rendered
 from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies.checkpoint import find_checkpoint, weights_file

@@ -17,16 +17,12 @@ from typing import Literal, Protocol, Self
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
 from vla_eval.errors import TooManyErrorsError
+from vla_eval.evaluation.episode_jobs import EpisodeJob, SetupKey
+from vla_eval.evaluation.fingerprint import fingerprint, results_config
 from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.phases import ReadyPhase, phases, with_servers
-from vla_eval.evaluation.plan import (
-    EpisodeJob,
-    Plan,
-    SetupKey,
-    fingerprint,
-    results_config,
-)
+from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.evaluation.worker import Finished, worker_main
 from vla_eval.policies.registry import own_modules

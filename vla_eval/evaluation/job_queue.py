@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass
 
-from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob, SetupKey
+from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, SetupKey
 from vla_eval.records import EpisodeKey
 
 

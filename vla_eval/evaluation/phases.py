@@ -12,7 +12,8 @@ from pathlib import Path
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
 from vla_eval.errors import RemoteConnectionError, RemoteReplyError, RemoteTimeoutError, RunChangedError
-from vla_eval.evaluation.plan import EpisodeJob, Plan
+from vla_eval.evaluation.episode_jobs import EpisodeJob
+from vla_eval.evaluation.plan import Plan
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError

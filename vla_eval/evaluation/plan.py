@@ -10,24 +10,20 @@ from itertools import product
 from typing import Any, NamedTuple
 
 from vla_eval.bounds import MAX_EPISODES
-from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
-from vla_eval.config.files import Recipe, content_of, digest_of
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.cue_view import CueViewSettings
 from vla_eval.errors import RecipeError
+from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.inference_choice import (
-    INFERENCE_FIELDS,
     chosen_inference,
     has_weights,
-    inference_fields,
 )
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes, training_seeds
-from vla_eval.policies.recipe import bare_policy
 from vla_eval.policies.registry import check_adapter
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
-from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.shard import Shard
@@ -36,78 +32,6 @@ from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec
 from vla_eval.wire.metadata import ServerMetadata
-
-
-class GroupKey(NamedTuple):
-    """The row of a table that episodes belong to."""
-
-    task: str
-    policy: str
-    n_action_steps: int
-
-
-class SetupKey(NamedTuple):
-    """The key of episodes that one environment object and one policy object can run."""
-
-    group: GroupKey
-    checkpoint: int | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EpisodeGroup:
-    """Episodes that differ only in run and seed.
-
-    Attributes:
-        key: its identity in the plan.
-        adapter: registry name of the policy's code.
-        args: the adapter's keyword arguments.
-        env: the environment, before it is known which cameras the policy needs.
-        rollout: how the episodes are run.
-        instruction: the language instruction.
-        n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
-            policy is in it, else what its server says.
-        checkpoint: of a policy of several checkpoints, which one; it has the run of that number alone.
-        part: the policy's name in recipes and among shared policies; with several checkpoints, that of one.
-    """
-
-    key: GroupKey
-    adapter: str
-    args: Mapping[str, Any]  # Any: whatever the adapter takes
-    env: EnvSettings
-    rollout: RolloutSettings
-    instruction: str
-    n_rows: int = 1
-    checkpoint: int | None = None
-    part: str = ""
-
-    @property
-    def setup_key(self) -> SetupKey:
-        """Episodes with the same one can be run with the same environment and policy."""
-        return SetupKey(self.key, self.checkpoint)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EpisodeJob:
-    """One episode to run.
-
-    Attributes:
-        group: what it shares with others.
-        run, seed: which of them it is.
-        slot: where in a worker it runs.
-        row: where in a forward pass it is computed, see `EpisodeStart.row`. Slot and row are fixed by the
-            seed, so that no result depends on workers or order.
-    """
-
-    group: EpisodeGroup
-    run: int
-    seed: int
-    slot: int = 0
-    row: int = 0
-
-    @property
-    def key(self) -> EpisodeKey:
-        """The identity of the episode within its run folder."""
-        return EpisodeKey(*self.group.key, self.run, self.seed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -304,31 +228,6 @@ def _recipe_hashes(
         if server.weights_sha256 is not None:
             hashes[f"checkpoints/{name}"] = server.weights_sha256
     return hashes
-
-
-def results_config(config: EvalConfig) -> dict[str, Any]:  # Any: plain data
-    """Return the part of a configuration that results depend on; compared when a run is resumed."""
-    data = content_of(config, options=OPTION_FIELDS)
-    # So that runs of versions without these fields can be resumed.
-    if config.slots_per_worker == 1:
-        del data["slots_per_worker"]
-    data = {name: value for name, value in data.items() if name not in INFERENCE_FIELDS}
-    data |= inference_fields(config)
-    data["policies"] = [bare_policy(name) for name in data["policies"]]
-    if config.reset_policy_at_step is None:
-        del data["reset_policy_at_step"]
-    if config.chunking.first_inference_step == 0:
-        del data["chunking"]["first_inference_step"]
-    if config.cue_view == "as_shown":
-        del data["cue_view"]
-    if config.appearance == AS_DESIGNED:
-        del data["appearance"]
-    return data
-
-
-def fingerprint(config: EvalConfig) -> str:
-    """Return the sha256 of the part of a configuration that results depend on."""
-    return digest_of(results_config(config))
 
 
 def _refuse_instruction(config: EvalConfig) -> None:

@@ -7,7 +7,7 @@ from typing import Any, Literal  # Any: what a recipe holds
 
 from vla_eval.config.capture import may_be_wanted
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.evaluation.plan import EpisodeJob
+from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.checkpoint_notes import LEROBOT_CHECKPOINTS
 from vla_eval.policies.registry import SCRIPTED

@@ -24,8 +24,8 @@ from vla_eval.errors import (
     RemoteTimeoutError,
     VlaEvalError,
 )
+from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
-from vla_eval.evaluation.plan import EpisodeGroup, EpisodeJob
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.records import EpisodeRecord, EpisodeTiming

@@ -4,21 +4,17 @@ Images drift like those of a moving camera, so the codec has realistic work. All
 was simulated and there is no manifest, so it is not a complete dataset.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.configs import RGBEncoderConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.core import ImageArray
-from vla_eval.data.opening import video_decoder
+from vla_eval.data.shard_writer import new_dataset
 from vla_eval.features import (
     CAMERA_KEYS,
     DONE_KEY,
-    FPS,
     IMAGE_SHAPE,
     REWARD_KEY,
     SUCCESS_KEY,
@@ -50,16 +46,7 @@ def write_synthetic_dataset(
         instructions: they alternate.
     """
     features = dataset_features(state)
-    dataset = LeRobotDataset.create(
-        f"local/{root.name}",
-        fps=FPS,
-        features=features,
-        root=root,
-        streaming_encoding=True,
-        encoder_queue_maxsize=n_frames + 3,  # lerobot drops frames if its queue is full
-        rgb_encoder=RGBEncoderConfig(**dataclasses.asdict(EncoderSettings())),
-        video_backend=video_decoder(),
-    )
+    dataset = new_dataset(root, features, encoder=EncoderSettings(), max_frames=n_frames + 2)
     for episode in range(n_episodes):
         rng = np.random.default_rng([seed, episode])
         length = n_frames + episode % 3

@@ -1,0 +1,81 @@
+"""What one episode of a plan is: the row of a table that it belongs to, and what a worker needs to run it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from vla_eval.config.environment import EnvSettings
+from vla_eval.records import EpisodeKey
+from vla_eval.rollout import RolloutSettings
+
+
+class GroupKey(NamedTuple):
+    """The row of a table that episodes belong to."""
+
+    task: str
+    policy: str
+    n_action_steps: int
+
+
+class SetupKey(NamedTuple):
+    """The key of episodes that one environment object and one policy object can run."""
+
+    group: GroupKey
+    checkpoint: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeGroup:
+    """Episodes that differ only in run and seed.
+
+    Attributes:
+        key: its identity in the plan.
+        adapter: registry name of the policy's code.
+        args: the adapter's keyword arguments.
+        env: the environment, before it is known which cameras the policy needs.
+        rollout: how the episodes are run.
+        instruction: the language instruction.
+        n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
+            policy is in it, else what its server says.
+        checkpoint: of a policy of several checkpoints, which one; it has the run of that number alone.
+        part: the policy's name in recipes and among shared policies; with several checkpoints, that of one.
+    """
+
+    key: GroupKey
+    adapter: str
+    args: Mapping[str, Any]  # Any: whatever the adapter takes
+    env: EnvSettings
+    rollout: RolloutSettings
+    instruction: str
+    n_rows: int = 1
+    checkpoint: int | None = None
+    part: str = ""
+
+    @property
+    def setup_key(self) -> SetupKey:
+        """Episodes with the same one can be run with the same environment and policy."""
+        return SetupKey(self.key, self.checkpoint)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeJob:
+    """One episode to run.
+
+    Attributes:
+        group: what it shares with others.
+        run, seed: which of them it is.
+        slot: where in a worker it runs.
+        row: where in a forward pass it is computed, see `EpisodeStart.row`. Slot and row are fixed by the
+            seed, so that no result depends on workers or order.
+    """
+
+    group: EpisodeGroup
+    run: int
+    seed: int
+    slot: int = 0
+    row: int = 0
+
+    @property
+    def key(self) -> EpisodeKey:
+        """The identity of the episode within its run folder."""
+        return EpisodeKey(*self.group.key, self.run, self.seed)
