@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.policies.episode_samples import episodes_of, in_numbers
+from vla_eval.policies.episode_samples import Episodes, episodes_of, in_numbers
 from vla_eval.policies.sequence.configuration_sequence import MikasaSequenceConfig
 
 CAMERAS = ("observation.images.base", "observation.images.wrist")
@@ -61,6 +61,11 @@ def waits_then_moves() -> dict[str, Tensor]:
     return given
 
 
+def shown_images(episodes: Episodes) -> Tensor:
+    """Return (B, T, cameras, 3, H, W), what each step shows."""
+    return episodes.images[episodes.frames]
+
+
 def found_shift(seen: Tensor, moved: Tensor) -> tuple[int, int]:
     """Return the one shift (down, right) that makes `moved` (3, H, W) of `seen`, pixel by pixel."""
     fits = []
@@ -76,7 +81,7 @@ def found_shift(seen: Tensor, moved: Tensor) -> tuple[int, int]:
 
 def test_the_images_of_an_episode_are_moved_together_and_those_of_each_camera_by_their_own_amount() -> None:
     given = batch()
-    images = episodes_of(given, config(shift_px=MOST_PX), training=True).images
+    images = shown_images(episodes_of(given, config(shift_px=MOST_PX), training=True))
 
     shifts = [
         [
@@ -98,8 +103,8 @@ def test_the_images_of_an_episode_are_moved_together_and_those_of_each_camera_by
 def test_images_are_not_moved_at_zero_pixels_nor_outside_training() -> None:
     given = batch()
     shown = torch.stack([given[key][:, :N_STEPS] for key in CAMERAS], dim=2)
-    assert torch.equal(episodes_of(given, config(), training=True).images, shown)
-    assert torch.equal(episodes_of(given, config(shift_px=MOST_PX), training=False).images, shown)
+    assert torch.equal(shown_images(episodes_of(given, config(), training=True)), shown)
+    assert torch.equal(shown_images(episodes_of(given, config(shift_px=MOST_PX), training=False)), shown)
 
 
 def test_a_negative_shift_is_refused() -> None:
@@ -161,7 +166,9 @@ def test_the_frame_of_a_decision_is_shown_up_to_so_many_times_again() -> None:
     given, n_late = waits_then_moves(), set()
     for _ in range(8):
         episodes = episodes_of(given, config(late_steps=3), training=True)
-        for steps, counts, images in zip(episodes.steps, episodes.counts, episodes.images, strict=True):
+        assert len(episodes.images) == N_EPISODES * N_STEPS  # each frame is encoded once
+        images_of_all = shown_images(episodes)
+        for steps, counts, images in zip(episodes.steps, episodes.counts, images_of_all, strict=True):
             shown = steps[counts[:, 0] > 0].tolist()
             assert shown == sorted(shown) and set(shown) == set(range(N_STEPS))
             n_late.add(shown.count(3) - 1)

@@ -18,7 +18,9 @@ class Episodes(NamedTuple):
     """A batch of B episodes of T steps, from their beginning; padding comes last.
 
     Attributes:
-        images: (B, T, cameras, 3, H, W), as they were handed over: see `in_numbers`.
+        images: (N, cameras, 3, H, W), as they were handed over (see `in_numbers`): those of `first`, one
+            episode after the other. Most of (B, T) is padding, and images are nearly all of the work.
+        first: (B, T) where a frame is shown for the first time; False for padding.
         state: (B, T, state).
         actions: (B, T, chunk, action).
         counts: (B, T, chunk) float, 0 for what is beyond the episode.
@@ -28,12 +30,18 @@ class Episodes(NamedTuple):
     """
 
     images: Tensor
+    first: Tensor
     state: Tensor
     actions: Tensor
     counts: Tensor
     goal_counts: Tensor
     goal_m: Tensor
     steps: Tensor
+
+    @property
+    def frames(self) -> Tensor:
+        """(B, T) which of `images` each step shows; padding shows the last one of its episode."""
+        return self.first.flatten().cumsum(dim=0).sub(1).reshape(self.first.shape)
 
 
 def in_numbers(images: Tensor) -> Tensor:
@@ -84,9 +92,12 @@ def episodes_of(
         return values[rows, steps]
 
     counts = taken(counts) * share[..., None]
-    images = taken(stacked_images({key: batch[key][:, :n_steps] for key in config.image_features}, config))
+    first = _first(steps, share > 0)
+    episodes = rows.expand_as(steps)[first]
+    images = torch.stack([batch[key][episodes, steps[first]] for key in config.image_features], dim=1)
     return Episodes(
-        images=_augmented(images, config) if training else images,
+        images=_augmented(images, episodes, config, n_episodes=len(steps)) if training else images,
+        first=first,
         state=taken(batch[STATE_KEY][:, :n_steps]),
         actions=taken(actions),
         counts=counts,
@@ -94,6 +105,13 @@ def episodes_of(
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=steps,
     )
+
+
+def _first(steps: Tensor, is_there: Tensor) -> Tensor:
+    """Return (B, T): whether a frame is shown there, not for padding, and for the first time."""
+    first = is_there.clone()
+    first[:, 1:] &= steps[:, 1:] != steps[:, :-1]
+    return first
 
 
 def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
@@ -146,9 +164,10 @@ def _shares(config: EpisodeConfig, actions: Tensor) -> Tensor:
     return shares
 
 
-def _augmented(images: Tensor, config: EpisodeConfig) -> Tensor:
-    mixed = _mixed(images) if config.mix_colors else images
-    return _moved(mixed, config.shift_px) if config.shift_px else mixed
+def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_episodes: int) -> Tensor:
+    """Return images (N, …) of these episodes (N,), changed alike in all frames of an episode."""
+    mixed = _mixed(images, episodes, n_episodes) if config.mix_colors else images
+    return _moved(mixed, episodes, n_episodes, config.shift_px) if config.shift_px else mixed
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
@@ -211,20 +230,22 @@ def _until_a_decision(begins: Tensor, share: float) -> Tensor:
     return ~ends[:, None] | (steps <= last[:, None])
 
 
-def _mixed(images: Tensor) -> Tensor:
-    """Let the three colours of each episode (B, …, 3, H, W) change places; an order of its own for each."""
-    orders = torch.rand(len(images), 3, device=images.device).argsort(dim=1)
-    return images.take_along_dim(orders.reshape(-1, 1, 1, 3, 1, 1), dim=-3)
+def _mixed(images: Tensor, episodes: Tensor, n_episodes: int) -> Tensor:
+    """Let the three colours of each episode change places; an order of its own for each."""
+    orders = torch.rand(n_episodes, 3, device=images.device).argsort(dim=1)[episodes]
+    return images.take_along_dim(orders[:, None, :, None, None], dim=-3)
 
 
-def _moved(images: Tensor, most_px: int) -> Tensor:
-    """Move what each camera saw of each episode (B, T, cameras, 3, H, W); the edges are repeated."""
+def _moved(images: Tensor, episodes: Tensor, n_episodes: int, most_px: int) -> Tensor:
+    """Move what each camera saw of each episode; the edges are repeated."""
     moved = torch.empty_like(images)
-    by = torch.randint(-most_px, most_px + 1, (len(images), images.shape[2], 2)).tolist()
-    for episode, cameras in enumerate(by):
+    by = torch.randint(-most_px, most_px + 1, (n_episodes, images.shape[1], 2)).tolist()
+    lengths = episodes.bincount(minlength=n_episodes).tolist()
+    for seen, place, cameras in zip(
+        torch.split(images, lengths), torch.split(moved, lengths), by, strict=True
+    ):
         for camera, (down, right) in enumerate(cameras):
-            seen = images[episode, :, camera]
-            moved[episode, :, camera] = _moved_along(_moved_along(seen, down, dim=-2), right, dim=-1)
+            place[:, camera] = _moved_along(_moved_along(seen[:, camera], down, dim=-2), right, dim=-1)
     return moved
 
 

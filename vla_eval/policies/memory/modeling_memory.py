@@ -52,7 +52,8 @@ class MikasaMemoryPolicy(EpisodePolicy):
         same = SAME_JOINTS if config.joint_targets else SAME_ACTION
         episodes = episodes_of(scaled, config, training=self.training, same_action=same)
         said = said_at_each_step(self.network.sentence, batch, episodes.state.shape[1])
-        answer = self.network(in_numbers(episodes.images), episodes.state, said)
+        images = in_numbers(episodes.images)[episodes.frames]
+        answer = self.network(images, episodes.state, said)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
         real = (episodes.counts.sum(dim=-1) > 0).float()

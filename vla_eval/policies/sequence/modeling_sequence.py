@@ -193,12 +193,12 @@ class MikasaSequencePolicy(EpisodePolicy):
         """Return the loss of a batch of training samples, and its parts."""
         config, network = self.config, self.network
         episodes = episodes_of(batch, config, training=self.training)
-        real = episodes.counts[..., 0] > 0
-        # Images are most of the work: those of padding are not encoded.
-        said = said_at_each_step(network.sentence, batch, real.shape[1])
-        said = None if said is None else said[real][None]
-        encoded = network.tokens(episodes.images[real][None], episodes.state[real][None], said)[0]
-        tokens = encoded.new_zeros(*real.shape, encoded.shape[-1]).masked_scatter(real[..., None], encoded)
+        # Images are most of the work: each is encoded once, those of padding not at all.
+        first = episodes.first
+        said = said_at_each_step(network.sentence, batch, first.shape[1])
+        said = None if said is None else said[first][None]
+        encoded = network.tokens(episodes.images[None], episodes.state[first][None], said)[0]
+        tokens = encoded[episodes.frames]
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
         predicted = network.predict(tokens, answers)
         errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
