@@ -9,7 +9,7 @@ from torch import Tensor
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies.sequence.core import Core
 from vla_eval.policies.sequence.cores import make_core
-from vla_eval.policies.sequence.encoders import Cameras, Keypoints, Nature
+from vla_eval.policies.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature
 from vla_eval.policies.sequence.sizes import CORES
 
 WIDTH, N_STEPS = 8, 12
@@ -180,6 +180,22 @@ def test_the_encoder_of_the_baselines_has_their_size() -> None:
     assert Nature(image_px=128, outputs=64)[7].in_features == 9216
     cameras = Cameras("nature_stacked", n_cameras=2, image_px=128, outputs=64)
     assert (len(cameras), cameras[0][0].in_channels, cameras.outputs) == (1, 6, 64)
+
+
+@pytest.mark.parametrize("n_frames", [FRAMES_AT_ONCE - 1, FRAMES_AT_ONCE + 1, 2 * FRAMES_AT_ONCE])
+def test_images_that_are_encoded_in_parts_teach_what_each_of_them_teaches(n_frames: int) -> None:
+    cameras = Cameras("nature", n_cameras=2, image_px=64, outputs=5).double()
+    images = torch.rand(1, n_frames, 2, 3, 64, 64, dtype=torch.float64)
+    weights = torch.rand(n_frames, cameras.outputs, dtype=torch.float64)
+    (cameras(images)[0] * weights).sum().backward()
+    together = [parameter.grad.clone() for parameter in cameras.parameters() if parameter.grad is not None]
+    cameras.zero_grad()
+    for frame in range(n_frames):
+        seen = cameras(images[:, frame : frame + 1])[0]
+        assert seen.shape == (1, cameras.outputs)
+        (seen * weights[frame]).sum().backward()
+    for one_by_one, at_once in zip(cameras.parameters(), together, strict=True):
+        torch.testing.assert_close(one_by_one.grad, at_once)
 
 
 def test_stacked_images_are_the_channels_of_the_first_camera_and_then_of_the_second() -> None:

@@ -11,6 +11,7 @@ RGB = 3
 KEYPOINTS = 32
 NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
 LEAST_VARIANCE = 1e-5  # as torch's instance_norm
+FRAMES_AT_ONCE = 64  # on a CPU
 
 
 class Nature(nn.Sequential):
@@ -109,12 +110,24 @@ class Cameras(nn.ModuleList):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes."""
-        parts = images.flatten(0, 1).flatten(1, 2).chunk(len(self), dim=1)
+        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes.
+
+        On a CPU, 64 frames at a time. In training their number differs from step to step; maps of ever new
+        sizes would find no room where those of the last step were, and the process would grow and grow.
+        """
+        frames = images.flatten(0, 1)
+        at_once = FRAMES_AT_ONCE if images.device.type == "cpu" else len(frames)
+        seen = torch.cat([self._seen(part) for part in torch.split(frames, at_once)])
+        return seen.reshape(*images.shape[:2], self.outputs)
+
+    def _seen(self, frames: Tensor) -> Tensor:
+        """Return (N, `outputs`) of frames (N, cameras, 3, H, W)."""
+        parts = frames.flatten(1, 2).chunk(len(self), dim=1)
         # Convolutions on a CPU are a fifth faster in this order of the same numbers.
         ordered = (part.contiguous(memory_format=torch.channels_last) for part in parts)
-        seen = [encoder(_around_zero(part)) for encoder, part in zip(self, ordered, strict=True)]
-        return torch.cat(seen, dim=-1).reshape(*images.shape[:2], self.outputs)
+        return torch.cat(
+            [encoder(_around_zero(part)) for encoder, part in zip(self, ordered, strict=True)], dim=-1
+        )
 
 
 def _around_zero(images: Tensor) -> Tensor:
