@@ -11,6 +11,7 @@ from vla_eval.policies.sequence.core import Core
 from vla_eval.policies.sequence.cores import make_core
 from vla_eval.policies.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature
 from vla_eval.policies.sequence.sizes import CORES
+from vla_eval.policies.sequence.spatial_softmax import LEAST_VARIANCE, spatial_softmax
 
 WIDTH, N_STEPS = 8, 12
 SMALL_OPTIONS: dict[str, dict[str, Any]] = {
@@ -180,6 +181,27 @@ def test_the_encoder_of_the_baselines_has_their_size() -> None:
     assert Nature(image_px=128, outputs=64)[7].in_features == 9216
     cameras = Cameras("nature_stacked", n_cameras=2, image_px=128, outputs=64)
     assert (len(cameras), cameras[0][0].in_channels, cameras.outputs) == (1, 6, 64)
+
+
+def test_a_spatial_softmax_has_the_values_and_gradients_of_its_formula() -> None:
+    def formula(maps: Tensor, sharpness: Tensor, places: Tensor) -> Tensor:
+        normalised = torch.nn.functional.instance_norm(maps, eps=LEAST_VARIANCE)
+        shares = (normalised * sharpness[:, None]).softmax(dim=-1)
+        strong = (shares * maps).sum(dim=-1, keepdim=True)
+        return torch.cat([shares @ places, strong], dim=-1)
+
+    draws = torch.Generator().manual_seed(4)
+    maps = torch.randn(3, 4, 9, generator=draws, dtype=torch.float64) + 2
+    sharpness = torch.rand(4, generator=draws, dtype=torch.float64) * 3
+    places = torch.randn(9, 2, generator=draws, dtype=torch.float64)
+    weights = torch.randn(3, 4, 3, generator=draws, dtype=torch.float64)
+    given = [part.requires_grad_() for part in (maps, sharpness)]
+    torch.testing.assert_close(spatial_softmax(*given, places), formula(*given, places))
+    found, expected = (
+        torch.autograd.grad((of(*given, places) * weights).sum(), given) for of in (spatial_softmax, formula)
+    )
+    torch.testing.assert_close(found, expected)
+    assert torch.autograd.gradcheck(lambda *inputs: spatial_softmax(*inputs, places), given)
 
 
 @pytest.mark.parametrize("n_frames", [FRAMES_AT_ONCE - 1, FRAMES_AT_ONCE + 1, 2 * FRAMES_AT_ONCE])

@@ -5,12 +5,12 @@ from torch import Tensor, nn
 
 from vla_eval.policies.episode_samples import in_numbers
 from vla_eval.policies.sequence.sizes import ENCODERS, NATURE_LAYERS, nature_edges
+from vla_eval.policies.sequence.spatial_softmax import spatial_softmax
 from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3
 KEYPOINTS = 32
 NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
-LEAST_VARIANCE = 1e-5  # as torch's instance_norm
 FRAMES_AT_ONCE = 64  # on a CPU
 
 
@@ -78,15 +78,10 @@ class Keypoints(nn.Module):
     @in_float32
     def reads_out(self, features: Tensor) -> Tensor:
         """Return (N, outputs) of maps (N, maps, H, W); half precision would round places to a pixel."""
-        maps = features.flatten(2)
-        # Normalised per image, as by torch's instance_norm, in fewer passes over the maps.
-        around = maps - maps.mean(dim=-1, keepdim=True)
-        variance = torch.linalg.vector_norm(around, dim=-1).square() / maps.shape[-1]
-        scale = self.sharpness.exp() / (variance + LEAST_VARIANCE).sqrt()
-        shares = (around * scale[..., None]).softmax(dim=-1)
-        x, y = (shares @ self.places).unbind(dim=-1)
-        strong = (shares * maps).sum(dim=-1)
-        read: Tensor = self.reads(torch.cat([x, y, strong], dim=-1))
+        # In one piece: after convolutions in channels_last order, a map's numbers are far apart.
+        maps = features.flatten(2).contiguous()
+        found = spatial_softmax(maps, self.sharpness.exp(), self.places)
+        read: Tensor = self.reads(found.transpose(1, 2).flatten(1))  # all x, all y, all strengths
         return read
 
 
