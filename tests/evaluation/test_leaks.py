@@ -86,6 +86,18 @@ class Policy:
 def make(context):
     return Policy(context)
 """
+# A list is an object that a collection walks through, unless it is frozen.
+LOOKING_MODULE = LEAKING_MODULE.replace(
+    "exec(leak, globals())",
+    """
+    policy.mine = [policy]
+    def act(window):
+        import gc
+        if any(one is policy.mine for one in gc.get_objects()):
+            raise RuntimeError("each reset walks through what the policy is made of")
+        return Policy.act(policy, window)
+    policy.act = act""",
+).replace(", *, leak", "")
 VICTIMS = ["cue_blind", "random"]
 
 
@@ -127,3 +139,11 @@ def test_draws_from_the_global_generators_depend_on_the_episode_alone(bench: Ben
     assert len(set(lines)) == 8
     assert results(bench, "two", ["draws"]) == lines
     assert set(results(bench, "late", ["draws"])) <= set(lines)
+
+
+def test_a_collection_during_episodes_does_not_walk_through_the_policy(bench: Bench) -> None:
+    (bench.folder / "looking_policy.py").write_text(LOOKING_MODULE)
+    bench.run("out", policies=[write_recipe(bench.folder, "looks", "looking_policy:make")], episodes=2)
+
+    records = read_run(bench.folder / "out").records
+    assert [record.error for record in records] == [None, None]

@@ -7,6 +7,7 @@ native library or a GPU context may be left in a state that nothing within the p
 
 import dataclasses
 import functools
+import gc
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -149,7 +150,12 @@ class EpisodeRunner:
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
-            env = self._make_env(self._settings_for(group, policy, facts))
+            settings = self._settings_for(group, policy, facts)
+            self._close_other(settings)
+            if self._env is None:
+                # ManiSkill collects garbage at each reset, through all that the policy's libraries imported.
+                gc.freeze()
+            env = self._make_env(settings)
             self._policy = policy
             return env, policy
         return self._env, self._policy
@@ -175,11 +181,15 @@ class EpisodeRunner:
         status = env.reset({job.slot: job.seed}, render=False)[job.slot].status
         return EnvFacts(env.spec, status.n_candidates)
 
-    def _make_env(self, settings: EnvSettings) -> SimEnv:
-        if self._env is None or self._env_settings != settings:
-            if self._env is not None:
-                self._env.close()
+    def _close_other(self, settings: EnvSettings) -> None:
+        """Close the environment if it is not made with these settings."""
+        if self._env is not None and self._env_settings != settings:
+            self._env.close()
             self._env = self._env_settings = None
+
+    def _make_env(self, settings: EnvSettings) -> SimEnv:
+        self._close_other(settings)
+        if self._env is None:
             self._env = make_env(settings)
             self._env_settings = settings
             device = describe_device(self._env)
