@@ -1,6 +1,7 @@
 """Run evaluations as the command line asks: one, or several one after another, each in its own folder."""
 
 import argparse
+import itertools
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import NamedTuple
 from vla_eval.cli import progress
 from vla_eval.cli.arguments import typed_command
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import FolderInUseError
 from vla_eval.evaluation.evaluate import EvaluationSummary
 from vla_eval.policies.run_seeds import PolicyEntry
 from vla_eval.workers.backend import Backend
@@ -60,18 +62,29 @@ def evaluate_each(
 ) -> Evaluations:
     """Run or resume each evaluation; a signal stops the one that runs, and those after it.
 
+    One that another process is writing comes after all others, so that several processes share the work.
+
     Args:
         runs: run folder and configuration of each.
         args: of the command line: `--shard`, `--allow-environment-change` and `--json-progress`.
         backend: where the workers run.
 
     Raises:
+        FolderInUseError: another process is still writing when all others are finished.
         VlaEvalError: see `evaluate`.
     """
     n_errors = 0
+    put_off: list[tuple[Path, EvalConfig]] = []
     with progress.stop_on_signals() as stop:
-        for out, config in runs:
-            summary = evaluate_one(config, out, args, stop=stop, backend=backend)
+        for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
+            try:
+                summary = evaluate_one(config, out, args, stop=stop, backend=backend)
+            except FolderInUseError:
+                if (out, config) in put_off:
+                    raise
+                print(f"{out}: another process is writing into it; it comes last.", file=sys.stderr)
+                put_off.append((out, config))
+                continue
             n_errors += summary.n_errors
             if summary.was_stopped:
                 print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
