@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from safetensors.torch import load_file, save_file
 from tests.policies import small_checkpoints
 from tests.policies.small_checkpoints import FACTS, TASK, context_for, copied
 from vla_eval.cli.main import main
+from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.evaluation import evaluate as evaluate_module
+from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies import lerobot_loading
 from vla_eval.policies.checkpoint import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
@@ -27,6 +30,7 @@ from vla_eval.policies.lerobot_loading import (
     read_config,
 )
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.run_seeds import load_policy_entries
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
 from vla_eval.testing.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
@@ -241,6 +245,26 @@ class TestFolders:
         recipes = run.description.recipes
         assert recipes["policies/mine"] == recipes["checkpoints/mine"] == checkpoint_sha256(folder)
         assert recipes[f"datasets/{FACTS.dataset}"] == FACTS.dataset_sha256
+
+    def test_another_dataset_of_the_same_name_is_noted_too_and_a_run_may_grow_by_its_policy(
+        self, act: Path, tmp_path: Path
+    ) -> None:
+        digests = {"one": "a" * 64, "two": "b" * 64}
+        for name, digest in digests.items():
+            (tmp_path / name).mkdir()
+            copied(act, tmp_path / name)
+            write_facts(tmp_path / name, replace(FACTS, dataset_sha256=digest))
+
+        def noted(*names: str) -> Mapping[str, str]:
+            config = EvalConfig(
+                name="c", tasks=(TASK,), policies=tuple(str(tmp_path / name) for name in names)
+            )
+            return plan_shard(config, None, load_policy_entries(config.policies)).recipe_hashes
+
+        both = noted("one", "two")
+        assert both[f"datasets/{FACTS.dataset}"] == digests["one"]
+        assert both[f"datasets/{FACTS.dataset} of two"] == digests["two"]
+        assert noted("one").items() <= both.items()
 
     def test_a_folder_without_a_checkpoint_says_what_is_in_it(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -41,8 +41,8 @@ class Plan:
     Attributes:
         jobs: every episode, in a fixed order.
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
-            policies, and the datasets that these were trained on. Several checkpoints of one policy are
-            `policies/NAME/run-0` and so on.
+            policies, and the datasets that these were trained on (another dataset of the same name is
+            `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         servers: policy behind a socket -> what its server says of itself.
         training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
@@ -223,7 +223,11 @@ def _recipe_hashes(
         for index, recipe in enumerate(policy.recipes):
             part = policy.part(index)
             hashes[f"policies/{part}"] = recipe.sha256
-            hashes |= checkpoint_hashes(recipe.value.adapter, recipe.value.args, policy=part)
+            digests = checkpoint_hashes(recipe.value.adapter, recipe.value.args, policy=part)
+            for name, digest in digests.items():
+                # Two datasets may have one name. The first keeps it, so that a run grows by further policies.
+                is_other = hashes.get(name, digest) != digest
+                hashes[f"{name} of {part}" if is_other else name] = digest
     for name, server in servers.items():
         if server.weights_sha256 is not None:
             hashes[f"checkpoints/{name}"] = server.weights_sha256
