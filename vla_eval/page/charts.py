@@ -174,13 +174,11 @@ def curves_png(
         figure = _curves(series, x_title=x_title, x_ticks=x_ticks, x_labels=x_labels)
         figure.set(frameon=True, facecolor=PALETTE["paper"])
         (axes,) = figure.axes
-        named = [one for one in series if one.kind == "solid"]
-        handles = [
-            Line2D([], [], color=_color(one.color), linestyle=(0, _dashes(one.color)), label=one.name)
-            for one in named
-        ]
-        axes.legend(handles=handles, frameon=False, loc="lower left")
-        axes.set_title(_printable(title))
+        named = sorted(series, key=lambda one: one.kind != "solid")  # lines of reference last
+        handles = [Line2D([], [], **_line(one), label=one.name) for one in named]
+        # Beside the axes: with several series no corner is free.
+        axes.legend(handles=handles, frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
+        axes.set_title(_printable(title), pad=10)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=PNG_DPI, bbox_inches="tight", metadata={"Software": None})
         return file.getvalue()
@@ -190,7 +188,7 @@ def _curves(
     series: Sequence[Series], *, x_title: str, x_ticks: Sequence[float], x_labels: Sequence[str] | None
 ) -> Figure:
     figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
-    margin = (x_ticks[-1] - x_ticks[0] or 1) * 0.03
+    margin = (x_ticks[-1] - x_ticks[0] or 1) * (0.03 + len(series) * DODGE / 2)
     axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
     axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks] if x_labels is None else x_labels)
     axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
@@ -250,9 +248,8 @@ def _draw_series(axes: Axes, series: Series) -> None:
     if series.kind != "solid":
         _reference(axes, series.kind, xs, ys)
         return
-    style = (0, _dashes(series.color))
     draw = "steps-post" if series.is_step else "default"
-    axes.plot(xs, ys, color=_color(series.color), linestyle=style, drawstyle=draw, gid="curve")
+    axes.plot(xs, ys, **_line(series), drawstyle=draw, gid="curve")
     if series.is_step:
         return
     for point in series.points:
@@ -260,6 +257,13 @@ def _draw_series(axes: Axes, series: Series) -> None:
             ends = [point.low, point.high]
             axes.plot([point.x, point.x], ends, color=_color(series.color), gid="whisker")
         _marker(axes, series.color, point.x, point.y)
+
+
+def _line(series: Series) -> dict[str, Any]:  # Any: matplotlib's properties of a line
+    if series.kind == "solid":
+        return {"color": _color(series.color), "linestyle": (0, _dashes(series.color))}
+    color, dashes = REFERENCES[series.kind]
+    return {"color": color, "linestyle": (0, dashes)}
 
 
 def _reference(axes: Axes, name: str, xs: Sequence[float], ys: Sequence[float]) -> None:
@@ -278,6 +282,7 @@ def _marker(axes: Axes, color: int, x: float, y: float) -> None:
         markersize=size,
         markeredgecolor=PALETTE["paper"],
         markeredgewidth=1,
+        clip_on=False,  # a whole marker also at a rate of 0 or 1
         gid="marker",
     )
 
