@@ -127,7 +127,7 @@ def _forest(bars: Sequence[Bar], width_px: float, label_px: float) -> Figure:
     for y, bar in enumerate(bars):
         for name, rate in (("chance", bar.chance), ("ceiling", bar.ceiling)):
             if rate is not None:
-                _reference(axes, name, [rate, rate], [y - 0.4, y + 0.4])
+                axes.plot([rate, rate], [y - 0.4, y + 0.4], **_reference_line(name), gid=name)
         if bar.value is None:
             axes.text(0.015, y, "no result", va="center_baseline")
         else:
@@ -213,7 +213,7 @@ def _dodged(series: Sequence[Series], distance: float) -> list[Series]:
 def sign(color: int, *, is_line: bool) -> Markup:
     """Return the line or marker of a series, for a legend."""
     if is_line:
-        return _sign([0.04, 0.96], color=_color(color), linestyle=(0, _dashes(color)))
+        return _sign([0.04, 0.96], **_solid_line(color))
     shape, size = MARKERS[color % len(MARKERS)]
     style = {"marker": shape, "markersize": size, "markeredgewidth": 0, "linestyle": "none"}
     return _sign([0.5], color=_color(color), **style)
@@ -221,8 +221,7 @@ def sign(color: int, *, is_line: bool) -> Markup:
 
 def reference_sign(name: str) -> Markup:
     """Return the line of `chance` or of `ceiling`."""
-    color, dashes = REFERENCES[name]
-    return _sign([0.04, 0.96], color=color, linestyle=(0, dashes))
+    return _sign([0.04, 0.96], **_reference_line(name))
 
 
 def _sign(xs: Sequence[float], **style: Any) -> Markup:  # Any: matplotlib's properties of a line
@@ -246,7 +245,7 @@ def _plot(
 def _draw_series(axes: Axes, series: Series) -> None:
     xs, ys = [point.x for point in series.points], [point.y for point in series.points]
     if series.kind != "solid":
-        _reference(axes, series.kind, xs, ys)
+        axes.plot(xs, ys, **_line(series), gid=series.kind)
         return
     draw = "steps-post" if series.is_step else "default"
     axes.plot(xs, ys, **_line(series), drawstyle=draw, gid="curve")
@@ -260,15 +259,16 @@ def _draw_series(axes: Axes, series: Series) -> None:
 
 
 def _line(series: Series) -> dict[str, Any]:  # Any: matplotlib's properties of a line
-    if series.kind == "solid":
-        return {"color": _color(series.color), "linestyle": (0, _dashes(series.color))}
-    color, dashes = REFERENCES[series.kind]
-    return {"color": color, "linestyle": (0, dashes)}
+    return _solid_line(series.color) if series.kind == "solid" else _reference_line(series.kind)
 
 
-def _reference(axes: Axes, name: str, xs: Sequence[float], ys: Sequence[float]) -> None:
+def _solid_line(number: int) -> dict[str, Any]:
+    return {"color": _color(number), "linestyle": (0, _dashes(number))}
+
+
+def _reference_line(name: str) -> dict[str, Any]:
     color, dashes = REFERENCES[name]
-    axes.plot(xs, ys, color=color, linestyle=(0, dashes), gid=name)
+    return {"color": color, "linestyle": (0, dashes)}
 
 
 def _marker(axes: Axes, color: int, x: float, y: float) -> None:
