@@ -1,5 +1,7 @@
 """What a policy sees: the same pixels however and wherever the episode runs, and nothing in vain."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -248,3 +250,19 @@ def test_an_unknown_camera_or_argument_is_named_with_a_suggestion() -> None:
         make_env(EnvSettings(task="RememberColor3-v0", cameras=("handcamera",)))
     with pytest.raises(UnknownNameError, match="Did you mean 'delay_steps'"):
         make_env(EnvSettings(task="RememberColor3-v0", kwargs={"delay_step": 3}))
+
+
+WITHOUT_CAMERAS = """
+import os
+from vla_eval.config.environment import EnvSettings
+from vla_eval.envs.factory import make_env
+env = make_env(EnvSettings(task="RememberColor3-v0"))
+env.reset({0: 1}, render=False)
+os.environ["VK_DRIVER_FILES"] = "/nowhere"  # an instance made from here on would find no driver
+env.reset({0: 2}, render=False)
+"""
+
+
+def test_resets_without_cameras_make_no_new_vulkan_instance() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_CAMERAS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -21,6 +21,7 @@ from vla_eval.envs.cue_location import boxes_of_cue
 from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
+    keep_vulkan_open,
     render_backend,
     take_human_image,
     take_images,
@@ -196,7 +197,9 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
             f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
             f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
         )
-    if backend != "none":
+    if backend == "none":
+        keep_vulkan_open()
+    else:
         use_lean_shaders()
     try:
         return with_appearance(cls, settings.appearance)(

@@ -23,6 +23,7 @@ from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
+    keep_vulkan_open,
     render_backend,
     take_human_image,
     take_images,
@@ -211,7 +212,9 @@ def _check_possible(settings: EnvSettings, row: TaskSpec) -> None:
 
 def _build(cls: Any, settings: EnvSettings) -> Any:
     backend = render_backend(settings)
-    if backend != "none":
+    if backend == "none":
+        keep_vulkan_open()
+    else:
         use_lean_shaders()
     try:
         # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.

@@ -3,6 +3,7 @@
 Torch ends here. Knows nothing of tasks.
 """
 
+import functools
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 
 import numpy as np
@@ -27,6 +28,17 @@ def render_backend(settings: EnvSettings) -> str:
     if settings.render.backend == "auto":
         return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
     return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
+
+
+@functools.cache
+def keep_vulkan_open() -> Any:
+    """Return what holds SAPIEN's Vulkan instance, once per process, for environments without a renderer.
+
+    Their scenes have materials, too, and the first one makes an instance, which ends with the scene: one
+    per reset, half of its time. NVIDIA's driver refuses further ones after some hundred
+    (`ErrorIncompatibleDriver`).
+    """
+    return sapien.render.RenderMaterial()
 
 
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
