@@ -36,6 +36,7 @@ from vla_eval.policies.lerobot_memory import remembers_in_rows
 from vla_eval.policies.lerobot_types import history
 from vla_eval.policies.verify import random_batch
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.process_memory import available_bytes, peak_rss_bytes, reset_peak
 from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
@@ -167,7 +168,7 @@ def _measured(
         trained=acted.trained,
         bytes=n_bytes,
         peak_rss_bytes={**written.peaks, **acted.peaks},
-        peak_device_bytes=torch.cuda.max_memory_allocated() if options.device != "cpu" else None,
+        peak_device_bytes=acted.peak_device_bytes,
         seconds={**written.seconds, **acted.seconds},
         inferences_per_second=acted.inferences_per_second,
         before_bytes=before,
@@ -210,6 +211,7 @@ class _Acted:
     parameters: int
     trained: int | None
     peaks: dict[str, int]
+    peak_device_bytes: int | None
     seconds: dict[str, float]
     inferences_per_second: dict[int, float]
 
@@ -249,6 +251,7 @@ def _load_and_act(
     context = PolicyContext(name="rehearsal", env=env.spec, chunking=chunking, n_candidates=3)
     cameras = _cameras(config)
     reset_peak()
+    reset_device_peak(options.device)
     started = time.perf_counter()
     dtype: Any = options.dtype
     loaded = make_lerobot(
@@ -262,7 +265,7 @@ def _load_and_act(
     policy: Policy = timed
     (record,) = rollout(env, policy, [start], RolloutSettings(chunking=chunking))
     assert record.error is None  # else it was raised
-    peaks["act"] = peak_rss_bytes()
+    peaks["act"], of_device = peak_rss_bytes(), peak_device_bytes(options.device)
     seconds |= {"first_inference": timed.seconds[0], "second_inference": timed.seconds[1]}
     model = loaded._loaded.policy
     n_parameters = sum(x.numel() for x in model.parameters())
@@ -272,6 +275,7 @@ def _load_and_act(
         parameters=n_parameters,
         trained=trained,
         peaks=peaks,
+        peak_device_bytes=of_device,
         seconds=seconds,
         inferences_per_second=_rates(folder, options.device, batches) if batches else {},
     )

@@ -14,6 +14,7 @@ from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_K
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_unfilled_policy, read_config
 from vla_eval.policies.lerobot_processors import load_processors
 from vla_eval.policies.verify import random_batch
+from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.estimate import estimate
 from vla_eval.training.job import load_finetune_recipe
@@ -54,6 +55,7 @@ def _measure(
     model_folder = folder / "model"
     model_folder.mkdir()
     write_checkpoint(model_folder, config, make_unfilled_policy(config), tokenizer)
+    reset_device_peak(device)
     options = LoadOptions(device=device)
     config = read_config(model_folder, options)
     model = load_weights(model_folder, config, options)
@@ -67,13 +69,14 @@ def _measure(
     trained = [x for x in model.parameters() if x.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=LEARNING_RATE)
     seconds = [_step(model, batch, optimizer, config, device) for _ in range(1 + n_steps)]
+    peak = peak_device_bytes(device)
     found = estimate(model, config, recipe, device=device)
     return {
         "batch_size": n_samples,
         "trained": sum(x.numel() for x in trained),
         "first_step_seconds": seconds[0],
         "step_seconds": sum(seconds[1:]) / n_steps,
-        "peak_device_bytes": torch.cuda.max_memory_allocated() if device != "cpu" else None,
+        "peak_device_bytes": peak,
         "estimated_device_bytes": None
         if found.cost is None
         else found.fixed_bytes + n_samples * found.cost.saved_bytes,
