@@ -264,5 +264,6 @@ env.reset({0: 2}, render=False)
 
 
 def test_resets_without_cameras_make_no_new_vulkan_instance() -> None:
-    done = subprocess.run([sys.executable, "-c", WITHOUT_CAMERAS], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", WITHOUT_CAMERAS]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
