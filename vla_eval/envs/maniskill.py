@@ -22,6 +22,7 @@ from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
     keep_vulkan_open,
+    let_vulkan_go,
     render_backend,
     take_human_image,
     take_images,
@@ -200,6 +201,7 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
     if backend == "none":
         keep_vulkan_open()
     else:
+        let_vulkan_go()
         use_lean_shaders()
     try:
         return with_appearance(cls, settings.appearance)(

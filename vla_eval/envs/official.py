@@ -24,6 +24,7 @@ from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
     keep_vulkan_open,
+    let_vulkan_go,
     render_backend,
     take_human_image,
     take_images,
@@ -215,6 +216,7 @@ def _build(cls: Any, settings: EnvSettings) -> Any:
     if backend == "none":
         keep_vulkan_open()
     else:
+        let_vulkan_go()
         use_lean_shaders()
     try:
         # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.

@@ -3,7 +3,6 @@
 Torch ends here. Knows nothing of tasks.
 """
 
-import functools
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 
 import numpy as np
@@ -30,15 +29,22 @@ def render_backend(settings: EnvSettings) -> str:
     return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
 
 
-@functools.cache
-def keep_vulkan_open() -> Any:
-    """Return what holds SAPIEN's Vulkan instance, once per process, for environments without a renderer.
+_kept: list[Any] = []  # SAPIEN has one renderer per process
 
-    Their scenes have materials, too, and the first one makes an instance, which ends with the scene: one
-    per reset, half of its time. NVIDIA's driver refuses further ones after some hundred
-    (`ErrorIncompatibleDriver`).
+
+def keep_vulkan_open() -> None:
+    """Let environments without a renderer share one Vulkan instance.
+
+    Their scenes have materials, too. The first one makes an instance, which ends with the last: one per
+    reset, half of its time. NVIDIA's driver refuses another after some hundred (`ErrorIncompatibleDriver`).
     """
-    return sapien.render.RenderMaterial()
+    if not _kept:
+        _kept.append(sapien.render.RenderMaterial())
+
+
+def let_vulkan_go() -> None:
+    """Let the environment that is made next choose the renderer's device, as the first to render does."""
+    _kept.clear()
 
 
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:

@@ -148,8 +148,9 @@ class MemoryTableEnv(ArmControl):
 
     def _reconfigure(self, options: dict[str, Any]) -> None:
         # Shapes have materials even if nothing is rendered. SAPIEN starts its renderer for the first material
-        # and stops it with the last one: without this one, once for every shape. It must not stay alive,
-        # because there is one renderer per process, and the first to render chooses its device.
+        # and stops it with the last one: without this one, once for every shape. A task must not keep it
+        # longer: there is one renderer per process, and the first to render chooses its device. Environments
+        # keep one, see `envs.scenes`.
         kept = None if can_render(self._render_device) else sapien.render.RenderMaterial()
         super()._reconfigure(options)
         del kept
