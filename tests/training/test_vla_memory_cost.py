@@ -1,10 +1,12 @@
 """What memory adds to the estimate of a fine-tuning."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
-from tests.policies.vla_memory.tiny_vlas import FAMILIES, made
+from tests.policies.vla_memory.tiny_vlas import FAMILIES, batch_of, made
 from vla_eval.training.sample_cost import count, sample_cost
 from vla_eval.training.stages import EPISODE_STEPS, STAGES, stage_of
 
@@ -46,3 +48,48 @@ def test_without_a_dataset_the_usual_length_of_an_episode_is_assumed(tmp_path: P
     config = made("mikasa_smolvla", tmp_path, **TOKENS).config
     # 90 frames: 0, 4, …, 88 and the last one, 89.
     assert config.n_passes(EPISODE_STEPS) == (24 - 2, 2)
+
+
+@pytest.mark.parametrize("family", ["pi0", "pi05"])
+def test_a_frozen_language_model_keeps_its_activations_for_the_expert(family: str, tmp_path: Path) -> None:
+    # LeRobot computes the attention of both in one tensor, which needs a gradient from the first layer on.
+    def policy_for(n_words: int) -> Any:
+        return made(family, tmp_path, train_expert_only=True, tokenizer_max_length=n_words).train()
+
+    def estimated(n_words: int) -> float:
+        policy = policy_for(n_words)
+        return count(policy, policy.config).saved
+
+    language = policy_for(4).model.paligemma_with_expert.paligemma
+    hidden = [
+        x.out_features for name, x in language.named_modules() if name.endswith(("gate_proj", "up_proj"))
+    ]
+    assert kept(policy_for(8), 8) - kept(policy_for(4), 4) > 4 * sum(hidden)
+    assert estimated(8) - estimated(4) > 4 * sum(hidden)
+
+
+@pytest.mark.parametrize("family", ["pi0", "pi05"])
+def test_an_expert_trained_with_recomputed_activations_has_the_same_gradients(
+    family: str, tmp_path: Path
+) -> None:
+    found = []
+    for is_recomputed in (False, True):
+        changes = {"train_expert_only": True, "gradient_checkpointing": is_recomputed}
+        policy = made(family, tmp_path, **changes).train()
+        torch.manual_seed(1)
+        loss, _ = policy.forward(batch_of(2))
+        loss.backward()
+        found.append([x.grad for x in policy.parameters() if x.grad is not None])
+    assert len(found[0]) == len(found[1]) > 10
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def kept(policy: Any, n_words: int) -> int:
+    """Return how many numbers autograd keeps of one sample."""
+    batch = batch_of(1)
+    for key in ("observation.language.tokens", "observation.language.attention_mask"):
+        batch[key] = batch[key][:, :1].repeat(1, n_words)
+    sizes: list[int] = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: (sizes.append(x.numel()), x)[1], lambda x: x):
+        policy.forward(batch)
+    return sum(sizes)

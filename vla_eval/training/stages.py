@@ -55,7 +55,8 @@ def _pi0(config: Any) -> tuple[Stage, ...]:
         Stage(r"lm_head", 0, EXPERT),
         Stage(r"vision_tower|multi_modal_projector", images, VISION),
         Stage(r"memory_tokens\.", memory, LANGUAGE),
-        Stage(r"paligemma\.", images + config.tokenizer_max_length + memory, LANGUAGE),
+        # One tensor of attention for both: what trains the expert alone keeps the language model's, too.
+        Stage(r"paligemma\.", images + config.tokenizer_max_length + memory, EXPERT),
         Stage(r"gemma_expert|action_|time_mlp|state_proj", config.chunk_size + own, EXPERT),
     )
 
