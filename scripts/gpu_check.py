@@ -7,6 +7,7 @@ here says why. `--device cpu --tiny` tries the script itself, in minutes, on tin
 import argparse
 import contextlib
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -59,8 +60,8 @@ def rendering(check: Check) -> dict[str, Any]:
         raise CannotRunError("--tiny has no renderer: its simulator is a fake")
     import numpy as np
 
-    own = _frames("cpu")
-    other = _frames("gpu" if check.device == "cuda" else "cpu")
+    own = _in_its_own_process("cpu")
+    other = _in_its_own_process("gpu" if check.device == "cuda" else "cpu")
     difference = np.abs(own.astype(np.int16) - other.astype(np.int16))
     return {
         "renderers": ["cpu", "gpu" if check.device == "cuda" else "cpu"],
@@ -236,6 +237,17 @@ def _small(check: Check, name: str) -> Iterator[tuple[str, bool]]:
     """Yield the recipe to measure, and whether it is built in its tiny form."""
     has_own = name.startswith("openvla")
     yield ("openvla_oft_tiny" if check.tiny and has_own else name, check.tiny and not has_own)
+
+
+def _in_its_own_process(renderer: str) -> Any:
+    """Return `_frames(renderer)`: the first to render in a process chooses its device."""
+    from vla_eval.errors import RenderingError
+
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        try:
+            return pool.apply(_frames, (renderer,))
+        except RenderingError as exc:
+            raise CannotRunError(f"the renderer '{renderer}' is not there: {exc}") from None
 
 
 def _frames(renderer: Any) -> Any:
