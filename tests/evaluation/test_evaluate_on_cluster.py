@@ -106,10 +106,12 @@ class TestFaults:
         command += ("--cluster", str(three_machines.cluster.address), "--out", str(out))
         path = f"{bench.folder}:{os.environ.get('PYTHONPATH', '')}"
         with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
-            wait_until(
-                lambda: len(bench.lines("cluster")) >= 15 if (out / "episodes.jsonl").exists() else False
-            )
-            process.send_signal(signal.SIGKILL)
+            try:
+                wait_until(
+                    lambda: len(bench.lines("cluster")) >= 15 if (out / "episodes.jsonl").exists() else False
+                )
+            finally:
+                process.kill()
         wait_until(lambda: not pids_of("ray::WorkerActor"))  # they end with their driver
         n_before = len(bench.lines("cluster"))
 

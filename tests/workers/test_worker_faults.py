@@ -164,8 +164,10 @@ def test_a_daemon_dies_with_a_command_that_is_killed(bench: Bench) -> None:
     command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", TASK, "--policy", "night.yaml"]
     command += ["--workers", "1", "--out", "out", "--set", "simulator=fake"]
     with subprocess.Popen(command, cwd=bench.folder, stderr=subprocess.DEVNULL) as process:
-        assert wait_until(lambda: bool(daemons(bench)))
-        process.kill()
+        try:
+            assert wait_until(lambda: bool(daemons(bench)))
+        finally:
+            process.kill()
     pids = {*bench.worker_pids(), *daemons(bench)}
     assert len(pids) == 2
     assert wait_until(lambda: not any(is_alive(pid) for pid in pids))
