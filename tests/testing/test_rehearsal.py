@@ -37,7 +37,7 @@ BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
         ("pi05_lora", True),
         ("pi0_fast", True),
         ("smolvla", True),
-        ("smolvla_frames", True),
+        pytest.param("smolvla_frames", True, marks=pytest.mark.slow),
         ("pi05_memory_tokens", True),
     ],
 )

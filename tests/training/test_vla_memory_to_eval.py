@@ -84,6 +84,7 @@ def actions_of(
     return {slot: np.stack(actions) for slot, actions in done.items()}
 
 
+@pytest.mark.slow
 def test_pi05_with_frames_and_tokens_begins_from_a_base_resumes_and_acts(
     recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt
 ) -> None:

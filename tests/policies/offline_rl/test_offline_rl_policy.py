@@ -154,7 +154,10 @@ def test_it_acts_without_draws_within_the_bounds(algorithm: str) -> None:
     assert torch.equal(made.select_action(frames), chunk[:, 0])
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize(
+    "algorithm",
+    [pytest.param(x, marks=pytest.mark.slow) if x == "cql_published" else x for x in ALGORITHMS],
+)
 def test_who_reads_rewards_comes_to_prefer_what_was_rewarded(algorithm: str) -> None:
     """Half of the recorded actions are +0.5, with reward 1; half are -0.5, without. Their mean is 0."""
     made = policy(algorithm, target_rate=0.1, hidden=32).train()

@@ -206,8 +206,8 @@ def test_a_spatial_softmax_has_the_values_and_gradients_of_its_formula() -> None
 
 @pytest.mark.parametrize("n_frames", [FRAMES_AT_ONCE - 1, FRAMES_AT_ONCE + 1, 2 * FRAMES_AT_ONCE])
 def test_images_that_are_encoded_in_parts_teach_what_each_of_them_teaches(n_frames: int) -> None:
-    cameras = Cameras("nature", n_cameras=2, image_px=64, outputs=5).double()
-    images = torch.rand(1, n_frames, 2, 3, 64, 64, dtype=torch.float64)
+    cameras = Cameras("nature", n_cameras=2, image_px=40, outputs=5).double()
+    images = torch.rand(1, n_frames, 2, 3, 40, 40, dtype=torch.float64)
     weights = torch.rand(n_frames, cameras.outputs, dtype=torch.float64)
     (cameras(images)[0] * weights).sum().backward()
     together = [parameter.grad.clone() for parameter in cameras.parameters() if parameter.grad is not None]
