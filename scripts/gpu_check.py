@@ -60,11 +60,11 @@ def rendering(check: Check) -> dict[str, Any]:
         raise CannotRunError("--tiny has no renderer: its simulator is a fake")
     import numpy as np
 
-    own = _in_its_own_process("cpu")
-    other = _in_its_own_process("gpu" if check.device == "cuda" else "cpu")
+    renderers = ["cpu", "gpu" if check.device == "cuda" else "cpu"]
+    own, other = (_in_its_own_process(renderer) for renderer in renderers)
     difference = np.abs(own.astype(np.int16) - other.astype(np.int16))
     return {
-        "renderers": ["cpu", "gpu" if check.device == "cuda" else "cpu"],
+        "renderers": renderers,
         "frames": len(own),
         "share_of_pixels_that_differ": float((difference.max(axis=-1) > 0).mean()),
         "largest_difference_levels": int(difference.max()),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from vla_eval.envs.scenes import keep_vulkan_open
+from vla_eval.envs.scenes import share_vulkan
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.register import env_class
 
@@ -17,6 +17,5 @@ def make(task: str, **kwargs: Any) -> Any:
         **spec.kwargs,
         **kwargs,
     }
-    if settings["render_backend"] == "none":
-        keep_vulkan_open()  # half of the time of a reset
+    share_vulkan(settings["render_backend"])  # half of the time of a reset
     return env_class(spec)(**settings)

@@ -63,7 +63,9 @@ def acted(run: Path, task: str, instruction: str) -> str | None:
     return record.trajectory_sha256
 
 
-@pytest.mark.parametrize("policy", [pytest.param("memory_many", marks=pytest.mark.slow), "context_many"])
+@pytest.mark.parametrize(
+    "policy", [pytest.param(x, marks=pytest.mark.slow) if x == "memory_many" else x for x in TINY]
+)
 def test_two_tasks_are_learned_at_once_and_a_killed_run_ends_with_the_same_weights(
     policy: str, mixed: Path, tmp_path: Path, killed_at: KilledAt
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.policies.vla_memory.tiny_vlas import FAMILIES, batch_of, made
+from tests.testing.script_files import load_script
 from vla_eval.training.sample_cost import count, sample_cost
 from vla_eval.training.stages import EPISODE_STEPS, STAGES, stage_of
 
@@ -89,7 +90,5 @@ def kept(policy: Any, n_words: int) -> int:
     batch = batch_of(1)
     for key in ("observation.language.tokens", "observation.language.attention_mask"):
         batch[key] = batch[key][:, :1].repeat(1, n_words)
-    sizes: list[int] = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: (sizes.append(x.numel()), x)[1], lambda x: x):
-        policy.forward(batch)
-    return sum(sizes)
+    found: int = load_script("activation_constants").saved_bytes(policy, batch)
+    return found // torch.float32.itemsize

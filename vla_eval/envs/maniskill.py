@@ -21,9 +21,8 @@ from vla_eval.envs.cue_location import boxes_of_cue
 from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
-    keep_vulkan_open,
-    let_vulkan_go,
     render_backend,
+    share_vulkan,
     take_human_image,
     take_images,
     to_array,
@@ -198,10 +197,8 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
             f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
             f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
         )
-    if backend == "none":
-        keep_vulkan_open()
-    else:
-        let_vulkan_go()
+    share_vulkan(backend)
+    if backend != "none":
         use_lean_shaders()
     try:
         return with_appearance(cls, settings.appearance)(

@@ -23,9 +23,8 @@ from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.scenes import (
     RENDERING_ADVICE,
     describe,
-    keep_vulkan_open,
-    let_vulkan_go,
     render_backend,
+    share_vulkan,
     take_human_image,
     take_images,
     to_array,
@@ -213,10 +212,8 @@ def _check_possible(settings: EnvSettings, row: TaskSpec) -> None:
 
 def _build(cls: Any, settings: EnvSettings) -> Any:
     backend = render_backend(settings)
-    if backend == "none":
-        keep_vulkan_open()
-    else:
-        let_vulkan_go()
+    share_vulkan(backend)
+    if backend != "none":
         use_lean_shaders()
     try:
         # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.

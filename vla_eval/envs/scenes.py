@@ -32,19 +32,20 @@ def render_backend(settings: EnvSettings) -> str:
 _kept: list[Any] = []  # SAPIEN has one renderer per process
 
 
-def keep_vulkan_open() -> None:
-    """Let environments without a renderer share one Vulkan instance.
+def share_vulkan(backend: str) -> None:
+    """Let environments without a renderer share one Vulkan instance; one with a renderer chooses its device.
 
-    Their scenes have materials, too. The first one makes an instance, which ends with the last: one per
-    reset, half of its time. NVIDIA's driver refuses another after some hundred (`ErrorIncompatibleDriver`).
+    Scenes without a renderer have materials, too. The first one makes an instance, which ends with the last:
+    one per reset, half of its time. NVIDIA's driver refuses another after some tens
+    (`ErrorIncompatibleDriver`). The first to render chooses the device, so that the shared one must be gone.
+
+    Args:
+        backend: of the environment that is made next, see `render_backend`.
     """
-    if not _kept:
+    if backend != "none":
+        _kept.clear()
+    elif not _kept:
         _kept.append(sapien.render.RenderMaterial())
-
-
-def let_vulkan_go() -> None:
-    """Let the environment that is made next choose the renderer's device, as the first to render does."""
-    _kept.clear()
 
 
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
