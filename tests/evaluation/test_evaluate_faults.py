@@ -6,38 +6,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
 from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import SHORT, TASK, Bench
+from tests.waiting import HANGS_AFTER_S, is_alive, wait_until
 from vla_eval.errors import RecipeError, SpecMismatchError, TooManyErrorsError
 
 bench = evaluation_bench.bench
-
-HANGS_AFTER_S = 240.0
-"""Far longer than anything here takes on a slow machine: what is not over by then never will be."""
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
-
-
-def wait_until(claim: Callable[[], bool], *, seconds: float = HANGS_AFTER_S) -> bool:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if claim():
-            return True
-        time.sleep(0.02)
-    return claim()
-
 
 # ------------------------------------------------------------------------------------------ faults
 
@@ -219,7 +197,7 @@ class TestKills:
             time.sleep(rng.uniform(0.7, 1.6))
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
-            assert wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
+            wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
 
         table = self.finish(bench, "killed")
 
@@ -233,20 +211,20 @@ class TestKills:
     ) -> None:
         bench.write_policy(pause=0.05)
         process = self.start(bench, "out")
-        assert wait_until(lambda: bool(bench.worker_pids()))
+        wait_until(lambda: bool(bench.worker_pids()))
         process.send_signal(number)
         stdout, stderr = process.communicate(timeout=HANGS_AFTER_S)
 
         assert process.returncode == exit_code
         assert stdout == ""
         assert "To resume: mikasa-vla eval --task" in stderr
-        assert wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
+        wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
         self.finish(bench, "out")
 
     def test_a_worker_that_is_killed_is_replaced(self, bench: Bench) -> None:
         bench.write_policy(pause=0.02)
         process = self.start(bench, "out", workers=1)
-        assert wait_until(lambda: bool(bench.worker_pids()))
+        wait_until(lambda: bool(bench.worker_pids()))
         os.kill(next(iter(bench.worker_pids())), signal.SIGKILL)
         _, stderr = process.communicate(timeout=HANGS_AFTER_S)
 

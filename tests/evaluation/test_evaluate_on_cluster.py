@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from typing import Any
 
 import pytest
@@ -13,6 +12,7 @@ import pytest
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
 from tests.evaluation.test_shared_inference import NETWORK_MODULE
+from tests.waiting import wait_until
 from tests.workers.three_machines import After, ThreeMachines, kill_actors, pids_of
 from tests.workers.three_machines import three_machines as three_machines
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
@@ -120,10 +120,3 @@ class TestFaults:
         assert done.returncode == 0 and n_before < N_EPISODES
         bench.run("local", **{**LONG, "workers": 2})
         assert bench.lines("cluster") == bench.lines("local")
-
-
-def wait_until(is_so: Any) -> None:
-    deadline = time.monotonic() + 120
-    while not is_so():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)

@@ -6,15 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.waiting import is_alive, wait_until
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.fingerprint import results_config
@@ -151,7 +150,7 @@ def test_the_servers_of_a_run_end_with_it_even_if_it_is_killed(network: Bench) -
             (server,) = network.worker_pids()
         finally:
             process.kill()  # else leaving waits for 100,000 episodes
-    wait_until(lambda: not Path(f"/proc/{server}").exists())
+    wait_until(lambda: not is_alive(server))
 
 
 def test_with_several_gpus_each_has_a_server_and_records_are_the_same(
@@ -238,10 +237,3 @@ def test_a_network_with_memory_on_maniskill_has_the_same_records(bench: Bench) -
     shared(bench, "two", inference_max_batch=2, workers=2, **fields)
 
     assert bench.lines("in-process") == bench.lines("one") == bench.lines("two")
-
-
-def wait_until(condition: Any) -> None:
-    deadline = time.monotonic() + 240
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)

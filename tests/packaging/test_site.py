@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from scripts.site_figures import drawn
 from tests.page import test_report_browser
 from tests.page.test_report_browser import CHROMIUM, Browser
+from tests.waiting import wait_until
 from vla_eval.cli.main import VERBS
 from vla_eval.tasks.catalog import FAMILIES, TASKS
 
@@ -83,10 +83,7 @@ def test_pages_from_the_disk_are_searched(site: Path, browser: Browser) -> None:
     browser.open(site / "results.html")
     browser.ask("document.querySelector('.md-search__input').focus()")
     browser.call("Input.insertText", {"text": "wilson"})
-    deadline = time.monotonic() + 60
-    while not browser.ask("document.querySelectorAll('.md-search-result__link').length"):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until(lambda: browser.ask("document.querySelectorAll('.md-search-result__link').length"))
     assert browser.complaints == []
     assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
 

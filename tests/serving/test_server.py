@@ -13,6 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from tests.serving.served_policies import CHUNK_SIZE, CountingPolicy, Running, frame, host, serving
+from tests.waiting import wait_until
 from vla_eval.serving.server import PolicyServer, ServeError, ServerOptions
 from vla_eval.wire.codec import packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata
@@ -222,10 +223,3 @@ class TestTheEnd:
             another = PolicyServer(host(CountingPolicy()), ServerOptions(port=server.port))
             with pytest.raises(ServeError, match=f"cannot listen on 127.0.0.1:{server.port}.*Choose another"):
                 asyncio.run(another.run(asyncio.Event(), lambda _: None))
-
-
-def wait_until(condition: Any) -> None:
-    deadline = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
-from tests.evaluation.test_evaluate_faults import is_alive, wait_until
+from tests.waiting import is_alive, wait_until
 
 bench = evaluation_bench.bench
 
@@ -165,12 +165,12 @@ def test_a_daemon_dies_with_a_command_that_is_killed(bench: Bench) -> None:
     command += ["--workers", "1", "--out", "out", "--set", "simulator=fake"]
     with subprocess.Popen(command, cwd=bench.folder, stderr=subprocess.DEVNULL) as process:
         try:
-            assert wait_until(lambda: bool(daemons(bench)))
+            wait_until(lambda: bool(daemons(bench)))
         finally:
             process.kill()
     pids = {*bench.worker_pids(), *daemons(bench)}
     assert len(pids) == 2
-    assert wait_until(lambda: not any(is_alive(pid) for pid in pids))
+    wait_until(lambda: not any(is_alive(pid) for pid in pids))
 
 
 def run_with_server(number: signal.Signals, out: Path, *, setup_seconds: float) -> str:

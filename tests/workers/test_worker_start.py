@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import is_alive, wait_until
 from vla_eval.workers import start as worker_start
 from vla_eval.workers.start import begin, simulator_modules, worker_context, worker_environment
 
@@ -84,16 +85,9 @@ def test_a_worker_ends_with_a_command_that_is_killed() -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         worker = int(parent.stdout.readline())
-        os.kill(worker, 0)  # it is there
+        assert is_alive(worker)
         parent.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + 240
-    while time.monotonic() < deadline:
-        try:
-            os.kill(worker, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.05)
-    pytest.fail(f"worker {worker} outlived its parent")
+    wait_until(lambda: not is_alive(worker))
 
 
 def test_a_guard_sleeps_while_its_worker_works() -> None:
