@@ -16,7 +16,7 @@ from tests.tasks.sample import SAMPLED_TASKS
 
 # Read when huggingface_hub is imported.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
-# Read when torch is imported. Test processes share the cores: threads that wait for each other cost half of the time.
+# Read when torch is imported. Test processes share the cores: threads that wait took half of the time.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from vla_eval.workers.start import worker_context  # after the lines above

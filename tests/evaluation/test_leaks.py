@@ -112,7 +112,10 @@ def results(bench: Bench, out: str, policies: list[str]) -> list[str]:
     return sorted(record.to_json() for record in records if record.policy in policies)
 
 
-@pytest.mark.parametrize(("workers", "victims_first"), [(1, False), (2, False), (1, True)])
+@pytest.mark.parametrize(
+    ("workers", "victims_first"),
+    [(2, False), (1, True), pytest.param(1, False, marks=pytest.mark.slow)],
+)
 def test_thirty_kinds_of_leak_change_no_other_policy_s_records(
     bench: Bench, workers: int, victims_first: bool
 ) -> None:

@@ -327,6 +327,7 @@ print(*ProcessorStepRegistry.list())
 """
 
 
+@pytest.mark.slow
 def test_a_new_process_knows_the_steps_of_every_ported_policy() -> None:
     """One that has trained nothing: it evaluates a checkpoint."""
     done = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True, check=True)
