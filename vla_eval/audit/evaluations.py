@@ -18,7 +18,7 @@ from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
-Kind = Literal["choice", "search", "several", "ball", "no_choice", "unscripted"]
+Kind = Literal["choice", "search", "several", "ball", "cube", "no_choice", "unscripted"]
 
 CONTROLS: Mapping[Kind, tuple[str, ...]] = {
     "choice": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch", "body_memory"),
@@ -27,17 +27,18 @@ CONTROLS: Mapping[Kind, tuple[str, ...]] = {
     # One width of the gripper encodes one candidate; no control encodes several.
     "several": ("random", "hold", "oracle", "cue_blind", "tour", "cue_touch"),
     "ball": ("random", "hold", "oracle", "cue_blind", "one_frame"),
+    "cube": ("random", "hold", "oracle", "cue_blind", "one_frame"),
     "no_choice": ("random", "hold", "oracle", "cue_blind"),
     "unscripted": ("random", "hold"),
 }
-WITHOUT_PHASES: frozenset[Kind] = frozenset({"ball", "no_choice"})
+WITHOUT_PHASES: frozenset[Kind] = frozenset({"ball", "cube", "no_choice"})
 OFFICIAL_FIELDS: Mapping[str, Any] = {"seed_start": 4242424242, "stop_at_success": True}
 """What differs in an evaluation of official tasks: the seeds of their runner (protocols/mikasa_vla_90.yaml).
 Their metric is success at any step, so that an episode may end there."""
 
 
 def kind_of(task: TaskSpec) -> Kind:
-    """Return whether the task has one right candidate, several, or none; if none, whether a ball rolls.
+    """Return whether the task has one right candidate, several, or none; if none, what one frame shows.
 
     Of an official task with one, also whether its cue can be gone to, or stored by the arm.
     """
@@ -46,7 +47,7 @@ def kind_of(task: TaskSpec) -> Kind:
     if task.suite != "paper" and task.has_candidates:
         return "search" if task.waits_for_choice or task.phase_source == "none" else "choice"
     if task.candidates is None:
-        return "ball" if "velocity_range_m_s" in task.kwargs else "no_choice"
+        return task.seen_in_one_frame or "no_choice"
     return "several" if "n_shown" in task.kwargs else "choice"
 
 

@@ -1,4 +1,4 @@
-"""Expert for TakeItBack: grasp the cube, drag it onto the disc, drag it back."""
+"""Expert for TakeItBack: grasp the cube, drag it onto the disc, drag it back; also from single frames."""
 
 from dataclasses import dataclass, replace
 
@@ -37,6 +37,7 @@ BACK_M = 0.02
 IMAGINED_X_M = (-0.05, 0.05)
 IMAGINED_BANDS_Y_M = (-0.1, 0.0, 0.1)
 IMAGINED_BAND_WIDTH_M = 0.05
+MEAN_FIRST_X_M = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,15 +86,48 @@ class CarryExpert:
         # Use only observed states: by the model alone, the arm would turn back too early.
         self._was_there |= float(np.linalg.norm(play.cube_m - play.goal_m)) < ON_DISC_M
         play = replace(play, was_there=self._was_there)
-        rows = []
-        for index in range(n_actions):
-            play = _decide(play)
-            if index == 0:  # later steps are predictions of the model
-                self._closing = play.closing
-            translation, gripper = _command(play)
-            rows.append(action_row(translation, gripper))
-            play = _advance(play, translation, gripper)
-        return np.stack(rows)
+        self._closing = _decide(play).closing  # later steps are predictions of the model
+        return _rows(play, n_actions)
+
+
+def plan_from_one_frame(state: PrivilegedState, n_actions: int) -> NDArray[np.float32]:
+    """Return (n_actions, 7), planned from this state alone: nothing is kept of earlier ones.
+
+    The cube was dragged straight to the disc, and only until it was on it. So the way back is the line from
+    the disc's centre through the cube, wherever on it the cube is. The disc's colour says which way to go.
+    """
+    arm = gripper_state(state)
+    cube_m, goal_m = (state.bodies[name].position_m[:2] for name in ("cube", "goal"))
+    held = arm.width_m < HELD_WIDTH_M
+    stalled = held and float(np.linalg.norm(state.tcp_velocity_m_s)) < STALLED_M_S
+    play = _Play(
+        arm=arm,
+        cube_m=cube_m,
+        goal_m=goal_m,
+        home_m=_on_the_way_back_m(cube_m, goal_m),
+        was_there=bool(state.bodies["violet_disc"].position_m[2] > 0),
+        closing=held,
+        caution=CAUTION**4 if stalled else 1.0,
+    )
+    return _rows(play, n_actions)
+
+
+def _on_the_way_back_m(cube_m: Vector, goal_m: Vector) -> Vector:
+    """Return the place on the line from disc to cube that is as far from the robot as first places are."""
+    offset_m = cube_m - goal_m
+    times = (MEAN_FIRST_X_M - goal_m[0]) / min(float(offset_m[0]), -1e-3)
+    place_m: Vector = goal_m + times * offset_m
+    return place_m
+
+
+def _rows(play: _Play, n_actions: int) -> NDArray[np.float32]:
+    rows = []
+    for _ in range(n_actions):
+        play = _decide(play)
+        translation, gripper = _command(play)
+        rows.append(action_row(translation, gripper))
+        play = _advance(play, translation, gripper)
+    return np.stack(rows)
 
 
 def _decide(play: _Play) -> _Play:

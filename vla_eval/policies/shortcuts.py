@@ -11,7 +11,8 @@
 - `one_frame`: meets a rolling ball with the oracle's controller, but keeps nothing between inferences, and
   sees where the ball is, not how fast it rolls. It assumes the mean speed of the task; beside the ball,
   which it followed to get there, the speed of its own arm. So any policy that reads the last frame and its
-  joints' speeds could do the same.
+  joints' speeds could do the same. In TakeItBack it drags the cube back along the line from the middle of
+  the disc through the cube: where the cube is on the disc keeps the answer.
 """
 
 from dataclasses import replace
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, ObservationWindow
 from vla_eval.errors import SpecMismatchError
+from vla_eval.oracles import carry
 from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
@@ -132,7 +134,7 @@ BESIDE_M = 0.09
 while the ball passes."""
 
 
-class OneFramePolicy(ScriptedPolicy):
+class OneFrameOfBallPolicy(ScriptedPolicy):
     """Sees where the ball is, not how it moves; see the module's text."""
 
     privileged = True
@@ -163,18 +165,31 @@ class OneFramePolicy(ScriptedPolicy):
         return np.array([ROLLING_SHARE * np.mean(IMAGINED_VELOCITY_X_M_S), along_y, 0.0])
 
 
+class OneFrameOfCubePolicy(ScriptedPolicy):
+    """Sees where cube and disc are, and the disc's colour; see the module's text."""
+
+    privileged = True
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Plan a chunk."""
+        return ActionChunk(actions=carry.plan_from_one_frame(self.privileged_state(window), self._n_actions))
+
+
 @in_any_control_mode
 def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
     """Make the `one_frame` control.
 
     Raises:
-        SpecMismatchError: no ball rolls in the task.
+        SpecMismatchError: no ball rolls in the task, and no cube is taken back.
     """
     task = task_spec(context.env.task)
-    if "velocity_range_m_s" not in task.kwargs:
-        raise SpecMismatchError(
-            f"policy '{context.name}' meets a ball without knowing its speed; in {context.env.task} no "
-            "ball rolls. Leave this task out for this policy."
-        )
-    expert = cast(BallExpertFactory, task_expert(context))
-    return OneFramePolicy(context, expert, task.kwargs["velocity_range_m_s"])
+    if task.seen_in_one_frame == "ball":
+        expert = cast(BallExpertFactory, task_expert(context))
+        return OneFrameOfBallPolicy(context, expert, task.kwargs["velocity_range_m_s"])
+    if task.seen_in_one_frame == "cube":
+        return OneFrameOfCubePolicy(context)
+    raise SpecMismatchError(
+        f"policy '{context.name}' meets a ball without knowing its speed, or takes a cube back along the way "
+        f"it came; in {context.env.task} no ball rolls, and no cube is taken back. Leave this task out for "
+        "this policy."
+    )

@@ -105,6 +105,17 @@ class TaskSpec:
         return self.candidates is not None or self.true_state in ("items", "mugs")
 
     @property
+    def seen_in_one_frame(self) -> Literal["ball", "cube"] | None:
+        """What the control of single frames goes by: a ball that rolls, or a cube dragged onto a disc.
+
+        The official TakeItBack is left out: its state does not say which colour the disc has.
+        """
+        if "velocity_range_m_s" in self.kwargs:
+            return "ball"
+        is_dragged = self.suite == "paper" and self.oracle.startswith("vla_eval.oracles.carry:")
+        return "cube" if is_dragged else None
+
+    @property
     def split(self) -> Split | None:
         """The official split of the 90 tasks, by horizon; None for the others."""
         if self.suite != "mikasa_vla_90":

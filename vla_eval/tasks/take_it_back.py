@@ -170,10 +170,11 @@ class TakeItBackEnv(OnePhaseEnv):
         }
 
     def moving_bodies(self) -> dict[str, Body]:
-        """Return `cube`, `goal` and `first_place`."""
+        """Return `cube`, `goal`, `first_place` and `violet_disc`, which is below the table while red."""
         return {
             "cube": moving_body(self.cube.pose.p, self.cube.linear_velocity),
             "goal": resting_body(self._goal_position),
+            "violet_disc": resting_body(self.violet_disc.pose.p),
             "first_place": resting_body(self._first_place),
         }
 
