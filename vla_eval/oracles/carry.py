@@ -32,6 +32,7 @@ ON_DISC_M = 0.07  # within 8 cm counts
 # edge of its reach. If the arm stands still, the action is reduced step by step until it moves again.
 STALLED_M_S = 0.03
 CAUTION = 0.6
+CAUTION_OF_ONE_FRAME = CAUTION**4  # it does not know how long the arm has stood still
 AIM_M = 0.055  # the cube is moved this close to the disc's centre
 BACK_M = 0.02
 IMAGINED_X_M = (-0.05, 0.05)
@@ -107,7 +108,7 @@ def plan_from_one_frame(state: PrivilegedState, n_actions: int) -> NDArray[np.fl
         home_m=_on_the_way_back_m(cube_m, goal_m),
         was_there=bool(state.bodies["violet_disc"].position_m[2] > 0),
         closing=held,
-        caution=CAUTION**4 if stalled else 1.0,
+        caution=CAUTION_OF_ONE_FRAME if stalled else 1.0,
     )
     return _rows(play, n_actions)
 

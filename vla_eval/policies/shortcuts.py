@@ -180,7 +180,7 @@ def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
     """Make the `one_frame` control.
 
     Raises:
-        SpecMismatchError: no ball rolls in the task, and no cube is taken back.
+        SpecMismatchError: no ball rolls in the task, and it is not TakeItBack.
     """
     task = task_spec(context.env.task)
     if task.seen_in_one_frame == "ball":
@@ -189,7 +189,6 @@ def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
     if task.seen_in_one_frame == "cube":
         return OneFrameOfCubePolicy(context)
     raise SpecMismatchError(
-        f"policy '{context.name}' meets a ball without knowing its speed, or takes a cube back along the way "
-        f"it came; in {context.env.task} no ball rolls, and no cube is taken back. Leave this task out for "
-        "this policy."
+        f"policy '{context.name}' is for tasks in which a ball rolls and for TakeItBack-v0; "
+        f"{context.env.task} is neither. Leave this task out for this policy."
     )
