@@ -10,7 +10,7 @@ from vla_eval.errors import VlaEvalError
 from vla_eval.policies.sequence.core import Core
 from vla_eval.policies.sequence.cores import make_core
 from vla_eval.policies.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature
-from vla_eval.policies.sequence.sizes import CORES
+from vla_eval.policies.sequence.sizes import CORES, ENCODERS
 from vla_eval.policies.sequence.spatial_softmax import LEAST_VARIANCE, spatial_softmax
 
 WIDTH, N_STEPS = 8, 12
@@ -170,10 +170,21 @@ def test_keypoints_are_where_a_colour_stands_out_from_the_image() -> None:
     assert (x, y) == pytest.approx((-1 + 2 * 3 / 15, -1 + 2 * 10 / 15), abs=0.01)  # the 4th of 16 places
 
 
+def test_colour_keypoints_know_the_colour_of_a_cell_and_nothing_of_its_neighbours() -> None:
+    encoder = Keypoints(image_px=64, outputs=4, features="color_keypoints")
+    image = torch.rand(1, 3, 64, 64)
+    changed = image.clone()
+    changed[:, :, 8:12, 20:24] = image[:, :, 8:12, 20:24].flip(-1)  # the same mean
+    changed[:, :, 40:44, 12:16] += 0.5
+    differs = (encoder.features(changed) - encoder.features(image)).abs().amax(dim=(0, 1)) > 1e-5
+    assert differs.nonzero().tolist() == [[10, 3]]  # row and column of the cell, of 16 each
+
+
 @pytest.mark.parametrize("image_px", [64, 128])
-def test_encoders_take_the_sizes_of_images_that_are_recorded(image_px: int) -> None:
-    for encoder in (Keypoints(image_px=image_px, outputs=5), Nature(image_px=image_px, outputs=5)):
-        assert encoder(torch.rand(2, 3, image_px, image_px)).shape == (2, 5)
+@pytest.mark.parametrize("name", ENCODERS)
+def test_encoders_take_the_sizes_of_images_that_are_recorded(name: str, image_px: int) -> None:
+    cameras = Cameras(name, n_cameras=2, image_px=image_px, outputs=5)
+    assert cameras(torch.rand(2, 3, 2, 3, image_px, image_px)).shape == (2, 3, cameras.outputs)
 
 
 def test_the_encoder_of_the_baselines_has_their_size() -> None:

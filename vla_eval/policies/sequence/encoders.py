@@ -1,4 +1,6 @@
-"""Plain encoders of images: the one of the paper's baselines, and keypoints."""
+"""Plain encoders of images: the one of the paper's baselines, and keypoints of shapes or of colours."""
+
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -9,8 +11,8 @@ from vla_eval.policies.sequence.spatial_softmax import spatial_softmax
 from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3
-KEYPOINTS = 32
 NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
+CELL_PX = 4
 FRAMES_AT_ONCE = 64  # on a CPU
 
 
@@ -41,8 +43,37 @@ class Nature(nn.Sequential):
         )
 
 
+def _features_of_shapes() -> tuple[nn.Module, ...]:
+    """Two convolutions, and one of 1 x 1: 32 maps."""
+    return (
+        nn.Conv2d(RGB, 32, 2 * CELL_PX, stride=CELL_PX, padding=2),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 1),
+    )
+
+
+def _features_of_colors() -> tuple[nn.Module, ...]:
+    """Three layers over the mean colour of each cell, and nothing of its neighbours: 64 maps.
+
+    A colour is found in a fraction of the steps in which convolutions find it (docs/general_memory.md).
+    """
+    return (
+        nn.AvgPool2d(CELL_PX),
+        nn.Conv2d(RGB, 64, 1),
+        nn.ReLU(),
+        nn.Conv2d(64, 64, 1),
+        nn.ReLU(),
+        nn.Conv2d(64, 64, 1),
+    )
+
+
+FEATURES = {"keypoints": _features_of_shapes, "color_keypoints": _features_of_colors}
+
+
 class Keypoints(nn.Module):
-    """Convolutions and a spatial softmax: where each feature is, and how strong it is there.
+    """Features of each cell of 4 x 4 pixels and a spatial softmax: where each is, and how strong it is there.
 
     Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies", section 5.1; the strength, which
     says whether the feature is in the image at all, is ours.
@@ -50,23 +81,19 @@ class Keypoints(nn.Module):
     Args:
         image_px: height and width of an image, a multiple of 4.
         outputs: numbers that are returned.
-        channels: of an image.
+        features: a name of `FEATURES`.
     """
 
     places: Tensor
 
-    def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
+    def __init__(self, *, image_px: int, outputs: int, features: str = "keypoints") -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(channels, 32, 8, stride=4, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(32, 32, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(32, KEYPOINTS, 1),
-        )
-        self.sharpness = nn.Parameter(torch.full((KEYPOINTS,), 4.0).log())
-        self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * KEYPOINTS, outputs)
-        line = torch.linspace(-1, 1, image_px // 4)
+        layers = FEATURES[features]()
+        self.features = nn.Sequential(*layers)
+        n_maps = cast(nn.Conv2d, layers[-1]).out_channels
+        self.sharpness = nn.Parameter(torch.full((n_maps,), 4.0).log())
+        self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * n_maps, outputs)
+        line = torch.linspace(-1, 1, image_px // CELL_PX)
         places = torch.cartesian_prod(line, line).flip(-1)  # (H · W, 2): x, y
         self.register_buffer("places", places, persistent=False)
 
@@ -96,13 +123,17 @@ class Cameras(nn.ModuleList):
     """
 
     def __init__(self, name: str, *, n_cameras: int, image_px: int, outputs: int) -> None:
-        make = Keypoints if name == "keypoints" else Nature
         channels = RGB * n_cameras if ENCODERS[name].shared else RGB
         n_encoders = RGB * n_cameras // channels
         self.outputs = n_encoders * outputs
-        super().__init__(
-            make(image_px=image_px, outputs=outputs, channels=channels) for _ in range(n_encoders)
-        )
+        if name in FEATURES:
+            super().__init__(
+                Keypoints(image_px=image_px, outputs=outputs, features=name) for _ in range(n_encoders)
+            )
+        else:
+            super().__init__(
+                Nature(image_px=image_px, outputs=outputs, channels=channels) for _ in range(n_encoders)
+            )
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes.

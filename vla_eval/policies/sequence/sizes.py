@@ -176,6 +176,7 @@ class EncoderRow:
 
 ENCODERS = {
     "keypoints": EncoderRow(),
+    "color_keypoints": EncoderRow(),
     "nature": EncoderRow(),
     "nature_stacked": EncoderRow(shared=True),
 }
