@@ -8,9 +8,9 @@ from torch import Tensor
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
+from vla_eval.policies.things import MAX_UINT8, changed_things, usual_colors
 
 LEAST_VARIANCE_M2 = 1e-6
-MAX_UINT8 = 255
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
 
 
@@ -49,6 +49,11 @@ def in_numbers(images: Tensor) -> Tensor:
     return images.to(torch.float32).div_(MAX_UINT8) if images.dtype == torch.uint8 else images
 
 
+def in_bytes(images: Tensor) -> Tensor:
+    """Return images as bytes, given that or numbers in [0, 1]."""
+    return images if images.dtype == torch.uint8 else images.mul(MAX_UINT8).round_().to(torch.uint8)
+
+
 def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
     """Return the images (…, cameras, 3, H, W), in the order of the configuration."""
     return torch.stack([batch[key] for key in config.image_features], dim=-4)
@@ -62,8 +67,8 @@ def episodes_of(
     Args:
         batch: as `config` asks for it by its delta indices; images in [0, 1], or bytes.
         config: of the policy.
-        training: leave waiting out, end some episodes at a decision, mix colours and move images, at random
-            by torch's generator; else take every step.
+        training: leave waiting out, end some episodes at a decision, change things and colours and move
+            images, at random by torch's generator; else take every step.
         same_action: actions that differ by less are waiting.
     """
     n_steps = config.n_window_steps
@@ -95,6 +100,12 @@ def episodes_of(
     first = _first(steps, share > 0)
     episodes = rows.expand_as(steps)[first]
     images = torch.stack([batch[key][episodes, steps[first]] for key in config.image_features], dim=1)
+    if training and (config.exchange_share or config.erase_share):
+        ends = taken(begins)[:, -1]  # padding is the last step again
+        before = torch.stack(
+            [batch[key][rows[:, 0], steps[:, -1] - 1] for key in config.image_features], dim=1
+        )
+        images = _with_other_things(images, episodes, ends, before, config)
     return Episodes(
         images=_augmented(images, episodes, config, n_episodes=len(steps)) if training else images,
         first=first,
@@ -228,6 +239,34 @@ def _until_a_decision(begins: Tensor, share: float) -> Tensor:
     ends = begins.any(dim=1) & (torch.rand(len(begins), device=begins.device) < share)
     steps = torch.arange(begins.shape[1], device=begins.device)
     return ~ends[:, None] | (steps <= last[:, None])
+
+
+def _with_other_things(
+    images: Tensor, episodes: Tensor, ends: Tensor, before: Tensor, config: EpisodeConfig
+) -> Tensor:
+    """Change the things in a share of the episodes that end at a decision, see `changed_things`.
+
+    Args:
+        images: (N, cameras, 3, H, W), one episode after the other.
+        episodes: (N,) whose they are.
+        ends: (B,) which episodes end at a decision.
+        before: (B, cameras, 3, H, W) the frames before the last ones.
+        config: of the policy.
+    """
+    exchanges, erases = (
+        (torch.rand(len(ends)) < share).tolist() for share in (config.exchange_share, config.erase_share)
+    )
+    empty = in_bytes(before)
+    shown_nowhere = empty[ends].cpu().numpy()
+    usual = [usual_colors(shown_nowhere[:, camera]) for camera in range(images.shape[1])]
+    parts = list(torch.split(in_bytes(images), episodes.bincount(minlength=len(ends)).tolist()))
+    for row in ends.nonzero().flatten().tolist():
+        if exchanges[row] or erases[row]:
+            parts[row] = changed_things(
+                parts[row], empty[row], usual, erases=erases[row], exchanges=exchanges[row]
+            )
+    changed = torch.cat(parts)
+    return changed if images.dtype == torch.uint8 else in_numbers(changed)
 
 
 def _mixed(images: Tensor, episodes: Tensor, n_episodes: int) -> Tensor:

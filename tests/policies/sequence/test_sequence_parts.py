@@ -9,7 +9,7 @@ from torch import Tensor
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies.sequence.core import Core
 from vla_eval.policies.sequence.cores import make_core
-from vla_eval.policies.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature
+from vla_eval.policies.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature, ShapesAndColors
 from vla_eval.policies.sequence.sizes import CORES, ENCODERS
 from vla_eval.policies.sequence.spatial_softmax import LEAST_VARIANCE, spatial_softmax
 
@@ -171,12 +171,13 @@ def test_keypoints_are_where_a_colour_stands_out_from_the_image() -> None:
 
 
 def test_colour_keypoints_know_the_colour_of_a_cell_and_nothing_of_its_neighbours() -> None:
-    encoder = Keypoints(image_px=64, outputs=4, features="color_keypoints")
+    features = Keypoints(image_px=64, outputs=4, features="color_keypoints").features
+    assert isinstance(features, ShapesAndColors)
     image = torch.rand(1, 3, 64, 64)
     changed = image.clone()
     changed[:, :, 8:12, 20:24] = image[:, :, 8:12, 20:24].flip(-1)  # the same mean
     changed[:, :, 40:44, 12:16] += 0.5
-    differs = (encoder.features(changed) - encoder.features(image)).abs().amax(dim=(0, 1)) > 1e-5
+    differs = (features.colors(changed) - features.colors(image)).abs().amax(dim=(0, 1)) > 1e-5
     assert differs.nonzero().tolist() == [[10, 3]]  # row and column of the cell, of 16 each
 
 

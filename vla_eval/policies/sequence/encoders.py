@@ -1,6 +1,7 @@
-"""Plain encoders of images: the one of the paper's baselines, and keypoints of shapes or of colours."""
+"""Plain encoders of images: the one of the paper's baselines, and keypoints of shapes and of colours."""
 
-from typing import cast
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,33 +44,54 @@ class Nature(nn.Sequential):
         )
 
 
-def _features_of_shapes() -> tuple[nn.Module, ...]:
-    """Two convolutions, and one of 1 x 1: 32 maps."""
-    return (
+SHAPE_MAPS, COLOR_MAPS = 32, 64
+
+
+def _shapes() -> nn.Sequential:
+    """Two convolutions, and one of 1 x 1."""
+    return nn.Sequential(
         nn.Conv2d(RGB, 32, 2 * CELL_PX, stride=CELL_PX, padding=2),
         nn.ReLU(),
         nn.Conv2d(32, 32, 3, padding=1),
         nn.ReLU(),
-        nn.Conv2d(32, 32, 1),
+        nn.Conv2d(32, SHAPE_MAPS, 1),
     )
 
 
-def _features_of_colors() -> tuple[nn.Module, ...]:
-    """Three layers over the mean colour of each cell, and nothing of its neighbours: 64 maps.
+class ShapesAndColors(nn.Module):
+    """Beside the maps of convolutions, some of each cell's mean colour alone, by three layers.
 
-    A colour is found in a fraction of the steps in which convolutions find it (docs/general_memory.md).
+    They find a colour in a fraction of the steps in which convolutions find it (docs/general_memory.md).
     """
-    return (
-        nn.AvgPool2d(CELL_PX),
-        nn.Conv2d(RGB, 64, 1),
-        nn.ReLU(),
-        nn.Conv2d(64, 64, 1),
-        nn.ReLU(),
-        nn.Conv2d(64, 64, 1),
-    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shapes = _shapes()
+        self.colors = nn.Sequential(
+            nn.AvgPool2d(CELL_PX),
+            nn.Conv2d(RGB, 64, 1),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 1),
+            nn.ReLU(),
+            nn.Conv2d(64, COLOR_MAPS, 1),
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (N, maps, H / 4, W / 4) of images (N, 3, H, W)."""
+        return torch.cat([self.shapes(images), self.colors(images)], dim=1)
 
 
-FEATURES = {"keypoints": _features_of_shapes, "color_keypoints": _features_of_colors}
+class FeatureRow(NamedTuple):
+    """Features of each cell of 4 x 4 pixels, and how many maps they are."""
+
+    make: Callable[[], nn.Module]
+    n_maps: int
+
+
+FEATURES = {
+    "keypoints": FeatureRow(_shapes, SHAPE_MAPS),
+    "color_keypoints": FeatureRow(ShapesAndColors, SHAPE_MAPS + COLOR_MAPS),
+}
 
 
 class Keypoints(nn.Module):
@@ -88,9 +110,8 @@ class Keypoints(nn.Module):
 
     def __init__(self, *, image_px: int, outputs: int, features: str = "keypoints") -> None:
         super().__init__()
-        layers = FEATURES[features]()
-        self.features = nn.Sequential(*layers)
-        n_maps = cast(nn.Conv2d, layers[-1]).out_channels
+        make, n_maps = FEATURES[features]
+        self.features = make()
         self.sharpness = nn.Parameter(torch.full((n_maps,), 4.0).log())
         self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * n_maps, outputs)
         line = torch.linspace(-1, 1, image_px // CELL_PX)

@@ -1,0 +1,169 @@
+"""Things in images of demonstrations: found, given each other's colours, erased."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.policies.test_episode_samples import CAMERAS, EDGE_PX, N_EPISODES, config, waits_then_moves
+from vla_eval.errors import RecipeError
+from vla_eval.policies.episode_samples import episodes_of
+from vla_eval.policies.things import changed_things, groups_of, things_in, usual_colors
+
+RED, MAROON, CYAN, BLUE = (230, 4, 4), (170, 4, 4), (4, 230, 230), (4, 4, 230)
+EDGE = 40
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        yield
+
+
+def wood(seed: int = 0) -> Tensor:
+    """An image (3, 40, 40) of brown pixels, no two alike."""
+    draws = np.random.default_rng(seed).integers(-12, 13, (3, EDGE, EDGE))
+    return torch.from_numpy((np.array([150, 90, 60])[:, None, None] + draws).astype(np.uint8))
+
+
+def with_square(image: Tensor, color: tuple[int, int, int], x: int, y: int = 20) -> Tensor:
+    """A square of 6 pixels; its lower third is in the shade, half as bright."""
+    image = image.clone()
+    image[:, y : y + 4, x : x + 6] = torch.tensor(color, dtype=torch.uint8)[:, None, None]
+    image[:, y + 4 : y + 6, x : x + 6] = torch.tensor(color, dtype=torch.uint8)[:, None, None] // 2
+    return image
+
+
+def color_at(image: Tensor, x: int, y: int = 20) -> tuple[int, ...]:
+    return tuple(image[:, y, x].tolist())
+
+
+def episode() -> tuple[Tensor, Tensor]:
+    """A red cue, an empty image, then red, maroon, cyan and blue: one camera."""
+    empty, last = wood(1), wood(2)
+    for place, color in enumerate((MAROON, RED, CYAN, BLUE)):
+        last = with_square(last, color, 2 + 10 * place)
+    images = torch.stack([with_square(wood(), RED, 17), empty, last])
+    return images[:, None], empty[None]
+
+
+def changed(*, erases: bool, exchanges: bool) -> Tensor:
+    images, empty = episode()
+    return changed_things(images, empty, [usual_colors(empty.numpy())], erases=erases, exchanges=exchanges)
+
+
+def test_a_thing_is_a_piece_of_colours_that_empty_images_do_not_have() -> None:
+    images, empty = episode()
+    usual = usual_colors(empty.numpy())
+    assert things_in(empty[0].numpy(), usual, frame=0, camera=0) == []
+    things = things_in(images[2, 0].numpy(), usual, frame=2, camera=0)
+    assert [int(thing.mask.sum()) for thing in things] == [36] * 4
+    found = {tuple(thing.color.round().astype(int).tolist()) for thing in things}
+    assert found == {RED, MAROON, CYAN, BLUE}  # the side in the light, not the mean
+
+
+def test_things_of_one_colour_are_a_group_and_a_darker_red_is_another() -> None:
+    images, empty = episode()
+    usual = usual_colors(empty.numpy())
+    things = [
+        thing
+        for frame in (0, 2)
+        for thing in things_in(images[frame, 0].numpy(), usual, frame=frame, camera=0)
+    ]
+    groups, colors = groups_of(things)
+    assert len(things) == 5 and len(colors) == 4
+    (red,) = (group for thing, group in zip(things, groups, strict=True) if thing.frame == 0)
+    assert groups.count(red) == 2
+
+
+def test_colours_change_places_alike_in_all_frames_and_shades_stay() -> None:
+    seen = set()
+    for _ in range(30):
+        images = changed(erases=False, exchanges=True)
+        cue, places = (
+            color_at(images[0, 0], 17),
+            [color_at(images[2, 0], 2 + 10 * place) for place in range(4)],
+        )
+        assert sorted(places) == sorted((MAROON, RED, CYAN, BLUE))
+        assert places[1] == cue  # where red was
+        shade = color_at(images[2, 0], 2, y=25)
+        assert shade == pytest.approx([value / 2 for value in places[0]], abs=1.5)
+        assert torch.equal(images[1, 0], episode()[0][1, 0])
+        seen.add(cue)
+    assert seen == {MAROON, RED, CYAN, BLUE}
+
+
+def test_what_is_erased_was_not_shown_and_something_else_stays() -> None:
+    originals, empty = episode()
+    seen = set()
+    for _ in range(40):
+        images = changed(erases=True, exchanges=False)
+        assert torch.equal(images[:2], originals[:2])
+        gone = [
+            place
+            for place in range(4)
+            if torch.equal(
+                images[2, 0][:, 20:26, 2 + 10 * place :][..., :6],
+                empty[0][:, 20:26, 2 + 10 * place :][..., :6],
+            )
+        ]
+        kept = [
+            place
+            for place in range(4)
+            if color_at(images[2, 0], 2 + 10 * place) == (MAROON, RED, CYAN, BLUE)[place]
+        ]
+        assert sorted(gone + kept) == [0, 1, 2, 3]
+        assert 1 in kept and len(kept) >= 2
+        seen.add(tuple(gone))
+    assert {len(gone) for gone in seen} == {0, 1, 2}
+
+
+def test_nothing_changes_where_no_thing_has_a_colour_that_was_shown() -> None:
+    images, empty = episode()
+    images[0, 0] = with_square(wood(), (4, 230, 4), 17)
+    usual = [usual_colors(empty.numpy())]
+    assert torch.equal(changed_things(images, empty, usual, erases=True, exchanges=True), images)
+
+
+def test_episodes_that_end_at_a_decision_have_other_things_and_others_are_left_as_they_are() -> None:
+    """Steps 0 and 1 show the cue, 2 is empty, 3 is the decision; see `waits_then_moves`."""
+    given = waits_then_moves()
+    grey = torch.full((N_EPISODES, 6, 3, EDGE_PX, EDGE_PX), 100, dtype=torch.uint8)
+    for key in CAMERAS:
+        given[key] = grey.clone()
+        given[key][:, :2, :, 4:8, 6:10] = torch.tensor(RED, dtype=torch.uint8)[:, None, None]
+        given[key][:, 3:, :, 1:5, 1:5] = torch.tensor(RED, dtype=torch.uint8)[:, None, None]
+        given[key][:, 3:, :, 9:13, 9:13] = torch.tensor(BLUE, dtype=torch.uint8)[:, None, None]
+    plain = episodes_of(given, config(decision_share=1.0), training=True)
+    changes = set()
+    for _ in range(10):
+        fields = {"decision_share": 0.5, "exchange_share": 1.0}
+        found = episodes_of(given, config(**fields), training=True)
+        rows = torch.arange(N_EPISODES)[:, None].expand_as(found.first)[found.first]
+        for row in range(N_EPISODES):
+            images = found.images[rows == row]
+            ends = len(images) == 4
+            cue, right = color_at(images[0, 0], 6, 4), color_at(images[-1, 1], 1, 1)
+            assert cue == right
+            assert ends or cue == RED
+            changes.add((ends, cue))
+    assert plain.images.shape[0] == 4 * N_EPISODES
+    assert changes == {(True, RED), (True, BLUE), (False, RED)}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"exchange_share": 1.5, "decision_share": 0.5},
+            r"exchange_share is 1.5, expected a number in \[0, 1\]",
+        ),
+        ({"erase_share": 0.5}, "decision_share is 0, expected more"),
+    ],
+)
+def test_a_wrong_share_is_one_message(fields: dict[str, float], message: str) -> None:
+    with pytest.raises(RecipeError, match=message):
+        config(**fields)

@@ -1,0 +1,132 @@
+"""Things that appear in demonstrations: found by their colours, given each other's colours, or erased.
+
+A thing is a connected piece of an image whose pixels have colours that are in no image of the batch just
+before a decision, when there is nothing to choose from yet. What is done here, and why, is measured in
+docs/general_memory.md ("RememberColor9"). It is for tasks in which a colour tells what is right.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Color = NDArray[np.float64]
+
+MAX_UINT8 = 255
+BIN = 8  # levels of a channel that count as one
+LEAST_PX = 8  # a smaller piece is noise of the video
+SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow and orange differ by more
+BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
+
+
+class Thing(NamedTuple):
+    """A piece of an image.
+
+    Attributes:
+        frame, camera: which image.
+        mask: (H, W) its pixels.
+        color: (3,) where it is brightest, in levels.
+    """
+
+    frame: int
+    camera: int
+    mask: Mask
+    color: Color
+
+
+def usual_colors(images: Bytes) -> NDArray[np.bool_]:
+    """Return (32, 32, 32): which colours (red, green, blue) images (N, 3, H, W) have, or nearly have."""
+    n_bins = (MAX_UINT8 + 1) // BIN
+    red, green, blue = np.moveaxis(images // BIN, 1, 0)
+    found = np.zeros((n_bins,) * 3, dtype=np.bool_)
+    found[red, green, blue] = True
+    near: NDArray[np.bool_] = ndimage.binary_dilation(found, np.ones((3, 3, 3)))
+    return near
+
+
+def things_in(image: Bytes, usual: NDArray[np.bool_], *, frame: int, camera: int) -> list[Thing]:
+    """Return the things in an image (3, H, W)."""
+    red, green, blue = image // BIN
+    pieces, n_pieces = ndimage.label(~usual[red, green, blue])
+    things = []
+    for number in range(1, n_pieces + 1):
+        mask = pieces == number
+        if mask.sum() >= LEAST_PX:
+            things.append(Thing(frame, camera, mask, _bright_color(image[:, mask])))
+    return things
+
+
+def _bright_color(pixels: Bytes) -> Color:
+    """Return the mean (3,) of the brightest of pixels (3, N)."""
+    light = pixels.sum(axis=0, dtype=np.int64)
+    color: Color = pixels[:, light >= np.quantile(light, 1 - BRIGHT_SHARE)].mean(axis=1)
+    return color
+
+
+def groups_of(things: Sequence[Thing]) -> tuple[list[int], NDArray[np.float64]]:
+    """Return the group of each thing, and the colours (groups, 3): things of one colour are a group."""
+    colors: list[Color] = []
+    groups = []
+    for thing in things:
+        away = [float(np.linalg.norm(thing.color - color)) for color in colors]
+        if not away or min(away) > SAME_COLOR:
+            colors.append(thing.color)
+            away.append(0.0)
+        groups.append(int(np.argmin(away)))
+    return groups, np.array(colors).reshape(-1, 3)
+
+
+def changed_things(
+    images: Tensor, empty: Tensor, usual: Sequence[NDArray[np.bool_]], *, erases: bool, exchanges: bool
+) -> Tensor:
+    """Return the images of an episode that ends at a decision, with other things; drawn by torch's generator.
+
+    Nothing changes where no thing of the last frame has a colour that was shown before.
+
+    Args:
+        images: (frames, cameras, 3, H, W) uint8.
+        empty: (cameras, 3, H, W) uint8, the frame before the decision.
+        usual: of each camera, see `usual_colors`.
+        erases: of the colours that appear only in the last frame, a random number is replaced by `empty`; one
+            always stays.
+        exchanges: all colours of things change places, alike in all frames; shades are kept.
+    """
+    before, after = images.cpu().numpy(), images.cpu().numpy().copy()
+    n_frames, n_cameras = before.shape[:2]
+    things = [
+        thing
+        for frame in range(n_frames)
+        for camera in range(n_cameras)
+        for thing in things_in(before[frame, camera], usual[camera], frame=frame, camera=camera)
+    ]
+    groups, colors = groups_of(things)
+    at_end = [thing.frame == n_frames - 1 for thing in things]
+    shown = {group for group, is_last in zip(groups, at_end, strict=True) if not is_last}
+    last = {group for group, is_last in zip(groups, at_end, strict=True) if is_last}
+    if not shown & last:
+        return images
+    erased = _drawn(sorted(last - shown)) if erases else frozenset()
+    order = torch.randperm(len(colors)).tolist() if exchanges else list(range(len(colors)))
+    for thing, group in zip(things, groups, strict=True):
+        place, mask = after[thing.frame, thing.camera], thing.mask
+        if group in erased:
+            mask = ndimage.binary_dilation(mask, np.ones((3, 3)))
+            place[:, mask] = empty[thing.camera].cpu().numpy()[:, mask]
+        elif exchanges:
+            shade = before[thing.frame, thing.camera][:, mask].max(axis=0) / thing.color.max()
+            place[:, mask] = (colors[order[group]][:, None] * shade).round().clip(0, MAX_UINT8)
+    return torch.from_numpy(after).to(images.device)
+
+
+def _drawn(wrong: Sequence[int]) -> frozenset[int]:
+    """Return those to erase: none to all but one of them."""
+    if len(wrong) < 2:
+        return frozenset()
+    n_erased = int(torch.randint(len(wrong), (1,)))
+    return frozenset(wrong[i] for i in torch.randperm(len(wrong))[:n_erased].tolist())
