@@ -65,6 +65,14 @@ def test_a_thing_is_a_piece_of_colours_that_empty_images_do_not_have() -> None:
     assert found == {RED, MAROON, CYAN, BLUE}  # the side in the light, not the mean
 
 
+def test_things_that_touch_are_two_if_their_hues_differ() -> None:
+    _, empty = episode()
+    image = with_square(with_square(wood(4), RED, 10), BLUE, 16).numpy()
+    things = things_in(image, usual_colors(empty.numpy()), frame=0, camera=0)
+    assert [int(thing.mask.sum()) for thing in things] == [36, 36]
+    assert {tuple(thing.color.round().astype(int).tolist()) for thing in things} == {RED, BLUE}
+
+
 def test_things_of_one_colour_are_a_group_and_a_darker_red_is_another() -> None:
     images, empty = episode()
     usual = usual_colors(empty.numpy())

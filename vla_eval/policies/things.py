@@ -1,8 +1,8 @@
 """Things that appear in demonstrations: found by their colours, given each other's colours, or erased.
 
-A thing is a connected piece of an image whose pixels have colours that are in no image of the batch just
-before a decision, when there is nothing to choose from yet. What is done here, and why, is measured in
-docs/general_memory.md ("RememberColor9"). It is for tasks in which a colour tells what is right.
+A thing is a connected piece of an image whose pixels have one hue, and colours that are in no image of the
+batch just before a decision, when there is nothing to choose from yet. What is done here, and why, is
+measured in docs/general_memory.md ("RememberColor9"). It is for tasks in which a colour tells what is right.
 """
 
 from collections.abc import Sequence
@@ -22,6 +22,7 @@ MAX_UINT8 = 255
 BIN = 8  # levels of a channel that count as one
 LEAST_PX = 8  # a smaller piece is noise of the video
 SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow and orange differ by more
+HUE_EDGES = (0.35, 0.87)  # of a channel relative to the strongest: orange's green is between, yellow's above
 BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
 
 
@@ -53,13 +54,35 @@ def usual_colors(images: Bytes) -> NDArray[np.bool_]:
 def things_in(image: Bytes, usual: NDArray[np.bool_], *, frame: int, camera: int) -> list[Thing]:
     """Return the things in an image (3, H, W)."""
     red, green, blue = image // BIN
-    pieces, n_pieces = ndimage.label(~usual[red, green, blue])
-    things = []
-    for number in range(1, n_pieces + 1):
-        mask = pieces == number
-        if mask.sum() >= LEAST_PX:
-            things.append(Thing(frame, camera, mask, _bright_color(image[:, mask])))
-    return things
+    numbers, n_things = _numbered(~usual[red, green, blue], _hues(image))
+    masks = (numbers == number for number in range(1, n_things + 1))
+    return [Thing(frame, camera, mask, _bright_color(image[:, mask])) for mask in masks]
+
+
+def _hues(image: Bytes) -> NDArray[np.int64]:
+    """Return (H, W) a number for the hue of each pixel, the same in the light and in the shade."""
+    shares = image / np.maximum(image.max(axis=0), 1)
+    red, green, blue = np.digitize(shares, HUE_EDGES)
+    hues: NDArray[np.int64] = 9 * red + 3 * green + blue
+    return hues
+
+
+def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return (H, W) which thing a pixel belongs to, 0: none, and how many things there are.
+
+    Pixels between two things, which have the hue of neither, belong to the nearer one.
+    """
+    cores, n_cores = np.zeros(unusual.shape, dtype=np.int64), 0
+    for hue in np.unique(hues[unusual]):
+        parts, _ = ndimage.label(unusual & (hues == hue))
+        sizes = np.bincount(parts.ravel())
+        for part in np.flatnonzero(sizes[1:] >= LEAST_PX) + 1:
+            n_cores += 1
+            cores[parts == part] = n_cores
+    pieces, _ = ndimage.label(unusual)
+    rows, columns = ndimage.distance_transform_edt(cores == 0, return_distances=False, return_indices=True)
+    same_piece = unusual & (pieces == pieces[rows, columns])
+    return np.where(same_piece, cores[rows, columns], 0), n_cores
 
 
 def _bright_color(pixels: Bytes) -> Color:
