@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tests.policies.test_episode_samples import CAMERAS, EDGE_PX, N_EPISODES, config, waits_then_moves
 from vla_eval.errors import RecipeError
+from vla_eval.features import ACTION_KEY
 from vla_eval.policies.episode_samples import episodes_of
 from vla_eval.policies.things import changed_things, groups_of, things_in, usual_colors
 
@@ -52,12 +53,12 @@ def episode() -> tuple[Tensor, Tensor]:
 
 def changed(*, erases: bool, exchanges: bool) -> Tensor:
     images, empty = episode()
-    return changed_things(images, empty, [usual_colors(empty.numpy())], erases=erases, exchanges=exchanges)
+    return changed_things(images, empty, n_before=2, erases=erases, exchanges=exchanges)
 
 
 def test_a_thing_is_a_piece_of_colours_that_empty_images_do_not_have() -> None:
     images, empty = episode()
-    usual = usual_colors(empty.numpy())
+    usual = usual_colors(empty[0].numpy())
     assert things_in(empty[0].numpy(), usual, frame=0, camera=0) == []
     things = things_in(images[2, 0].numpy(), usual, frame=2, camera=0)
     assert [int(thing.mask.sum()) for thing in things] == [36] * 4
@@ -68,14 +69,14 @@ def test_a_thing_is_a_piece_of_colours_that_empty_images_do_not_have() -> None:
 def test_things_that_touch_are_two_if_their_hues_differ() -> None:
     _, empty = episode()
     image = with_square(with_square(wood(4), RED, 10), BLUE, 16).numpy()
-    things = things_in(image, usual_colors(empty.numpy()), frame=0, camera=0)
+    things = things_in(image, usual_colors(empty[0].numpy()), frame=0, camera=0)
     assert [int(thing.mask.sum()) for thing in things] == [36, 36]
     assert {tuple(thing.color.round().astype(int).tolist()) for thing in things} == {RED, BLUE}
 
 
 def test_things_of_one_colour_are_a_group_and_a_darker_red_is_another() -> None:
     images, empty = episode()
-    usual = usual_colors(empty.numpy())
+    usual = usual_colors(empty[0].numpy())
     things = [
         thing
         for frame in (0, 2)
@@ -132,34 +133,36 @@ def test_what_is_erased_was_not_shown_and_something_else_stays() -> None:
 def test_nothing_changes_where_no_thing_has_a_colour_that_was_shown() -> None:
     images, empty = episode()
     images[0, 0] = with_square(wood(), (4, 230, 4), 17)
-    usual = [usual_colors(empty.numpy())]
-    assert torch.equal(changed_things(images, empty, usual, erases=True, exchanges=True), images)
+    found = changed_things(images, empty, n_before=2, erases=True, exchanges=True)
+    assert torch.equal(found, images)
 
 
-def test_episodes_that_end_at_a_decision_have_other_things_and_others_are_left_as_they_are() -> None:
+def test_in_a_share_of_the_episodes_colours_change_places_in_all_frames_also_after_the_decision() -> None:
     """Steps 0 and 1 show the cue, 2 is empty, 3 is the decision; see `waits_then_moves`."""
     given = waits_then_moves()
+    # The last episode decides at step 4 and has things in view before it: that must not hide the others'.
+    given[ACTION_KEY][-1, 3:] = given[ACTION_KEY][-1, 2]
+    given[ACTION_KEY][-1, 4:] += 0.5
     grey = torch.full((N_EPISODES, 6, 3, EDGE_PX, EDGE_PX), 100, dtype=torch.uint8)
     for key in CAMERAS:
         given[key] = grey.clone()
         given[key][:, :2, :, 4:8, 6:10] = torch.tensor(RED, dtype=torch.uint8)[:, None, None]
         given[key][:, 3:, :, 1:5, 1:5] = torch.tensor(RED, dtype=torch.uint8)[:, None, None]
         given[key][:, 3:, :, 9:13, 9:13] = torch.tensor(BLUE, dtype=torch.uint8)[:, None, None]
-    plain = episodes_of(given, config(decision_share=1.0), training=True)
-    changes = set()
-    for _ in range(10):
-        fields = {"decision_share": 0.5, "exchange_share": 1.0}
-        found = episodes_of(given, config(**fields), training=True)
-        rows = torch.arange(N_EPISODES)[:, None].expand_as(found.first)[found.first]
-        for row in range(N_EPISODES):
-            images = found.images[rows == row]
-            ends = len(images) == 4
-            cue, right = color_at(images[0, 0], 6, 4), color_at(images[-1, 1], 1, 1)
-            assert cue == right
-            assert ends or cue == RED
-            changes.add((ends, cue))
-    assert plain.images.shape[0] == 4 * N_EPISODES
-    assert changes == {(True, RED), (True, BLUE), (False, RED)}
+    seen = set()
+    for share in (0.0, 0.5, 1.0):
+        for _ in range(10):
+            found = episodes_of(given, config(decision_share=0.5, exchange_share=share), training=True)
+            rows = torch.arange(N_EPISODES)[:, None].expand_as(found.first)[found.first]
+            for row in range(N_EPISODES - 1):
+                images = found.images[rows == row]
+                cue = color_at(images[0, 0], 6, 4)
+                assert {color_at(image[1], 1, 1) for image in images[3:]} == {cue}
+                seen.add((share, len(images), cue))
+    assert seen == {
+        *((0.0, n_frames, RED) for n_frames in (4, 5)),
+        *((share, n_frames, color) for share in (0.5, 1.0) for n_frames in (4, 5) for color in (RED, BLUE)),
+    }
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,11 @@ class EpisodeConfig(PortedConfig):
         sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
             one of several has to know which is meant, where the images do not show it.
         mix_colors: the three colours of an episode's images change places at random in training.
-        exchange_share: share of the episodes that end at a decision in which the things that appear exchange
-            their colours, alike in all frames: a scene looks otherwise each time. See `things`.
-        erase_share: share of them in which some of the things that appear at the decision, but of no colour
-            that was shown before, are erased: a rule is learned sooner where there is less to choose from.
+        exchange_share: share of the episodes in which the things that appear exchange their colours, alike in
+            all frames: a scene looks otherwise each time. See `things`.
+        erase_share: of those that end at their first decision, the share in which some of the things that
+            appear at it, but of no colour that was shown before, are erased: a rule is learned sooner where
+            there is less to choose from.
         shift_px: the images of an episode are moved by up to so many pixels in each direction in training,
             those of each camera by an amount of their own, the same in all frames (random shifts, Kostrikov
             et al. 2020, "Image Augmentation Is All You Need"). 0: they are not.
@@ -101,10 +102,8 @@ class EpisodeConfig(PortedConfig):
         for name in ("decision_share", "exchange_share", "erase_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
-        if (self.exchange_share or self.erase_share) and not self.decision_share:
-            raise RecipeError(
-                "decision_share is 0, expected more: things change in episodes that end at a decision"
-            )
+        if self.erase_share and not self.decision_share:
+            raise RecipeError("decision_share is 0, expected more: erase_share is of episodes that end there")
         if self.shift_px < 0:
             raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
         if self.late_steps < 0:

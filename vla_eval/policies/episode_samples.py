@@ -8,7 +8,7 @@ from torch import Tensor
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
-from vla_eval.policies.things import MAX_UINT8, changed_things, usual_colors
+from vla_eval.policies.things import MAX_UINT8, changed_things
 
 LEAST_VARIANCE_M2 = 1e-6
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
@@ -101,11 +101,10 @@ def episodes_of(
     episodes = rows.expand_as(steps)[first]
     images = torch.stack([batch[key][episodes, steps[first]] for key in config.image_features], dim=1)
     if training and (config.exchange_share or config.erase_share):
-        ends = taken(begins)[:, -1]  # padding is the last step again
-        before = torch.stack(
-            [batch[key][rows[:, 0], steps[:, -1] - 1] for key in config.image_features], dim=1
-        )
-        images = _with_other_things(images, episodes, ends, before, config)
+        decision = torch.where(begins.any(dim=1), begins.int().argmax(dim=1), 0)
+        empty = torch.stack([batch[key][rows[:, 0], decision - 1] for key in config.image_features], dim=1)
+        n_before = (first & (steps < decision[:, None])).sum(dim=1)
+        images = _with_other_things(images, first.sum(dim=1), n_before, empty, config)
     return Episodes(
         images=_augmented(images, episodes, config, n_episodes=len(steps)) if training else images,
         first=first,
@@ -242,28 +241,30 @@ def _until_a_decision(begins: Tensor, share: float) -> Tensor:
 
 
 def _with_other_things(
-    images: Tensor, episodes: Tensor, ends: Tensor, before: Tensor, config: EpisodeConfig
+    images: Tensor, n_frames: Tensor, n_before: Tensor, empty: Tensor, config: EpisodeConfig
 ) -> Tensor:
-    """Change the things in a share of the episodes that end at a decision, see `changed_things`.
+    """Change the things in a share of the episodes, see `changed_things`.
 
     Args:
         images: (N, cameras, 3, H, W), one episode after the other.
-        episodes: (N,) whose they are.
-        ends: (B,) which episodes end at a decision.
-        before: (B, cameras, 3, H, W) the frames before the last ones.
+        n_frames: (B,) how many are of each.
+        n_before: (B,) how many of these are before the first decision; 0: there is none.
+        empty: (B, cameras, 3, H, W) the frames before the first decisions.
         config: of the policy.
     """
     exchanges, erases = (
-        (torch.rand(len(ends)) < share).tolist() for share in (config.exchange_share, config.erase_share)
+        (torch.rand(len(n_frames)) < share).tolist() for share in (config.exchange_share, config.erase_share)
     )
-    empty = in_bytes(before)
-    shown_nowhere = empty[ends].cpu().numpy()
-    usual = [usual_colors(shown_nowhere[:, camera]) for camera in range(images.shape[1])]
-    parts = list(torch.split(in_bytes(images), episodes.bincount(minlength=len(ends)).tolist()))
-    for row in ends.nonzero().flatten().tolist():
+    nothing = in_bytes(empty)
+    parts = list(torch.split(in_bytes(images), n_frames.tolist()))
+    for row in n_before.nonzero().flatten().tolist():
         if exchanges[row] or erases[row]:
             parts[row] = changed_things(
-                parts[row], empty[row], usual, erases=erases[row], exchanges=exchanges[row]
+                parts[row],
+                nothing[row],
+                n_before=int(n_before[row]),
+                erases=erases[row],
+                exchanges=exchanges[row],
             )
     changed = torch.cat(parts)
     return changed if images.dtype == torch.uint8 else in_numbers(changed)

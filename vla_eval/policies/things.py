@@ -1,8 +1,8 @@
 """Things that appear in demonstrations: found by their colours, given each other's colours, or erased.
 
-A thing is a connected piece of an image whose pixels have one hue, and colours that are in no image of the
-batch just before a decision, when there is nothing to choose from yet. What is done here, and why, is
-measured in docs/general_memory.md ("RememberColor9"). It is for tasks in which a colour tells what is right.
+A thing is a connected piece of an image whose pixels have one hue, and colours that the image just before the
+episode's first decision does not have, when there is nothing to choose from yet. What is done here, and why,
+is measured in docs/general_memory.md ("RememberColor9"). For tasks in which a colour tells what is right.
 """
 
 from collections.abc import Sequence
@@ -41,10 +41,10 @@ class Thing(NamedTuple):
     color: Color
 
 
-def usual_colors(images: Bytes) -> NDArray[np.bool_]:
-    """Return (32, 32, 32): which colours (red, green, blue) images (N, 3, H, W) have, or nearly have."""
+def usual_colors(image: Bytes) -> NDArray[np.bool_]:
+    """Return (32, 32, 32): which colours (red, green, blue) an image (3, H, W) has, or nearly has."""
     n_bins = (MAX_UINT8 + 1) // BIN
-    red, green, blue = np.moveaxis(images // BIN, 1, 0)
+    red, green, blue = image // BIN
     found = np.zeros((n_bins,) * 3, dtype=np.bool_)
     found[red, green, blue] = True
     near: NDArray[np.bool_] = ndimage.binary_dilation(found, np.ones((3, 3, 3)))
@@ -105,23 +105,23 @@ def groups_of(things: Sequence[Thing]) -> tuple[list[int], NDArray[np.float64]]:
     return groups, np.array(colors).reshape(-1, 3)
 
 
-def changed_things(
-    images: Tensor, empty: Tensor, usual: Sequence[NDArray[np.bool_]], *, erases: bool, exchanges: bool
-) -> Tensor:
-    """Return the images of an episode that ends at a decision, with other things; drawn by torch's generator.
+def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool, exchanges: bool) -> Tensor:
+    """Return the images of an episode with other things; drawn by torch's generator.
 
-    Nothing changes where no thing of the last frame has a colour that was shown before.
+    Nothing changes where no thing from the decision on has a colour that was shown before.
 
     Args:
         images: (frames, cameras, 3, H, W) uint8.
-        empty: (cameras, 3, H, W) uint8, the frame before the decision.
-        usual: of each camera, see `usual_colors`.
-        erases: of the colours that appear only in the last frame, a random number is replaced by `empty`; one
-            always stays.
+        empty: (cameras, 3, H, W) uint8, the frame before the first decision.
+        n_before: how many of the frames are before it.
+        erases: of the colours that appear only at the decision, a random number is replaced by `empty`; one
+            always stays. Only if the decision is the last frame: later, the arm has moved its camera.
         exchanges: all colours of things change places, alike in all frames; shades are kept.
     """
     before, after = images.cpu().numpy(), images.cpu().numpy().copy()
+    nothing = empty.cpu().numpy()
     n_frames, n_cameras = before.shape[:2]
+    usual = [usual_colors(nothing[camera]) for camera in range(n_cameras)]
     things = [
         thing
         for frame in range(n_frames)
@@ -129,18 +129,17 @@ def changed_things(
         for thing in things_in(before[frame, camera], usual[camera], frame=frame, camera=camera)
     ]
     groups, colors = groups_of(things)
-    at_end = [thing.frame == n_frames - 1 for thing in things]
-    shown = {group for group, is_last in zip(groups, at_end, strict=True) if not is_last}
-    last = {group for group, is_last in zip(groups, at_end, strict=True) if is_last}
-    if not shown & last:
+    shown = {group for group, thing in zip(groups, things, strict=True) if thing.frame < n_before}
+    choices = {group for group, thing in zip(groups, things, strict=True) if thing.frame >= n_before}
+    if not shown & choices:
         return images
-    erased = _drawn(sorted(last - shown)) if erases else frozenset()
+    erased = _drawn(sorted(choices - shown)) if erases and n_frames == n_before + 1 else frozenset()
     order = torch.randperm(len(colors)).tolist() if exchanges else list(range(len(colors)))
     for thing, group in zip(things, groups, strict=True):
         place, mask = after[thing.frame, thing.camera], thing.mask
         if group in erased:
             mask = ndimage.binary_dilation(mask, np.ones((3, 3)))
-            place[:, mask] = empty[thing.camera].cpu().numpy()[:, mask]
+            place[:, mask] = nothing[thing.camera][:, mask]
         elif exchanges:
             shade = before[thing.frame, thing.camera][:, mask].max(axis=0) / thing.color.max()
             place[:, mask] = (colors[order[group]][:, None] * shade).round().clip(0, MAX_UINT8)
