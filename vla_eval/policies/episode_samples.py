@@ -101,7 +101,7 @@ def episodes_of(
     episodes = rows.expand_as(steps)[first]
     images = torch.stack([batch[key][episodes, steps[first]] for key in config.image_features], dim=1)
     if training and (config.exchange_share or config.erase_share):
-        decision = torch.where(begins.any(dim=1), begins.int().argmax(dim=1), 0)
+        decision = begins.int().argmax(dim=1)  # 0: there is none
         empty = torch.stack([batch[key][rows[:, 0], decision - 1] for key in config.image_features], dim=1)
         n_before = (first & (steps < decision[:, None])).sum(dim=1)
         images = _with_other_things(images, first.sum(dim=1), n_before, empty, config)

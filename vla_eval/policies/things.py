@@ -134,7 +134,7 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
     if not shown & choices:
         return images
     erased = _drawn(sorted(choices - shown)) if erases and n_frames == n_before + 1 else frozenset()
-    order = torch.randperm(len(colors)).tolist() if exchanges else list(range(len(colors)))
+    others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
     for thing, group in zip(things, groups, strict=True):
         place, mask = after[thing.frame, thing.camera], thing.mask
         if group in erased:
@@ -142,7 +142,7 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
             place[:, mask] = nothing[thing.camera][:, mask]
         elif exchanges:
             shade = before[thing.frame, thing.camera][:, mask].max(axis=0) / thing.color.max()
-            place[:, mask] = (colors[order[group]][:, None] * shade).round().clip(0, MAX_UINT8)
+            place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_UINT8)
     return torch.from_numpy(after).to(images.device)
 
 

@@ -1,6 +1,7 @@
 """Plain encoders of images: the one of the paper's baselines, and keypoints of shapes and of colours."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -147,14 +148,10 @@ class Cameras(nn.ModuleList):
         channels = RGB * n_cameras if ENCODERS[name].shared else RGB
         n_encoders = RGB * n_cameras // channels
         self.outputs = n_encoders * outputs
-        if name in FEATURES:
-            super().__init__(
-                Keypoints(image_px=image_px, outputs=outputs, features=name) for _ in range(n_encoders)
-            )
-        else:
-            super().__init__(
-                Nature(image_px=image_px, outputs=outputs, channels=channels) for _ in range(n_encoders)
-            )
+        make: Callable[..., nn.Module] = (
+            partial(Keypoints, features=name) if name in FEATURES else partial(Nature, channels=channels)
+        )
+        super().__init__(make(image_px=image_px, outputs=outputs) for _ in range(n_encoders))
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes.
