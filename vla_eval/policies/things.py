@@ -54,7 +54,12 @@ def usual_colors(image: Bytes) -> NDArray[np.bool_]:
 def things_in(image: Bytes, usual: NDArray[np.bool_], *, frame: int, camera: int) -> list[Thing]:
     """Return the things in an image (3, H, W)."""
     red, green, blue = image // BIN
-    numbers, n_things = _numbered(~usual[red, green, blue], _hues(image))
+    unusual = ~usual[red, green, blue]
+    if np.count_nonzero(unusual) < LEAST_PX:
+        return []
+    box = ndimage.find_objects(unusual.astype(np.int8))[0]
+    numbers = np.zeros(unusual.shape, dtype=np.int64)
+    numbers[box], n_things = _numbered(unusual[box], _hues(image[:, *box]))
     masks = (numbers == number for number in range(1, n_things + 1))
     return [Thing(frame, camera, mask, _bright_color(image[:, mask])) for mask in masks]
 
@@ -62,7 +67,8 @@ def things_in(image: Bytes, usual: NDArray[np.bool_], *, frame: int, camera: int
 def _hues(image: Bytes) -> NDArray[np.int64]:
     """Return (H, W) a number for the hue of each pixel, the same in the light and in the shade."""
     shares = image / np.maximum(image.max(axis=0), 1)
-    red, green, blue = np.digitize(shares, HUE_EDGES)
+    first, second = HUE_EDGES
+    red, green, blue = (shares >= first).astype(np.int64) + (shares >= second)
     hues: NDArray[np.int64] = 9 * red + 3 * green + blue
     return hues
 
