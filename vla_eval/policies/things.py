@@ -2,7 +2,7 @@
 
 A thing is a connected piece of an image whose pixels have one hue, and colours that the image just before the
 episode's first decision does not have, when there is nothing to choose from yet. What is done here, and why,
-is measured in docs/general_memory.md ("RememberColor9"). For tasks in which a colour tells what is right.
+is measured in docs/learning_the_rule.md. For tasks in which a colour tells what is right.
 """
 
 from collections.abc import Sequence
