@@ -5,6 +5,7 @@ episode's first decision does not have, when there is nothing to choose from yet
 is measured in docs/learning_the_rule.md. For tasks in which a colour tells what is right.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ BIN = 8  # levels of a channel that count as one
 LEAST_PX = 8  # a smaller piece is noise of the video
 SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow and orange differ by more
 HUE_EDGES = (0.35, 0.87)  # of a channel relative to the strongest: orange's green is between, yellow's above
+IN_ITS_PLANE = ndimage.generate_binary_structure(2, 1)[None] & np.array([False, True, False])[:, None, None]
 BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
 
 
@@ -31,37 +33,48 @@ class Thing(NamedTuple):
 
     Attributes:
         frame, camera: which image.
-        mask: (H, W) its pixels.
+        box: the part (rows, columns) of the image in which all its things are, and a pixel around it.
+        mask: the thing's pixels in the box.
         color: (3,) where it is brightest, in levels.
     """
 
     frame: int
     camera: int
+    box: tuple[slice, slice]
     mask: Mask
     color: Color
 
 
-def usual_colors(image: Bytes) -> NDArray[np.bool_]:
+def usual_colors(image: Bytes) -> Mask:
     """Return (32, 32, 32): which colours (red, green, blue) an image (3, H, W) has, or nearly has."""
     n_bins = (MAX_UINT8 + 1) // BIN
     red, green, blue = image // BIN
     found = np.zeros((n_bins,) * 3, dtype=np.bool_)
     found[red, green, blue] = True
-    near: NDArray[np.bool_] = ndimage.binary_dilation(found, np.ones((3, 3, 3)))
-    return near
+    return _widened(found)
 
 
-def things_in(image: Bytes, usual: NDArray[np.bool_], *, frame: int, camera: int) -> list[Thing]:
+def _widened(mask: Mask) -> Mask:
+    """Return the mask with the neighbours of what is in it, those at corners, too."""
+    wide = mask.copy()
+    for axis in range(mask.ndim):
+        lines, narrow = wide.swapaxes(0, axis), wide.copy().swapaxes(0, axis)
+        lines[1:] |= narrow[:-1]
+        lines[:-1] |= narrow[1:]
+    return wide
+
+
+def things_in(image: Bytes, usual: Mask, *, frame: int, camera: int) -> list[Thing]:
     """Return the things in an image (3, H, W)."""
     red, green, blue = image // BIN
     unusual = ~usual[red, green, blue]
     if np.count_nonzero(unusual) < LEAST_PX:
         return []
-    box = ndimage.find_objects(unusual.astype(np.int8))[0]
-    numbers = np.zeros(unusual.shape, dtype=np.int64)
-    numbers[box], n_things = _numbered(unusual[box], _hues(image[:, *box]))
+    rows, columns = ndimage.find_objects(_widened(unusual).astype(np.int8))[0]
+    part = image[:, rows, columns]
+    numbers, n_things = _numbered(unusual[rows, columns], _hues(part))
     masks = (numbers == number for number in range(1, n_things + 1))
-    return [Thing(frame, camera, mask, _bright_color(image[:, mask])) for mask in masks]
+    return [Thing(frame, camera, (rows, columns), mask, _bright_color(part[:, mask])) for mask in masks]
 
 
 def _hues(image: Bytes) -> NDArray[np.int64]:
@@ -78,23 +91,22 @@ def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> tuple[NDArray[np.int64]
 
     Pixels between two things, which have the hue of neither, belong to the nearer one.
     """
-    cores, n_cores = np.zeros(unusual.shape, dtype=np.int64), 0
-    for hue in np.unique(hues[unusual]):
-        parts, _ = ndimage.label(unusual & (hues == hue))
-        sizes = np.bincount(parts.ravel())
-        for part in np.flatnonzero(sizes[1:] >= LEAST_PX) + 1:
-            n_cores += 1
-            cores[parts == part] = n_cores
+    planes = unusual & (hues == np.unique(hues[unusual])[:, None, None])
+    parts, _ = ndimage.label(planes, IN_ITS_PLANE)
+    is_core = np.bincount(parts.ravel()) >= LEAST_PX
+    is_core[0] = False
+    cores = np.where(is_core, np.cumsum(is_core), 0)[parts].sum(axis=0)
     pieces, _ = ndimage.label(unusual)
     rows, columns = ndimage.distance_transform_edt(cores == 0, return_distances=False, return_indices=True)
     same_piece = unusual & (pieces == pieces[rows, columns])
-    return np.where(same_piece, cores[rows, columns], 0), n_cores
+    return np.where(same_piece, cores[rows, columns], 0), int(is_core.sum())
 
 
 def _bright_color(pixels: Bytes) -> Color:
     """Return the mean (3,) of the brightest of pixels (3, N)."""
     light = pixels.sum(axis=0, dtype=np.int64)
-    color: Color = pixels[:, light >= np.quantile(light, 1 - BRIGHT_SHARE)].mean(axis=1)
+    least = math.ceil((len(light) - 1) * (1 - BRIGHT_SHARE))
+    color: Color = pixels[:, light >= np.partition(light, least)[least]].mean(axis=1)
     return color
 
 
@@ -142,12 +154,13 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
     erased = _drawn(sorted(choices - shown)) if erases and n_frames == n_before + 1 else frozenset()
     others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
     for thing, group in zip(things, groups, strict=True):
-        place, mask = after[thing.frame, thing.camera], thing.mask
+        part = (slice(None), *thing.box)
+        place, mask = after[thing.frame, thing.camera][part], thing.mask
         if group in erased:
-            mask = ndimage.binary_dilation(mask, np.ones((3, 3)))
-            place[:, mask] = nothing[thing.camera][:, mask]
+            mask = _widened(mask)
+            place[:, mask] = nothing[thing.camera][part][:, mask]
         elif exchanges:
-            shade = before[thing.frame, thing.camera][:, mask].max(axis=0) / thing.color.max()
+            shade = before[thing.frame, thing.camera][part][:, mask].max(axis=0) / thing.color.max()
             place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_UINT8)
     return torch.from_numpy(after).to(images.device)
 
