@@ -9,8 +9,9 @@ from torch import Tensor
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.policies.episode_samples import Episodes, episodes_of, in_numbers
+from vla_eval.policies.episode_samples import Episodes, episodes_of
 from vla_eval.policies.sequence.configuration_sequence import MikasaSequenceConfig
+from vla_eval.policies.steps.levels import in_numbers
 
 CAMERAS = ("observation.images.base", "observation.images.wrist")
 N_EPISODES, N_STEPS, CHUNK, EDGE_PX, MOST_PX = 6, 5, 8, 16, 3

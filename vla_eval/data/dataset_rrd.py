@@ -31,6 +31,7 @@ from vla_eval.features import (
     STATE_NAMES,
     SUCCESS_KEY,
 )
+from vla_eval.policies.steps.levels import in_bytes
 from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step, time_columns
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, PHASES, log_arm
@@ -182,8 +183,7 @@ def _log_pictures(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Map
     for step, frame in enumerate(frames):
         set_step(stream, step, float(dataset.fps))
         for key in dataset.meta.camera_keys:
-            # lerobot gives (3, H, W) float32 in [0, 1].
-            picture = np.rint(np.asarray(frame[key]) * 255).astype(np.uint8).transpose(1, 2, 0)
+            picture = in_bytes(frame[key]).permute(1, 2, 0).numpy()
             stream.log(f"cameras/{_camera(key)}", rr.Image(picture).compress(jpeg_quality=JPEG_QUALITY))
 
 

@@ -19,11 +19,11 @@ from vla_eval.data.frame_cache import FRAMES_FOLDER, EpisodeRows, FrameSource, f
 from vla_eval.data.rewards import rewards_of
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, RewardKind
+from vla_eval.policies.steps.levels import in_numbers
 from vla_eval.storage.cache import cache_dir
 
 Storage = Literal["disk", "ram"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
-MAX_UINT8 = 255
 
 
 class FrameLayout(NamedTuple):
@@ -182,7 +182,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         taken = self._frames[camera][rows]  # a list of rows copies
         frames = torch.from_numpy(taken) if isinstance(taken, np.ndarray) else taken
         frames = frames.squeeze(0)
-        frames = frames if self._return_uint8 else frames.type(torch.float32) / MAX_UINT8
+        frames = frames if self._return_uint8 else in_numbers(frames)
         return frames if self._transforms is None else self._transforms(frames)
 
 

@@ -8,7 +8,8 @@ from torch import Tensor
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.policies.eef_state import SPACE
 from vla_eval.policies.episode_config import EpisodeConfig
-from vla_eval.policies.things import MAX_UINT8, changed_things
+from vla_eval.policies.steps.levels import in_bytes, in_numbers
+from vla_eval.policies.things import changed_things
 
 LEAST_VARIANCE_M2 = 1e-6
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
@@ -42,16 +43,6 @@ class Episodes(NamedTuple):
     def frames(self) -> Tensor:
         """(B, T) which of `images` each step shows; padding shows the last one of its episode."""
         return self.first.flatten().cumsum(dim=0).sub(1).reshape(self.first.shape)
-
-
-def in_numbers(images: Tensor) -> Tensor:
-    """Return images in [0, 1], given that or bytes. Of bytes it takes a while: leave padding out first."""
-    return images.to(torch.float32).div_(MAX_UINT8) if images.dtype == torch.uint8 else images
-
-
-def in_bytes(images: Tensor) -> Tensor:
-    """Return images as bytes, given that or numbers in [0, 1]."""
-    return images if images.dtype == torch.uint8 else images.mul(MAX_UINT8).round_().to(torch.uint8)
 
 
 def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:

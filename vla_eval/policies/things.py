@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from vla_eval.policies.steps.levels import MAX_LEVEL
+
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Color = NDArray[np.float64]
 
-MAX_UINT8 = 255
+N_LEVELS = 256  # of a channel
 BIN = 8  # levels of a channel that count as one
 LEAST_PX = 8  # a smaller piece is noise of the video
 SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow and orange differ by more
@@ -47,7 +49,7 @@ class Thing(NamedTuple):
 
 def usual_colors(image: Bytes) -> Mask:
     """Return (32, 32, 32): which colours (red, green, blue) an image (3, H, W) has, or nearly has."""
-    n_bins = (MAX_UINT8 + 1) // BIN
+    n_bins = N_LEVELS // BIN
     red, green, blue = image // BIN
     found = np.zeros((n_bins,) * 3, dtype=np.bool_)
     found[red, green, blue] = True
@@ -161,7 +163,7 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
             place[:, mask] = nothing[thing.camera][part][:, mask]
         elif exchanges:
             shade = before[thing.frame, thing.camera][part][:, mask].max(axis=0) / thing.color.max()
-            place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_UINT8)
+            place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_LEVEL)
     return torch.from_numpy(after).to(images.device)
 
 

@@ -39,7 +39,7 @@ from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import light_metadata
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
-from vla_eval.policies.episode_samples import in_numbers
+from vla_eval.policies.steps.levels import in_numbers
 from vla_eval.training.checkpoints import load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line

@@ -13,7 +13,6 @@ from vla_eval.policies.episode_samples import (
     episodes_of,
     goal_missed,
     goal_variance,
-    in_numbers,
     stacked_images,
     weighted_mean,
 )
@@ -23,6 +22,7 @@ from vla_eval.policies.memory.joint_layer import action_units
 from vla_eval.policies.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.policies.memory.sizes import NetworkSizes
 from vla_eval.policies.sentence import said_at_each_step
+from vla_eval.policies.steps.levels import in_numbers
 
 SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]

@@ -21,12 +21,12 @@ from vla_eval.policies.octo.language import PromptEmbeddings, make_text_encoder
 from vla_eval.policies.octo.network import OctoNetwork
 from vla_eval.policies.octo.transformer import Window
 from vla_eval.policies.steps.images import (
-    MAX_LEVEL,
     Size,
     augment,
     resize_and_centre_crop,
     resize_lanczos3,
 )
+from vla_eval.policies.steps.levels import MAX_LEVEL
 from vla_eval.policies.steps.trainable import set_trainable
 
 INDEX_KEY = "index"  # of a frame in the dataset

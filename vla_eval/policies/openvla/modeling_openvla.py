@@ -14,13 +14,13 @@ from vla_eval.policies.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.policies.openvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
 from vla_eval.policies.steps.images import (
-    MAX_LEVEL,
     Size,
     augment,
     centre_crop,
     resize_lanczos3,
     truncated_levels,
 )
+from vla_eval.policies.steps.levels import MAX_LEVEL
 from vla_eval.policies.steps.precision import default_dtype
 from vla_eval.policies.steps.prompts import Prompts
 

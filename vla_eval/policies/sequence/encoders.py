@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vla_eval.policies.episode_samples import in_numbers
 from vla_eval.policies.sequence.sizes import ENCODERS, NATURE_LAYERS, nature_edges
 from vla_eval.policies.sequence.spatial_softmax import spatial_softmax
+from vla_eval.policies.steps.levels import in_numbers
 from vla_eval.policies.steps.precision import in_float32
 
 RGB = 3

@@ -25,7 +25,7 @@ from vla_eval.policies.spatialvla.network import (
 )
 from vla_eval.policies.spatialvla.sections import OF_NO_EFFECT, Field, Section
 from vla_eval.policies.spatialvla.sizes import SLIDING_WINDOW, NetworkSizes
-from vla_eval.policies.steps.images import MAX_LEVEL
+from vla_eval.policies.steps.levels import MAX_LEVEL
 from vla_eval.policies.steps.siglip import LAYER_NORM_EPS
 
 PROCESSOR_FILE, IMAGES_FILE, GENERATION_FILE = (

@@ -14,7 +14,8 @@ from vla_eval.policies.spatialvla.grid_refit import refitted
 from vla_eval.policies.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.policies.spatialvla.prompt import finished
 from vla_eval.policies.steps.chunks import PromptedChunks
-from vla_eval.policies.steps.images import MAX_LEVEL, Size, resize_bicubic
+from vla_eval.policies.steps.images import Size, resize_bicubic
+from vla_eval.policies.steps.levels import MAX_LEVEL
 from vla_eval.policies.steps.precision import default_dtype
 from vla_eval.policies.steps.prompts import Prompts
 

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import RecipeError
+from vla_eval.policies.steps.levels import MAX_LEVEL
 from vla_eval.policies.steps.precision import in_float32
 
-MAX_LEVEL = 255.0
 LANCZOS_RADIUS = 3.0
 CUBIC_A = -0.5  # of PIL's bicubic kernel; torch's own has -0.75 where it does not antialias
 PIL_PRECISION = 1 << 22  # steps of PIL's weights

@@ -7,11 +7,11 @@ that its values are of no effect.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from vla_eval.policies.vla_memory.frame_choice import MAX_UINT8, FrameChoice, Seen
+from vla_eval.policies.steps.levels import in_bytes
+from vla_eval.policies.vla_memory.frame_choice import FrameChoice, Seen
 
 SEGMENT_PADDING_KEY = "segment_is_pad"
 """(B, T) of a training batch in segments: which come before the episode's beginning."""
@@ -97,7 +97,7 @@ class FrameMemory:
 
     def after(self, frame: Mapping[str, Tensor]) -> "FrameMemory":
         """Return the memory after one more frame."""
-        look = as_uint8(frame[self.cameras[0]]) if self.choice.looks else None
+        look = in_bytes(frame[self.cameras[0]]).numpy() if self.choice.looks else None
         seen = self.choice.after(self.seen, look)
         images = {**self.images, seen.n_frames - 1: {camera: frame[camera] for camera in self.cameras}}
         wanted = self.choice.wanted(seen)
@@ -113,8 +113,3 @@ class FrameMemory:
             images = [None if number is None else self.images[number][camera] for number in shown]
             found.update(in_places(camera, images, newest[camera]))
         return found
-
-
-def as_uint8(image: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """Return an image of whole levels, float32 in [0, 1], as uint8; exact."""
-    return np.rint(image.numpy() * MAX_UINT8).astype(np.uint8)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ImageArray
 from vla_eval.errors import RecipeError, check_names
+from vla_eval.policies.steps.levels import MAX_LEVEL
 
 BLOCKS = (8, 16, 32)  # per side of an image; of 128 px: 16, 8 and 4 px
 NEAR, FAR = 2, 5  # blocks: what changes between these distances from a block is its surroundings
 BURST_FRAMES = 4  # changes in so many frames are one event: cups come down, a cube is replaced
-MAX_UINT8 = 255.0
 
 Values = NDArray[np.float64]
 Blocks = tuple[Values, ...]
@@ -127,7 +127,7 @@ def _means(image: NDArray[np.int64], n_blocks: int) -> Values:
     rows, columns = ((np.arange(n_blocks) * size) // n_blocks for size in (height, width))
     sums = np.add.reduceat(np.add.reduceat(image, rows, axis=1), columns, axis=2)
     n_pixels = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))
-    means: Values = sums / (n_pixels * MAX_UINT8)
+    means: Values = sums / (n_pixels * MAX_LEVEL)
     return means
 
 
