@@ -134,8 +134,9 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
         images: (frames, cameras, 3, H, W) uint8.
         empty: (cameras, 3, H, W) uint8, the frame before the first decision.
         n_before: how many of the frames are before it.
-        erases: of the colours that appear only at the decision, a random number is replaced by `empty`; one
-            always stays. Only if the decision is the last frame: later, the arm has moved its camera.
+        erases: of the colours that appear only at the decision, a random number is replaced by `empty`, more
+            often many than few; one always stays. To choose from two is learned first, and then helps to
+            choose from nine. Only if the decision is the last frame: later, the arm has moved its camera.
         exchanges: all colours of things change places, alike in all frames; shades are kept.
     """
     before, after = images.cpu().numpy(), images.cpu().numpy().copy()
@@ -168,8 +169,8 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
 
 
 def _drawn(wrong: Sequence[int]) -> frozenset[int]:
-    """Return those to erase: none to all but one of them."""
+    """Return those to erase, at most all but one: that r of them stay has a probability proportional to 1 / r."""
     if len(wrong) < 2:
         return frozenset()
-    n_erased = int(torch.randint(len(wrong), (1,)))
-    return frozenset(wrong[i] for i in torch.randperm(len(wrong))[:n_erased].tolist())
+    n_left = 1 + int(torch.multinomial(1 / torch.arange(1.0, len(wrong) + 1), 1))
+    return frozenset(wrong[i] for i in torch.randperm(len(wrong))[n_left:].tolist())
