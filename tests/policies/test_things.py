@@ -130,6 +130,17 @@ def test_what_is_erased_was_not_shown_and_something_else_stays() -> None:
     assert {len(gone) for gone in seen} == {0, 1, 2}
 
 
+def test_few_wrong_things_stay_more_often_than_many() -> None:
+    originals, _ = episode()
+    n_draws, n_left = 400, [0, 0, 0, 0]
+    for _ in range(n_draws):
+        last = changed(erases=True, exchanges=False)[2, 0]
+        stay = [torch.equal(last[:, 20, x], originals[2, 0][:, 20, x]) for x in (2, 22, 32)]
+        n_left[sum(stay)] += 1
+    # 1, 1/2 and 1/3 of 11/6; four standard deviations of 400 draws are 0.1
+    assert [n / n_draws for n in n_left] == pytest.approx([0, 6 / 11, 3 / 11, 2 / 11], abs=0.1)
+
+
 def test_nothing_changes_where_no_thing_has_a_colour_that_was_shown() -> None:
     images, empty = episode()
     images[0, 0] = with_square(wood(), (4, 230, 4), 17)

@@ -169,7 +169,7 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
 
 
 def _drawn(wrong: Sequence[int]) -> frozenset[int]:
-    """Return those to erase, at most all but one: that r of them stay has a probability proportional to 1 / r."""
+    """Return those to erase: that r of them stay, at least one, has a probability proportional to 1 / r."""
     if len(wrong) < 2:
         return frozenset()
     n_left = 1 + int(torch.multinomial(1 / torch.arange(1.0, len(wrong) + 1), 1))
