@@ -58,6 +58,9 @@ class EpisodeConfig(PortedConfig):
         erase_share: of those that end at their first decision, the share in which some of the things that
             appear at it, but of no colour that was shown before, are erased: a rule is learned sooner where
             there is less to choose from.
+        erase_warmup_episodes: in so many training samples of a process, the number of wrong things that may
+            stay where some are erased grows from one to all, as the square of the samples so far. 0: all may
+            stay from the beginning.
         shift_px: the images of an episode are moved by up to so many pixels in each direction in training,
             those of each camera by an amount of their own, the same in all frames (random shifts, Kostrikov
             et al. 2020, "Image Augmentation Is All You Need"). 0: they are not.
@@ -81,6 +84,7 @@ class EpisodeConfig(PortedConfig):
     mix_colors: bool = False
     exchange_share: float = 0.0
     erase_share: float = 0.0
+    erase_warmup_episodes: int = 0
     shift_px: int = 0
     sentence: str = "none"
 
@@ -104,6 +108,10 @@ class EpisodeConfig(PortedConfig):
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
         if self.erase_share and not self.decision_share:
             raise RecipeError("decision_share is 0, expected more: erase_share is of episodes that end there")
+        if self.erase_warmup_episodes < 0:
+            raise RecipeError(
+                f"erase_warmup_episodes is {self.erase_warmup_episodes}, expected a number of samples ≥ 0"
+            )
         if self.shift_px < 0:
             raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
         if self.late_steps < 0:

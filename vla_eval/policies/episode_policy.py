@@ -11,8 +11,9 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
-from vla_eval.features import STATE_KEY
+from vla_eval.features import ACTION_KEY, STATE_KEY
 from vla_eval.policies.episode_config import EpisodeConfig
+from vla_eval.policies.episode_samples import SAME_ACTION, Episodes, episodes_of
 from vla_eval.policies.lerobot_memory import Memory
 from vla_eval.policies.sentence import TASK_KEY
 
@@ -28,6 +29,20 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
     name: ClassVar[str] = "mikasa_episodes"  # lerobot asks every class for a name; each policy has its own
     config: EpisodeConfig
     draws_nothing = True
+
+    def __init__(self, config: EpisodeConfig) -> None:
+        super().__init__(config)
+        config.validate_features()
+        if config.erase_warmup_episodes:
+            self.register_buffer("n_trained", torch.zeros((), dtype=torch.int64))
+
+    def samples(self, batch: dict[str, Tensor], *, same_action: float = SAME_ACTION) -> Episodes:
+        """Return the steps of a batch to train on, see `episodes_of`; training counts the samples."""
+        config, may_stay = self.config, 1.0
+        if self.training and config.erase_warmup_episodes:
+            may_stay = min(1.0, int(self.n_trained) / config.erase_warmup_episodes) ** 2
+            self.n_trained += len(batch[ACTION_KEY])
+        return episodes_of(batch, config, training=self.training, same_action=same_action, may_stay=may_stay)
 
     def set_memory(self, begin: Any, *, remembers: bool) -> None:
         """Give the policy the methods by which the harness knows that it remembers, if it does.

@@ -51,7 +51,12 @@ def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
 
 
 def episodes_of(
-    batch: dict[str, Tensor], config: EpisodeConfig, *, training: bool, same_action: float = SAME_ACTION
+    batch: dict[str, Tensor],
+    config: EpisodeConfig,
+    *,
+    training: bool,
+    same_action: float = SAME_ACTION,
+    may_stay: float = 1.0,
 ) -> Episodes:
     """Return the steps to train on, moved together: those of the episode, most waiting left out.
 
@@ -61,6 +66,7 @@ def episodes_of(
         training: leave waiting out, end some episodes at a decision, change things and colours and move
             images, at random by torch's generator; else take every step.
         same_action: actions that differ by less are waiting.
+        may_stay: see `changed_things`.
     """
     n_steps = config.n_window_steps
     real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
@@ -95,7 +101,7 @@ def episodes_of(
         decision = begins.int().argmax(dim=1)  # 0: there is none
         empty = torch.stack([batch[key][rows[:, 0], decision - 1] for key in config.image_features], dim=1)
         n_before = (first & (steps < decision[:, None])).sum(dim=1)
-        images = _with_other_things(images, first.sum(dim=1), n_before, empty, config)
+        images = _with_other_things(images, first.sum(dim=1), n_before, empty, config, may_stay)
     return Episodes(
         images=_augmented(images, episodes, config, n_episodes=len(steps)) if training else images,
         first=first,
@@ -232,7 +238,7 @@ def _until_a_decision(begins: Tensor, share: float) -> Tensor:
 
 
 def _with_other_things(
-    images: Tensor, n_frames: Tensor, n_before: Tensor, empty: Tensor, config: EpisodeConfig
+    images: Tensor, n_frames: Tensor, n_before: Tensor, empty: Tensor, config: EpisodeConfig, may_stay: float
 ) -> Tensor:
     """Change the things in a share of the episodes, see `changed_things`.
 
@@ -242,6 +248,7 @@ def _with_other_things(
         n_before: (B,) how many of these are before the first decision; 0: there is none.
         empty: (B, cameras, 3, H, W) the frames before the first decisions.
         config: of the policy.
+        may_stay: see `changed_things`.
     """
     exchanges, erases = (
         (torch.rand(len(n_frames)) < share).tolist() for share in (config.exchange_share, config.erase_share)
@@ -256,6 +263,7 @@ def _with_other_things(
                 n_before=int(n_before[row]),
                 erases=erases[row],
                 exchanges=exchanges[row],
+                may_stay=may_stay,
             )
     changed = torch.cat(parts)
     return changed if images.dtype == torch.uint8 else in_numbers(changed)

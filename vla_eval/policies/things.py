@@ -125,7 +125,9 @@ def groups_of(things: Sequence[Thing]) -> tuple[list[int], NDArray[np.float64]]:
     return groups, np.array(colors).reshape(-1, 3)
 
 
-def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool, exchanges: bool) -> Tensor:
+def changed_things(
+    images: Tensor, empty: Tensor, *, n_before: int, erases: bool, exchanges: bool, may_stay: float = 1.0
+) -> Tensor:
     """Return the images of an episode with other things; drawn by torch's generator.
 
     Nothing changes where no thing from the decision on has a colour that was shown before.
@@ -134,10 +136,10 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
         images: (frames, cameras, 3, H, W) uint8.
         empty: (cameras, 3, H, W) uint8, the frame before the first decision.
         n_before: how many of the frames are before it.
-        erases: of the colours that appear only at the decision, a random number is replaced by `empty`, more
-            often many than few; one always stays. To choose from two is learned first, and then helps to
-            choose from nine. Only if the decision is the last frame: later, the arm has moved its camera.
+        erases: of the colours that appear only at the decision, a random number is replaced by `empty`; one
+            always stays. Only if the decision is the last frame: later, the arm has moved its camera.
         exchanges: all colours of things change places, alike in all frames; shades are kept.
+        may_stay: where things are erased, at most so large a share of the others stays.
     """
     before, after = images.cpu().numpy(), images.cpu().numpy().copy()
     nothing = empty.cpu().numpy()
@@ -154,7 +156,7 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
     choices = {group for group, thing in zip(groups, things, strict=True) if thing.frame >= n_before}
     if not shown & choices:
         return images
-    erased = _drawn(sorted(choices - shown)) if erases and n_frames == n_before + 1 else frozenset()
+    erased = _drawn(sorted(choices - shown), may_stay) if erases and n_frames == n_before + 1 else frozenset()
     others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
     for thing, group in zip(things, groups, strict=True):
         part = (slice(None), *thing.box)
@@ -168,9 +170,10 @@ def changed_things(images: Tensor, empty: Tensor, *, n_before: int, erases: bool
     return torch.from_numpy(after).to(images.device)
 
 
-def _drawn(wrong: Sequence[int]) -> frozenset[int]:
-    """Return those to erase: that r of them stay, at least one, has a probability proportional to 1 / r."""
+def _drawn(wrong: Sequence[int], may_stay: float) -> frozenset[int]:
+    """Return those to erase: one to so large a share of them stays, each number as often."""
     if len(wrong) < 2:
         return frozenset()
-    n_left = 1 + int(torch.multinomial(1 / torch.arange(1.0, len(wrong) + 1), 1))
+    most = 1 + round((len(wrong) - 1) * may_stay)
+    n_left = 1 + int(torch.randint(most, (1,)))
     return frozenset(wrong[i] for i in torch.randperm(len(wrong))[n_left:].tolist())

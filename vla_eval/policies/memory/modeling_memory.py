@@ -10,7 +10,6 @@ from vla_eval.policies.episode_policy import EpisodePolicy
 from vla_eval.policies.episode_samples import (
     SAME_ACTION,
     Episodes,
-    episodes_of,
     goal_missed,
     goal_variance,
     stacked_images,
@@ -37,7 +36,6 @@ class MikasaMemoryPolicy(EpisodePolicy):
 
     def __init__(self, config: MikasaMemoryConfig, **kwargs: Any) -> None:
         super().__init__(config)
-        config.validate_features()
         self.config: MikasaMemoryConfig = config
         sizes = network_sizes(config)
         self.network = MemoryNetwork(sizes, remembers=config.remembers)
@@ -50,7 +48,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
         config = self.config
         scaled = {**batch, ACTION_KEY: batch[ACTION_KEY] / self.units}
         same = SAME_JOINTS if config.joint_targets else SAME_ACTION
-        episodes = episodes_of(scaled, config, training=self.training, same_action=same)
+        episodes = self.samples(scaled, same_action=same)
         said = said_at_each_step(self.network.sentence, batch, episodes.state.shape[1])
         images = in_numbers(episodes.images)[episodes.frames]
         answer = self.network(images, episodes.state, said)

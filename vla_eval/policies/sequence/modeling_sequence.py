@@ -11,7 +11,6 @@ from vla_eval.policies.eef_state import POSITION_SCALE, SPACE
 from vla_eval.policies.episode_policy import EpisodePolicy
 from vla_eval.policies.episode_samples import (
     Episodes,
-    episodes_of,
     goal_missed,
     stacked_images,
     weighted_mean,
@@ -184,7 +183,6 @@ class MikasaSequencePolicy(EpisodePolicy):
 
     def __init__(self, config: MikasaSequenceConfig, **kwargs: Any) -> None:
         super().__init__(config)
-        config.validate_features()
         self.config: MikasaSequenceConfig = config
         self.network = SequenceNetwork(config)
         self.set_memory(self.network.begin, remembers=CORES[config.core].remembers)
@@ -192,7 +190,7 @@ class MikasaSequencePolicy(EpisodePolicy):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         config, network = self.config, self.network
-        episodes = episodes_of(batch, config, training=self.training)
+        episodes = self.samples(batch)
         # Images are most of the work: each is encoded once, those of padding not at all.
         first = episodes.first
         said = said_at_each_step(network.sentence, batch, first.shape[1])
