@@ -13,6 +13,7 @@ from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import RecipeError
+from vla_eval.policies.episode_samples import Episodes, episodes_of
 from vla_eval.policies.sequence.modeling_sequence import Demonstrated, MikasaSequencePolicy
 from vla_eval.policies.sequence.sizes import CORES
 from vla_eval.training.dataset import training_dataset
@@ -191,6 +192,28 @@ def demonstrations(policy: Any, *, n_episodes: int) -> dict[str, torch.Tensor]:
     batch["action_is_pad"] = torch.zeros(n_episodes, n_steps + chunk - 1, dtype=torch.bool)
     batch["observation.state_is_pad"] = torch.zeros(n_episodes, n_steps + 1, dtype=torch.bool)
     return batch
+
+
+def test_more_wrong_things_may_stay_the_longer_it_is_trained_also_after_a_resume(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: list[float] = []
+
+    def noted(*args: Any, may_stay: float, **options: Any) -> Episodes:
+        shares.append(may_stay)
+        return episodes_of(*args, may_stay=may_stay, **options)
+
+    monkeypatch.setattr("vla_eval.policies.episode_policy.episodes_of", noted)
+    policy = tiny_policy(recorded, decision_share=0.5, erase_share=0.5, erase_warmup_episodes=10)
+    batch = demonstrations(policy, n_episodes=4)
+    policy.forward(batch)  # not training
+    policy.train().forward(batch)
+    policy.forward(batch)
+    policy.save_pretrained(tmp_path)
+    resumed = MikasaSequencePolicy.from_pretrained(tmp_path).train()
+    for _ in range(2):
+        resumed.forward(batch)
+    assert shares == pytest.approx([1, 0, 0.4**2, 0.8**2, 1])
 
 
 def test_the_mean_of_all_goals_misses_one_variance(recorded: Path) -> None:
