@@ -10,7 +10,13 @@ from torch import Tensor, nn
 from vla_eval.policies.sequence.core import Core, CoreMemory
 from vla_eval.policies.sequence.elmur import Elmur
 from vla_eval.policies.sequence.mamba import DecisionMamba
-from vla_eval.policies.sequence.sizes import ElmurOptions, MambaOptions, TransformerXLOptions, options_of
+from vla_eval.policies.sequence.sizes import (
+    ElmurOptions,
+    MambaOptions,
+    RecurrentOptions,
+    TransformerXLOptions,
+    options_of,
+)
 from vla_eval.policies.sequence.transformer_xl import TransformerXL
 
 
@@ -41,11 +47,25 @@ class Recurrent(Core):
         width: of tokens and states.
         layers: one above the other.
         dropout: between them.
+        options: how it remembers.
     """
 
-    def __init__(self, kind: type[nn.GRU | nn.LSTM], *, width: int, layers: int, dropout: float) -> None:
+    def __init__(
+        self,
+        kind: type[nn.GRU | nn.LSTM],
+        *,
+        width: int,
+        layers: int,
+        dropout: float,
+        options: RecurrentOptions,
+    ) -> None:
         super().__init__()
         self.cells = kind(width, width, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0)
+        with torch.no_grad():
+            for layer in range(layers):
+                # The gate that keeps the state is the second one of both, of three and of four.
+                getattr(self.cells, f"bias_ih_l{layer}")[width : 2 * width] += options.keep_bias
+        self.before = nn.LayerNorm(width) if options.answers_before else None
 
     def begin(self, n_episodes: int) -> CoreMemory:
         """Return states of zeros, (B, layers, width)."""
@@ -58,9 +78,13 @@ class Recurrent(Core):
         states = tuple(state.transpose(0, 1).contiguous() for state in memory)
         if isinstance(self.cells, nn.GRU):
             answers, last = self.cells(tokens, states[0])
-            return answers, (last.transpose(0, 1),)
-        answers, (hidden, cell) = self.cells(tokens, states)
-        return answers, (hidden.transpose(0, 1), cell.transpose(0, 1))
+            after: CoreMemory = (last.transpose(0, 1),)
+        else:
+            answers, (hidden, cell) = self.cells(tokens, states)
+            after = (hidden.transpose(0, 1), cell.transpose(0, 1))
+        if self.before is not None:
+            answers = self.before(torch.cat([memory[0][:, -1:], answers[:, :-1]], dim=1))
+        return answers, after
 
 
 class CausalTransformer(Core):
@@ -158,8 +182,8 @@ def make_core(
         return Elmur(**stack, heads=heads, segment=n_tokens, options=options)
     if isinstance(options, MambaOptions):
         return DecisionMamba(**stack, options=options)
+    if isinstance(options, RecurrentOptions):
+        return Recurrent({"gru": nn.GRU, "lstm": nn.LSTM}[name], **stack, options=options)
     if name == "mlp":
         return PerStep(**stack)
-    if name == "transformer":
-        return CausalTransformer(**stack, heads=heads, context_steps=n_tokens)
-    return Recurrent({"gru": nn.GRU, "lstm": nn.LSTM}[name], **stack)
+    return CausalTransformer(**stack, heads=heads, context_steps=n_tokens)

@@ -18,6 +18,25 @@ class NoOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecurrentOptions:
+    """How a GRU or an LSTM remembers (docs/learning_the_rule.md).
+
+    Attributes:
+        keep_bias: added at the beginning to the bias of the gate that keeps the state (Gers et al. 2000,
+            "Learning to Forget"; of a GRU: its update gate). More of what was seen first is left then.
+        answers_before: the answer to a step is the state before it, normalised, in place of that after it.
+            The head reads the step itself anyway; so what was remembered is not mixed with it.
+    """
+
+    keep_bias: float = 0.0
+    answers_before: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_bounds(self, {"keep_bias": (-10, 10)}, prefix="")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TransformerXLOptions:
     """Sizes of Decision Transformer, RATE and GTrXL beyond those of every core.
 
@@ -104,7 +123,7 @@ class ElmurOptions:
         check_bounds(self, {**dict.fromkeys(counts, (1, MANY)), **shares, "slot_scale": (0, MANY)}, prefix="")
 
 
-CoreOptions = NoOptions | TransformerXLOptions | MambaOptions | ElmurOptions
+CoreOptions = NoOptions | RecurrentOptions | TransformerXLOptions | MambaOptions | ElmurOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +147,8 @@ class CoreRow:
 
 CORES = {
     "mlp": CoreRow(remembers=False),
-    "gru": CoreRow(),
-    "lstm": CoreRow(),
+    "gru": CoreRow(options=RecurrentOptions()),
+    "lstm": CoreRow(options=RecurrentOptions()),
     "transformer": CoreRow(heads_divide=True, is_even=True),
     "decision_transformer": CoreRow(
         is_even=True,
