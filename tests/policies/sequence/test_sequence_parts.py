@@ -60,6 +60,45 @@ def test_steps_one_by_one_get_the_answers_of_all_steps_at_once(
         torch.testing.assert_close(answers(core, steps(), at_once=at_once), whole, atol=1e-5, rtol=1e-5)
 
 
+def recurrent(name: str, *, layers: int = 2, **options: Any) -> Core:
+    torch.manual_seed(0)
+    return make_core(
+        name, width=WIDTH, layers=layers, heads=2, context_steps=4, dropout=0.0, given=options
+    ).eval()
+
+
+@pytest.mark.parametrize("name", ["gru", "lstm"])
+def test_an_answer_before_a_step_knows_the_steps_before_and_not_the_step(name: str) -> None:
+    core, tokens = recurrent(name, answers_before=True), steps()
+    whole = answers(core, tokens, at_once=N_STEPS)
+    for at_once in (1, 5):
+        torch.testing.assert_close(answers(core, tokens, at_once=at_once), whole, atol=1e-5, rtol=1e-5)
+    tokens[:, 7, 0] += 1
+    other = answers(core, tokens, at_once=N_STEPS)
+    torch.testing.assert_close(other[:, :8], whole[:, :8])
+    assert not torch.isclose(other[:, 8], whole[:, 8]).all()
+
+
+@pytest.mark.parametrize("name", ["gru", "lstm"])
+def test_with_a_large_keep_bias_the_state_stays_what_it_is(name: str) -> None:
+    """torch draws weights within 1 / sqrt(8), so that 18 of them times numbers within 1 are at least -6.4.
+
+    Of the logistic function of 10 - 6.4 the gate is at least 0.97, and a sum so low is rare.
+    """
+    tokens = steps().clamp(-1, 1)[:, :1]
+    for bias, stays in ((10.0, True), (0.0, False)):
+        core = recurrent(name, layers=1, keep_bias=bias)
+        begun = tuple(torch.full_like(part, 0.9) for part in core.begin(2))
+        kept = core(tokens, begun)[1][-1]  # of an LSTM: its cells, to which something is added
+        share = kept if name == "gru" else kept - added_by_lstm(core, tokens, begun)
+        assert torch.allclose(share, begun[-1], atol=0.02) is stays
+
+
+def added_by_lstm(core: Any, tokens: Tensor, begun: tuple[Tensor, ...]) -> Tensor:
+    """What the input gate lets in: that which the cells are from nothing, with the same hidden state."""
+    return core(tokens, (begun[0], torch.zeros_like(begun[1])))[1][1]
+
+
 @pytest.mark.parametrize("name", CORES)
 def test_training_gets_the_answers_of_acting(name: str) -> None:
     core, tokens = core_named(name, context_steps=3), steps()
