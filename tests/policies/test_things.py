@@ -184,6 +184,7 @@ def test_in_a_share_of_the_episodes_colours_change_places_in_all_frames_also_aft
             r"exchange_share is 1.5, expected a number in \[0, 1\]",
         ),
         ({"erase_share": 0.5}, "decision_share is 0, expected more"),
+        ({"erase_warmup_episodes": 9}, "erase_share is 0, expected more"),
         ({"erase_warmup_episodes": -1}, "erase_warmup_episodes is -1, expected a number of samples ≥ 0"),
     ],
 )

@@ -112,6 +112,8 @@ class EpisodeConfig(PortedConfig):
             raise RecipeError(
                 f"erase_warmup_episodes is {self.erase_warmup_episodes}, expected a number of samples ≥ 0"
             )
+        if self.erase_warmup_episodes and not self.erase_share:
+            raise RecipeError("erase_share is 0, expected more: erase_warmup_episodes is of what is erased")
         if self.shift_px < 0:
             raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
         if self.late_steps < 0:
