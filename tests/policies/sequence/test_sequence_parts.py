@@ -23,7 +23,9 @@ SMALL_OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def core_named(name: str, *, context_steps: int = 40, layers: int = 2, tokens_per_step: int = 1) -> Core:
+def core_named(
+    name: str, *, context_steps: int = 40, layers: int = 2, tokens_per_step: int = 1, **options: Any
+) -> Core:
     torch.manual_seed(0)
     return make_core(
         name,
@@ -33,7 +35,7 @@ def core_named(name: str, *, context_steps: int = 40, layers: int = 2, tokens_pe
         context_steps=context_steps,
         dropout=0.0,
         tokens_per_step=tokens_per_step,
-        given=SMALL_OPTIONS.get(name),
+        given={**SMALL_OPTIONS.get(name, {}), **options},
     ).eval()
 
 
@@ -60,16 +62,9 @@ def test_steps_one_by_one_get_the_answers_of_all_steps_at_once(
         torch.testing.assert_close(answers(core, steps(), at_once=at_once), whole, atol=1e-5, rtol=1e-5)
 
 
-def recurrent(name: str, *, layers: int = 2, **options: Any) -> Core:
-    torch.manual_seed(0)
-    return make_core(
-        name, width=WIDTH, layers=layers, heads=2, context_steps=4, dropout=0.0, given=options
-    ).eval()
-
-
 @pytest.mark.parametrize("name", ["gru", "lstm"])
 def test_an_answer_before_a_step_knows_the_steps_before_and_not_the_step(name: str) -> None:
-    core, tokens = recurrent(name, answers_before=True), steps()
+    core, tokens = core_named(name, answers_before=True), steps()
     whole = answers(core, tokens, at_once=N_STEPS)
     for at_once in (1, 5):
         torch.testing.assert_close(answers(core, tokens, at_once=at_once), whole, atol=1e-5, rtol=1e-5)
@@ -87,7 +82,7 @@ def test_with_a_large_keep_bias_the_state_stays_what_it_is(name: str) -> None:
     """
     tokens = steps().clamp(-1, 1)[:, :1]
     for bias, stays in ((10.0, True), (0.0, False)):
-        core = recurrent(name, layers=1, keep_bias=bias)
+        core = core_named(name, layers=1, keep_bias=bias)
         begun = tuple(torch.full_like(part, 0.9) for part in core.begin(2))
         kept = core(tokens, begun)[1][-1]  # of an LSTM: its cells, to which something is added
         share = kept if name == "gru" else kept - added_by_lstm(core, tokens, begun)
@@ -142,8 +137,7 @@ def test_a_core_remembers_the_first_step_if_its_row_says_so(name: str) -> None:
 def test_a_later_segment_knows_what_is_kept_of_the_first_and_nothing_else(
     name: str, changes: dict[str, Any], seen: bool
 ) -> None:
-    options = {**SMALL_OPTIONS[name], **changes}
-    core = make_core(name, width=WIDTH, layers=2, heads=2, context_steps=4, dropout=0.0, given=options).eval()
+    core = core_named(name, context_steps=4, **changes)
     tokens = steps()
     before = answers(core, tokens, at_once=N_STEPS)[:, -1]
     tokens[:, 0, 0] += 1  # of the first segment of three
