@@ -161,7 +161,8 @@ class TestList:
                 group = line
         assert group_of["oracle"] == group_of["tour"] == "baselines and controls:"
         assert group_of["memory_color3"] == "ready to evaluate:"
-        assert group_of["act"] == group_of["memory"] == "to fine-tune, from scratch:"
+        scratch = {group_of[name] for name in ("act", "memory", "recurrent_colors")}
+        assert scratch == {"to fine-tune, from scratch:"}
         assert group_of["pi0"] == group_of["octo_small"] == "to fine-tune, from a published base:"
         assert group_of["spatialvla_tiny"].startswith("for tests")
 

@@ -255,3 +255,16 @@ def test_every_shipped_recipe_with_a_base_has_a_command_that_fetches_it() -> Non
 def test_a_recipe_whose_base_is_missing_says_which_command_fetches_it(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="mikasa-vla checkpoint fetch pi0_base"):
         find_checkpoint(Path("checkpoints/pi0_base"))
+
+
+def test_a_recipe_that_starts_from_another_training_says_which_command_trains_it(tmp_path: Path) -> None:
+    first, then = (load_policy(name).value.finetune for name in ("recurrent_decisions", "recurrent_colors"))
+    assert first is not None and then is not None and then.base_checkpoint == "runs/recurrent_decisions"
+    with pytest.raises(
+        CheckpointError,
+        match="--policy recurrent_decisions --dataset DATASET --out runs/recurrent_decisions",
+    ):
+        find_checkpoint(Path(then.base_checkpoint))
+    # The weights of the one fit the network of the other.
+    for name in ("core", "core_options", "encoder", "erase_warmup_episodes"):
+        assert then.policy[name] == first.policy[name], name

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from vla_eval.cli.screen import NARROWEST, filled, screen_width
@@ -13,6 +14,7 @@ from vla_eval.config.prompts import instruction_for, load_prompts
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.grid import ModelTable, is_model_table
+from vla_eval.policies.bases import FIRST_TRAININGS
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.tasks.catalog import FAMILIES, SUITES
@@ -138,7 +140,8 @@ def _group(name: str, recipe: PolicyRecipe) -> str:
         return READY if "checkpoint" in recipe.args else BASELINES
     if name.endswith(TINY_SUFFIX):
         return FOR_TESTS
-    return TO_TRAIN if recipe.finetune.base_checkpoint is None else FROM_BASE
+    base = recipe.finetune.base_checkpoint
+    return TO_TRAIN if base is None or Path(base).name in FIRST_TRAININGS else FROM_BASE
 
 
 def _configs() -> Groups:

@@ -215,6 +215,8 @@ OF_RECIPES: Mapping[str, str] = MappingProxyType(
     }
 )
 """Shipped recipe -> the base that it starts from."""
+FIRST_TRAININGS = ("recurrent_decisions",)
+"""Shipped recipes whose trainings others start from, in a folder of that name."""
 
 
 def find_base(name: str) -> Base:
@@ -229,9 +231,13 @@ def find_base(name: str) -> Base:
 
 
 def how_to_get(path: str | Path) -> str:
-    """Return a sentence with the command that fetches what lies at a path; empty if no base has its name."""
+    """Return a sentence with the command that makes what lies at a path; empty if no base has its name."""
     name = Path(path).name
-    return f" Get it: mikasa-vla checkpoint fetch {name}." if name in BASES else ""
+    if name in BASES:
+        return f" Get it: mikasa-vla checkpoint fetch {name}."
+    if name in FIRST_TRAININGS:
+        return f" Train it first: mikasa-vla finetune --policy {name} --dataset DATASET --out {path!s:.300}."
+    return ""
 
 
 def first_fetch(recipe: str) -> str:
