@@ -257,7 +257,10 @@ def test_a_recipe_whose_base_is_missing_says_which_command_fetches_it(tmp_path: 
         find_checkpoint(Path("checkpoints/pi0_base"))
 
 
-def test_a_recipe_that_starts_from_another_training_says_which_command_trains_it(tmp_path: Path) -> None:
+def test_a_recipe_that_starts_from_another_training_says_which_command_trains_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where nobody has trained it
     first, then = (load_policy(name).value.finetune for name in ("recurrent_decisions", "recurrent_colors"))
     assert first is not None and then is not None and then.base_checkpoint == "runs/recurrent_decisions"
     with pytest.raises(
