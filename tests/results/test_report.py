@@ -9,7 +9,7 @@ import pytest
 from tests.results.stored_runs import COLOR, INTERCEPT, episode, episodes, has_note, only_row, stored
 from vla_eval.errors import ReportError
 from vla_eval.results.report import build_table, render
-from vla_eval.storage.run_file import Change
+from vla_eval.storage.run_file import Change, JsonValue
 from vla_eval.storage.run_folder import RunDescription, Session, StoredRun
 
 # ------------------------------------------------------------------------------- counting
@@ -323,28 +323,37 @@ def test_another_environment_or_recipe_is_named() -> None:
     assert has_note(table, "different contents of policies/p")
 
 
+def environment_notes(*environments: dict[str, JsonValue]) -> list[str]:
+    """What a table of one run per environment says of the environments."""
+    runs = []
+    for index, environment in enumerate(environments):
+        description = RunDescription(
+            name="demo", config={}, recipes={}, environment=environment, options={}, command=""
+        )
+        run = stored(episodes(f"p{index}", "+"), path=f"runs/{index}")
+        runs.append(StoredRun(path=run.path, description=description, records=run.records))
+    return [note for note in build_table(runs).notes if "different environments" in note]
+
+
 def test_a_run_without_pictures_differs_in_no_renderer() -> None:
     """Scripted policies see none: such a run has no renderer, where others may have two."""
-    software, gpu = {"render_device": "llvmpipe"}, {"render_device": "H100"}
+    blind: dict[str, JsonValue] = {"device": {"simulator": "physx_cpu"}}
+    software: dict[str, JsonValue] = {"device": {"simulator": "physx_cpu", "render_device": "llvmpipe"}}
+    gpu: dict[str, JsonValue] = {"device": {"simulator": "physx_cpu", "render_device": "H100"}}
 
-    def notes_of(*devices: dict[str, str]) -> tuple[str, ...]:
-        runs = []
-        for index, device in enumerate(devices):
-            description = RunDescription(
-                name="demo",
-                config={},
-                recipes={},
-                environment={"device": {"simulator": "physx_cpu", **device}},
-                options={},
-                command="",
-            )
-            run = stored(episodes(f"p{index}", "+"), path=f"runs/{index}")
-            runs.append(StoredRun(path=run.path, description=description, records=run.records))
-        return build_table(runs).notes
-
-    assert not any("different environments" in note for note in notes_of(software, {}, software))
-    (told,) = [note for note in notes_of(software, {}, gpu) if "different environments" in note]
+    assert environment_notes(software, blind, software) == []
+    (told,) = environment_notes(software, blind, gpu)
     assert told.endswith("what differs: device.render_device.")
+
+
+def test_a_run_of_which_no_worker_has_started_differs_in_no_device() -> None:
+    begun: dict[str, JsonValue] = {"python": "3.12"}
+    cpu: dict[str, JsonValue] = {"python": "3.12", "device": {"simulator": "physx_cpu"}}
+    gpu: dict[str, JsonValue] = {"python": "3.12", "device": {"simulator": "physx_cuda"}}
+
+    assert environment_notes(cpu, begun) == []
+    (told,) = environment_notes(cpu, begun, gpu)
+    assert told.endswith("what differs: device.simulator.")
 
 
 def test_a_run_that_was_continued_elsewhere_is_named() -> None:

@@ -9,12 +9,12 @@ from vla_eval.errors import MAX_NAMED, some_of
 from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
 from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
 from vla_eval.results.success_table import Row
-from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_file import DEVICE, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import find_task
 
-RENDERER = "device.render_"
+DEVICE_FACTS = f"{DEVICE}."
 VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
 
@@ -303,9 +303,10 @@ def _seen_in_training(run: StoredRun) -> list[str]:
 def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
     texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
     names = _unique(name for text in texts for name in text)
-    # A run without images has no renderer, so its renderer does not differ from another one.
+    # A run without images has no renderer, and one of which no worker has started has no device at all: what
+    # is not known does not differ.
     found = {
-        name: [text.get(name) for text in texts if name in text or not name.startswith(RENDERER)]
+        name: [text.get(name) for text in texts if name in text or not name.startswith(DEVICE_FACTS)]
         for name in names
     }
     differing = [name for name, values in found.items() if len(set(values)) > 1]
