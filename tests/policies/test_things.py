@@ -5,13 +5,23 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.policies.test_episode_samples import CAMERAS, EDGE_PX, N_EPISODES, config, waits_then_moves
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY
+from vla_eval.policies import things
 from vla_eval.policies.episode_samples import episodes_of
-from vla_eval.policies.things import changed_things, groups_of, things_in, usual_colors
+from vla_eval.policies.things import (
+    Empty,
+    SeenThings,
+    Thing,
+    changed_things,
+    groups_of,
+    things_in,
+    usual_colors,
+)
 
 RED, MAROON, CYAN, BLUE = (230, 4, 4), (170, 4, 4), (4, 230, 230), (4, 4, 230)
 EDGE = 40
@@ -59,33 +69,60 @@ def changed(*, erases: bool, exchanges: bool) -> Tensor:
 def test_a_thing_is_a_piece_of_colours_that_empty_images_do_not_have() -> None:
     images, empty = episode()
     usual = usual_colors(empty[0].numpy())
-    assert things_in(empty[0].numpy(), usual, frame=0, camera=0) == []
-    things = things_in(images[2, 0].numpy(), usual, frame=2, camera=0)
-    assert [int(thing.mask.sum()) for thing in things] == [36] * 4
-    found = {tuple(thing.color.round().astype(int).tolist()) for thing in things}
-    assert found == {RED, MAROON, CYAN, BLUE}  # the side in the light, not the mean
+    assert things_in(empty[0].numpy(), usual) == ()
+    found = things_in(images[2, 0].numpy(), usual)
+    assert [int(thing.mask.sum()) for thing in found] == [36] * 4
+    colors = {tuple(thing.color.round().astype(int).tolist()) for thing in found}
+    assert colors == {RED, MAROON, CYAN, BLUE}  # the side in the light, not the mean
 
 
 def test_things_that_touch_are_two_if_their_hues_differ() -> None:
     _, empty = episode()
     image = with_square(with_square(wood(4), RED, 10), BLUE, 16).numpy()
-    things = things_in(image, usual_colors(empty[0].numpy()), frame=0, camera=0)
-    assert [int(thing.mask.sum()) for thing in things] == [36, 36]
-    assert {tuple(thing.color.round().astype(int).tolist()) for thing in things} == {RED, BLUE}
+    found = things_in(image, usual_colors(empty[0].numpy()))
+    assert [int(thing.mask.sum()) for thing in found] == [36, 36]
+    assert {tuple(thing.color.round().astype(int).tolist()) for thing in found} == {RED, BLUE}
 
 
 def test_things_of_one_colour_are_a_group_and_a_darker_red_is_another() -> None:
     images, empty = episode()
     usual = usual_colors(empty[0].numpy())
-    things = [
-        thing
-        for frame in (0, 2)
-        for thing in things_in(images[frame, 0].numpy(), usual, frame=frame, camera=0)
-    ]
-    groups, colors = groups_of(things)
-    assert len(things) == 5 and len(colors) == 4
-    (red,) = (group for thing, group in zip(things, groups, strict=True) if thing.frame == 0)
-    assert groups.count(red) == 2
+    cue, *choices = [thing for frame in (0, 2) for thing in things_in(images[frame, 0].numpy(), usual)]
+    groups, colors = groups_of([cue, *choices])
+    assert len(choices) == 4 and len(colors) == 4
+    assert groups.count(groups[0]) == 2
+
+
+def test_a_thing_has_a_pixel_around_it_but_at_the_edge_of_the_image() -> None:
+    _, empty = episode()
+    image = with_square(with_square(wood(4), RED, 0), BLUE, 20, y=34).numpy()
+    found = things_in(image, usual_colors(empty[0].numpy()))
+    boxes = {tuple(thing.color.round().astype(int).tolist()): thing.box for thing in found}
+    assert boxes == {RED: (slice(19, 27), slice(0, 7)), BLUE: (slice(33, 40), slice(19, 27))}
+    assert all(thing.mask.shape == image[0][thing.box].shape for thing in found)
+
+
+def test_things_that_were_found_before_are_found_again_and_the_oldest_are_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked = []
+
+    def look(image: NDArray[np.uint8], usual: NDArray[np.bool_]) -> tuple[Thing, ...]:
+        looked.append(image)
+        return things_in(image, usual)
+
+    monkeypatch.setattr(things, "things_in", look)
+    images, empty = episode()
+    cue, none, choice = images[:, 0].numpy()
+    seen, before = SeenThings(2), Empty(empty[0].numpy())
+    numbers = [len(seen.things_in(image, before)) for image in (cue, choice, cue.copy(), none, cue)]
+    assert numbers == [1, 4, 1, 0, 1]
+    assert len(looked) == 3
+    seen.things_in(choice, before)  # it was used least recently when `none` came
+    assert len(looked) == 4
+    other = Empty(cue)
+    assert len(seen.things_in(cue, other)) == 0  # with another empty image, other things
+    assert len(looked) == 5
 
 
 def test_colours_change_places_alike_in_all_frames_and_shades_stay() -> None:

@@ -5,8 +5,11 @@ episode's first decision does not have, when there is nothing to choose from yet
 is measured in docs/learning_the_rule.md. For tasks in which a colour tells what is right.
 """
 
+import hashlib
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,20 +31,18 @@ SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow a
 HUE_EDGES = (0.35, 0.87)  # of a channel relative to the strongest: orange's green is between, yellow's above
 IN_ITS_PLANE = ndimage.generate_binary_structure(2, 1)[None] & np.array([False, True, False])[:, None, None]
 BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
+MOST_SEEN = 2**15  # images: both cameras of 500 episodes of 32 steps, at most 200 MB of things
 
 
 class Thing(NamedTuple):
     """A piece of an image.
 
     Attributes:
-        frame, camera: which image.
-        box: the part (rows, columns) of the image in which all its things are, and a pixel around it.
+        box: the part (rows, columns) of the image in which it is, with a pixel around it.
         mask: the thing's pixels in the box.
         color: (3,) where it is brightest, in levels.
     """
 
-    frame: int
-    camera: int
     box: tuple[slice, slice]
     mask: Mask
     color: Color
@@ -62,17 +63,79 @@ def _widened(mask: Mask) -> Mask:
     return wide
 
 
-def things_in(image: Bytes, usual: Mask, *, frame: int, camera: int) -> list[Thing]:
-    """Return the things in an image (3, H, W)."""
+class Empty:
+    """What a camera sees before there is anything to choose from.
+
+    Args:
+        image: (3, H, W).
+    """
+
+    def __init__(self, image: Bytes) -> None:
+        self.image = image
+        self.digest = _digest(image)
+
+    @cached_property
+    def usual(self) -> Mask:
+        """See `usual_colors`."""
+        return usual_colors(self.image)
+
+
+class SeenThings:
+    """Finds things, and keeps what it found: a demonstration is sampled again and again.
+
+    Args:
+        most: images; then the one that was not asked for the longest is forgotten.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._found: OrderedDict[bytes, tuple[Thing, ...]] = OrderedDict()
+
+    def things_in(self, image: Bytes, empty: Empty) -> tuple[Thing, ...]:
+        """Return the things in an image (3, H, W)."""
+        key = _digest(image) + empty.digest
+        found = self._found.get(key)
+        if found is None:
+            found = things_in(image, empty.usual)
+            if len(self._found) == self._most:
+                self._found.popitem(last=False)
+            self._found[key] = found
+        else:
+            self._found.move_to_end(key)
+        return found
+
+
+def _digest(image: Bytes) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(image), digest_size=16).digest()
+
+
+_SEEN = SeenThings(MOST_SEEN)
+
+
+def things_in(image: Bytes, usual: Mask) -> tuple[Thing, ...]:
+    """Return the things in an image (3, H, W), given the colours that are none."""
     red, green, blue = image // BIN
     unusual = ~usual[red, green, blue]
     if np.count_nonzero(unusual) < LEAST_PX:
-        return []
+        return ()
     rows, columns = ndimage.find_objects(_widened(unusual).astype(np.int8))[0]
     part = image[:, rows, columns]
-    numbers, n_things = _numbered(unusual[rows, columns], _hues(part))
-    masks = (numbers == number for number in range(1, n_things + 1))
-    return [Thing(frame, camera, (rows, columns), mask, _bright_color(part[:, mask])) for mask in masks]
+    numbers = _numbered(unusual[rows, columns], _hues(part))
+    things = []
+    for number, box in enumerate(ndimage.find_objects(numbers), start=1):
+        mask, down, right = numbers[box] == number, box[0].start + rows.start, box[1].start + columns.start
+        color = _bright_color(part[:, *box][:, mask])
+        things.append(_with_an_edge(mask, down, right, image.shape[1:], color))
+    return tuple(things)
+
+
+def _with_an_edge(mask: Mask, down: int, right: int, size: tuple[int, ...], color: Color) -> Thing:
+    """Return a thing whose box is a pixel wider than its mask (H, W), but where the image ends."""
+    above, before = min(down, 1), min(right, 1)
+    below, behind = min(size[0] - down - mask.shape[0], 1), min(size[1] - right - mask.shape[1], 1)
+    wide = np.pad(mask, ((above, below), (before, behind)))
+    top, left = down - above, right - before
+    return Thing((slice(top, top + wide.shape[0]), slice(left, left + wide.shape[1])), wide, color)
 
 
 def _hues(image: Bytes) -> NDArray[np.int64]:
@@ -84,8 +147,8 @@ def _hues(image: Bytes) -> NDArray[np.int64]:
     return hues
 
 
-def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return (H, W) which thing a pixel belongs to, 0: none, and how many things there are.
+def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (H, W) which thing a pixel belongs to, from 1 on; 0: to none.
 
     Pixels between two things, which have the hue of neither, belong to the nearer one.
     """
@@ -97,7 +160,8 @@ def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     pieces, _ = ndimage.label(unusual)
     rows, columns = ndimage.distance_transform_edt(cores == 0, return_distances=False, return_indices=True)
     same_piece = unusual & (pieces == pieces[rows, columns])
-    return np.where(same_piece, cores[rows, columns], 0), int(is_core.sum())
+    numbers: NDArray[np.int64] = np.where(same_piece, cores[rows, columns], 0)
+    return numbers
 
 
 def _bright_color(pixels: Bytes) -> Color:
@@ -138,30 +202,29 @@ def changed_things(
         may_stay: where things are erased, at most so large a share of the others stays.
     """
     before, after = images.cpu().numpy(), images.cpu().numpy().copy()
-    nothing = empty.cpu().numpy()
-    n_frames, n_cameras = before.shape[:2]
-    usual = [usual_colors(nothing[camera]) for camera in range(n_cameras)]
-    things = [
-        thing
+    nothing = [Empty(image) for image in empty.cpu().numpy()]
+    n_frames = len(before)
+    found = [
+        (frame, camera, thing)
         for frame in range(n_frames)
-        for camera in range(n_cameras)
-        for thing in things_in(before[frame, camera], usual[camera], frame=frame, camera=camera)
+        for camera, seen in enumerate(nothing)
+        for thing in _SEEN.things_in(before[frame, camera], seen)
     ]
-    groups, colors = groups_of(things)
-    shown = {group for group, thing in zip(groups, things, strict=True) if thing.frame < n_before}
-    choices = {group for group, thing in zip(groups, things, strict=True) if thing.frame >= n_before}
+    groups, colors = groups_of([thing for _, _, thing in found])
+    shown = {group for group, (frame, _, _) in zip(groups, found, strict=True) if frame < n_before}
+    choices = {group for group, (frame, _, _) in zip(groups, found, strict=True) if frame >= n_before}
     if not shown & choices:
         return images
     erased = _drawn(sorted(choices - shown), may_stay) if erases and n_frames == n_before + 1 else frozenset()
     others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
-    for thing, group in zip(things, groups, strict=True):
+    for (frame, camera, thing), group in zip(found, groups, strict=True):
         part = (slice(None), *thing.box)
-        place, mask = after[thing.frame, thing.camera][part], thing.mask
+        place, mask = after[frame, camera][part], thing.mask
         if group in erased:
             mask = _widened(mask)
-            place[:, mask] = nothing[thing.camera][part][:, mask]
+            place[:, mask] = nothing[camera].image[part][:, mask]
         elif exchanges:
-            shade = before[thing.frame, thing.camera][part][:, mask].max(axis=0) / thing.color.max()
+            shade = before[frame, camera][part][:, mask].max(axis=0) / thing.color.max()
             place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_LEVEL)
     return torch.from_numpy(after).to(images.device)
 
