@@ -26,19 +26,5 @@ shards="$1"
 shift
 number="${SLURM_ARRAY_TASK_ID:?expected a job array: sbatch --array=1-$shards shards.sh $shards …}"
 
-"${MIKASA_VLA:-.venv/bin/mikasa-vla}" "$@" --shard "$number/$shards" &
-child=$!
-# 120 s before the time limit, and when the job is preempted: mikasa-vla finishes what it is writing.
-trap 'kill -TERM "$child" 2>/dev/null || true' TERM
-code=0
-wait "$child" || code=$?
-while kill -0 "$child" 2>/dev/null; do # the signal has interrupted `wait`
-  code=0
-  wait "$child" || code=$?
-done
-
-# 143: stopped by SIGTERM. The same shard resumes where it stopped.
-if [ "$code" -eq 143 ] && [ -n "${SLURM_JOB_ID:-}" ]; then
-  scontrol requeue "$SLURM_JOB_ID"
-fi
-exit "$code"
+# It has a signal end the command properly, and queues the job again.
+exec bash scripts/slurm/job.sh "$@" --shard "$number/$shards"

@@ -15,7 +15,7 @@ from vla_eval.storage.merging import merge_runs, write_merged
 from vla_eval.storage.run_folder import read_run
 
 ROOT = Path(__file__).parents[2]
-SHARDS = ROOT / "scripts/slurm/shards.sh"
+SHARDS, JOB = ROOT / "scripts/slurm/shards.sh", ROOT / "scripts/slurm/job.sh"
 
 
 def write_program(path: Path, body: str) -> Path:
@@ -55,14 +55,29 @@ def test_a_task_of_the_array_runs_its_shard_and_gives_its_exit_code(tmp_path: Pa
     assert not (tmp_path / "scontrol").exists()
 
 
-def test_a_task_that_slurm_stops_ends_its_work_and_is_queued_again(tmp_path: Path) -> None:
+def test_a_job_runs_the_command_and_gives_its_exit_code(tmp_path: Path) -> None:
+    program = write_program(tmp_path / "program", f'echo "$@" > "{tmp_path}/called"; exit 3')
+
+    done = subprocess.run(
+        ["bash", JOB, "finetune", "--policy", "pi0", "--out", "runs/a b"], env=environment(tmp_path, program)
+    )
+
+    assert (tmp_path / "called").read_text() == "finetune --policy pi0 --out runs/a b\n"
+    assert done.returncode == 3
+    assert not (tmp_path / "scontrol").exists()
+
+
+@pytest.mark.parametrize(
+    "command", [[SHARDS, "8", "eval", "demo"], [JOB, "finetune", "--policy", "pi0"]], ids=["shard", "job"]
+)
+def test_a_job_that_slurm_stops_ends_its_work_and_is_queued_again(
+    tmp_path: Path, command: list[str | Path]
+) -> None:
     body = (
         f'trap "touch {tmp_path}/ended; exit 143" TERM; touch {tmp_path}/begun; while :; do sleep 0.05; done'
     )
     program = write_program(tmp_path / "program", body)
-    task = subprocess.Popen(
-        ["bash", SHARDS, "8", "eval", "demo"], env=environment(tmp_path, program, SLURM_ARRAY_TASK_ID="5")
-    )
+    task = subprocess.Popen(["bash", *command], env=environment(tmp_path, program, SLURM_ARRAY_TASK_ID="5"))
     while not (tmp_path / "begun").exists():
         time.sleep(0.02)
 
