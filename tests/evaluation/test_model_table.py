@@ -1,6 +1,8 @@
 """A table of learned policies: what it takes, what is missing of it, and all of it with tiny models."""
 
 import argparse
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ from vla_eval.policies.scripted import make_oracle
 from vla_eval.results.published import paper_figures
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.training.finetune import FinetuneSummary
 
 PAPER = "paper_vla_table"
 TASK = "RememberColor3-v0"
@@ -248,7 +251,7 @@ def test_processes_share_a_table_and_leave_each_other_alone(
     rows = [{**ROW, "name": name} for name in ("first", "second", "third", "fourth")]
     begun: list[str] = []
 
-    def train(config: FinetuneConfig, **_: Any) -> None:
+    def train(config: FinetuneConfig, **_: Any) -> FinetuneSummary:
         folder = Path(str(config.out))
         name = folder.relative_to(out / "training").parts[0]
         begun.append(name)
@@ -257,6 +260,7 @@ def test_processes_share_a_table_and_leave_each_other_alone(
         monkeypatch.setattr(  # the other process comes to an end with the third meanwhile
             "vla_eval.cli.model_table._is_finished", lambda one: one.row.name in (*begun, "third")
         )
+        return FinetuneSummary(out=folder, step=5, is_finished=True)
 
     monkeypatch.setattr("vla_eval.training.finetune.finetune", train)
     path = changed(small, rows=rows, steps=5, finetune={"save_every_steps": 5})
@@ -264,6 +268,26 @@ def test_processes_share_a_table_and_leave_each_other_alone(
     assert begun == ["first", "second", "fourth"]
     said = capsys.readouterr().err
     assert "second on RememberColor3-v0, run seed 0\n  another process is training it" in said
+
+
+def test_a_signal_stops_a_table_and_the_rows_that_follow_are_not_begun(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "data" / TASK).mkdir(parents=True)
+    begun: list[str] = []
+
+    def train(config: FinetuneConfig, *, is_stopping: Callable[[], bool], **_: Any) -> FinetuneSummary:
+        begun.append(str(config.out))
+        signal.raise_signal(signal.SIGTERM)
+        return FinetuneSummary(out=Path(str(config.out)), step=3, is_finished=not is_stopping())
+
+    monkeypatch.setattr("vla_eval.training.finetune.finetune", train)
+    path = changed(small, rows=[ROW, {**ROW, "name": "two"}], steps=5, finetune={"save_every_steps": 5})
+    assert main(["finetune", str(path), "--out", str(tmp_path / "out")]) == 143
+    assert len(begun) == 1
+    screen = capfd.readouterr()
+    assert screen.out == ""
+    assert f"[1/2] one on {TASK}, run seed 0: stopped at step 3. To resume: " in screen.err
 
 
 def test_an_evaluation_says_what_has_not_been_trained(

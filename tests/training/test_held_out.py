@@ -132,6 +132,31 @@ class TestEvaluation:
         finetune(act(recorded, broken, held_out=ON_FAKE))  # all is there
         assert len(quick_evaluation) == n_evaluations
 
+    def test_an_evaluation_is_stopped_with_its_training_and_finished_by_the_next_call(
+        self,
+        recorded: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        quick_evaluation: list[EvalConfig],
+    ) -> None:
+        straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+        finetune(act(recorded, straight, held_out=ON_FAKE))
+        quick, begun = held_out_module.evaluate, []
+
+        def begin(config: EvalConfig, **options: Any) -> Any:
+            begun.append(config)
+            return quick(config, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(held_out_module, "evaluate", begin)
+            asked = finetune(act(recorded, stopped, held_out=ON_FAKE), is_stopping=lambda: bool(begun))
+        assert (asked.is_finished, asked.step) == (False, 2)
+        assert [name for name, _ in metrics(stopped)] == ["1", "2"]  # no figure of a part
+
+        assert finetune(act(recorded, stopped, held_out=ON_FAKE)).is_finished
+        assert same_weights(straight, stopped)
+        assert metrics(stopped) == metrics(straight)
+
     def test_other_settings_evaluate_the_checkpoints_that_are_there_again(
         self, recorded: Path, tmp_path: Path, quick_evaluation: list[EvalConfig]
     ) -> None:

@@ -1,6 +1,7 @@
 """Trainings of some steps of a tiny ACT and a tiny π0, offline, with a cache of their own."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -87,7 +88,7 @@ def asked_for(monkeypatch: pytest.MonkeyPatch) -> list[FinetuneConfig]:
 
     def fake(config: FinetuneConfig, **_: Any) -> Any:
         seen.append(config)
-        return finetune_module.FinetuneSummary(out=Path("o"), checkpoint=Path("o/c"))
+        return SimpleNamespace(out=Path("o"), checkpoint=Path("o/c"), step=1, is_finished=True)
 
     monkeypatch.setattr(finetune_module, "finetune", fake)
     return seen

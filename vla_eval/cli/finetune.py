@@ -32,6 +32,9 @@ CONFIG may also be a table of learned policies, such as paper_vla_table: all its
 those of some rows (--policy) and tasks (--task).
 Then: mikasa-vla eval --policy RUN --task TASK"""
 
+EPILOG = """docs/finetuning.md explains recipes, memory and resuming. Exit codes: 0 trained to the last step; 1 a
+mistake; 130, 143 stopped by Ctrl-C, SIGTERM, with a checkpoint of that step (the same command resumes)."""
+
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
@@ -40,7 +43,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         "finetune",
         help="train a policy on a dataset, or resume the training",
         description=DESCRIPTION,
-        epilog="docs/finetuning.md explains recipes, memory and resuming.",
+        epilog=EPILOG,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     parser.add_argument(
@@ -102,6 +105,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for torch.
     from tqdm import tqdm
 
+    from vla_eval.cli.progress import ANSWER_TO_STOP, stop_on_signals
     from vla_eval.training.finetune import finetune
 
     if args.cluster is not None:
@@ -116,9 +120,18 @@ def run(args: argparse.Namespace) -> int:
             lines = describe_finetuning(_config(args), options)
         print("\n".join(lines))
         return 0
-    command = typed_command()
-    with contextlib.redirect_stdout(sys.stderr):  # some of lerobot's policies print while they are made
-        summary = finetune(_config(args), command=command, say=lambda line: tqdm.write(line, file=sys.stderr))
+    config, command = _config(args), typed_command()
+    # Some of lerobot's policies print while they are made.
+    with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
+        summary = finetune(
+            config,
+            command=command,
+            say=lambda line: tqdm.write(line, file=sys.stderr),
+            is_stopping=lambda: stop.is_asked,
+        )
+    if not summary.is_finished:
+        print(f"Stopped at step {summary.step} in {summary.out}. To resume: {command}", file=sys.stderr)
+        return stop.exit_code
     print(summary.checkpoint)
     return 0
 

@@ -77,7 +77,9 @@ def finetune_table(args: argparse.Namespace) -> int:
     work = _work(args, rows=args.policy)
     with backend_of(args, needs=lambda: _needs(work)) as backend:
         device = args.device or "auto"
-        _finetune(work, backend, device=device, allow_unreplayed=args.allow_unreplayed)
+        stopped = _finetune(work, backend, device=device, allow_unreplayed=args.allow_unreplayed)
+    if stopped is not None:
+        return stopped
     for one in finetunings(work.table, work.out):
         print(one.config.out)
     return 0
@@ -116,7 +118,9 @@ def evaluate_table(args: argparse.Namespace) -> int:
     with backend_of(args, needs=lambda: _needs(work)) as backend:
         if args.tiny:
             _record_tiny(work, backend, allow_environment_change=args.allow_environment_change)
-            _finetune(work, backend, device="cpu")
+            stopped = _finetune(work, backend, device="cpu")
+            if stopped is not None:
+                return stopped
         _refuse_unfinished(work, args)
         return _evaluate(work, backend, args)
 
@@ -169,8 +173,12 @@ def _needs(work: _Work) -> tuple[Needed, ...]:
     return (shared_folder(work.out), shared_folder(Path(work.table.datasets)), *recipes)
 
 
-def _finetune(work: _Work, backend: Backend, *, device: str, allow_unreplayed: bool = False) -> None:
-    """Run all fine-tunings that are not finished; leave out those that another process has begun."""
+def _finetune(work: _Work, backend: Backend, *, device: str, allow_unreplayed: bool = False) -> int | None:
+    """Run all fine-tunings that are not finished; leave out those that another process has begun.
+
+    Returns:
+        The exit code if a signal has asked to stop.
+    """
     everything = finetunings(work.table, work.out)
     unfinished = _unfinished(work)
     _say(describe_effort(work.table, n_finished=len(everything) - len(unfinished)))
@@ -186,27 +194,39 @@ def _finetune(work: _Work, backend: Backend, *, device: str, allow_unreplayed: b
         for one in unfinished
     ]
     if backend is LOCAL:
-        _finetune_here(work, todo)
-    else:
-        from vla_eval.cli.table_on_cluster import finetune_on
+        return _finetune_here(work, todo)
+    from vla_eval.cli.table_on_cluster import finetune_on
 
-        finetune_on(backend, todo, logs=work.out / "logs", is_tiny=bool(work.adapters), say=_say)
+    finetune_on(backend, todo, logs=work.out / "logs", is_tiny=bool(work.adapters), say=_say)
+    return None
 
 
-def _finetune_here(work: _Work, todo: Sequence[Finetuning]) -> None:
+def _finetune_here(work: _Work, todo: Sequence[Finetuning]) -> int | None:
     """Run one fine-tuning after the other in this process: each takes all GPUs of this machine."""
+    from vla_eval.cli.progress import ANSWER_TO_STOP, stop_on_signals
     from vla_eval.training.finetune import finetune
 
-    with contextlib.redirect_stdout(sys.stderr), _tiny_models(work):
+    command = typed_command()
+    with (
+        stop_on_signals(ANSWER_TO_STOP) as stop,
+        contextlib.redirect_stdout(sys.stderr),
+        _tiny_models(work),
+    ):
         for index, one in enumerate(todo):
             if _is_finished(one):
                 continue
-            _say(f"[{index + 1}/{len(todo)}] {one.row.name} on {one.task}, run seed {one.run_seed}")
+            name = f"[{index + 1}/{len(todo)}] {one.row.name} on {one.task}, run seed {one.run_seed}"
+            _say(name)
             try:
-                finetune(one.config, command=typed_command(), say=_say)
+                done = finetune(one.config, command=command, say=_say, is_stopping=lambda: stop.is_asked)
             except FolderInUseError:
                 _say("  another process is training it")
+            else:
+                if not done.is_finished:
+                    _say(f"{name}: stopped at step {done.step}. To resume: {command}")
+                    return stop.exit_code
             _free_memory()
+    return None
 
 
 def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:

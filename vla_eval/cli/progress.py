@@ -1,5 +1,6 @@
 """Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
 
+import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,9 @@ from vla_eval.workers.load import Load
 from vla_eval.workers.local import LOCAL
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+STDERR = 2
+ANSWER_TO_STOP = "Stopping after this step, with a checkpoint. Once more: at once, without one."
+"""Of a training."""
 MEGABYTES_PER_FRAME = 0.9  # 3 × (512² + 2 × 128²) bytes
 
 
@@ -32,23 +36,33 @@ class StopRequest:
     signal_number: int | None = None
 
     @property
+    def is_asked(self) -> bool:
+        """Whether a signal has come."""
+        return self.signal_number is not None
+
+    @property
     def exit_code(self) -> int:
         """What shells expect of a command that a signal has ended."""
         return 128 + (self.signal_number or 0)
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
+def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
     """Turn Ctrl-C, SIGTERM and SIGHUP into a request, so that no record is cut in the middle.
 
     A second signal does not wait: it raises KeyboardInterrupt.
+
+    Args:
+        answer: to the first one, a line on standard error.
     """
     request = StopRequest()
 
     def ask(number: int, _frame: FrameType | None) -> None:
-        if request.signal_number is not None:
+        if request.is_asked:
             raise KeyboardInterrupt
         request.signal_number = number
+        if answer:
+            os.write(STDERR, f"\n{answer}\n".encode())  # `print` may be what was interrupted
 
     previous: dict[int, Any] = {}  # Any: what `signal.signal` takes and gives
     for name in STOP_SIGNALS:
@@ -188,9 +202,9 @@ class Progress:
         """Write a line now and then; return whether a signal has asked to stop."""
         self._bar.tick()
         self._lines.on_tick()
-        return self._stop.signal_number is not None
+        return self._stop.is_asked
 
     def close(self) -> None:
         """Write how far it has come."""
         self._bar.close()
-        self._lines.close(stopped=self._stop.signal_number is not None)
+        self._lines.close(stopped=self._stop.is_asked)

@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
             sys.stdout.flush()
             hint_merge(whole, args.shard)
         code = _replay_new(summary, args, stop, workers=recipe.workers, backend=backend)
-    if stop.signal_number is not None:
+    if stop.is_asked:
         print(f"Stopped in the replay check. To resume: {command}", file=sys.stderr)
     return code
 

@@ -48,9 +48,9 @@ class RecordingProgress:
         """Write a line now and then; return whether a signal has asked to stop."""
         self._bar.tick()
         self._lines.on_tick()
-        return self._stop.signal_number is not None
+        return self._stop.is_asked
 
     def close(self) -> None:
         """Write how far the phase has come."""
         self._bar.close()
-        self._lines.close(stopped=self._stop.signal_number is not None)
+        self._lines.close(stopped=self._stop.is_asked)

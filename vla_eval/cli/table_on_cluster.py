@@ -70,7 +70,7 @@ def _run(
     n_done = 0
     with stop_on_signals() as stop, pool as running:
         for event in running.run(queue):
-            if event is None and stop.signal_number is not None:
+            if event is None and stop.is_asked:
                 raise SystemExit(stop.exit_code)
             if not isinstance(event, Answered):
                 continue

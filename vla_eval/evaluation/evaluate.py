@@ -70,7 +70,7 @@ class EvaluationObserver(Protocol):
         """Called several times a second; returns whether the run has to stop now."""
 
 
-class _Silence:
+class Silence:
     """Watches nothing and never stops the run."""
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
@@ -143,7 +143,7 @@ def evaluate(
     """
     policies = load_policy_entries(config.policies) if policies is None else policies
     config = with_inference(config, policies, backend)
-    observer, path = observer or _Silence(), out or shard_folder(default_run_folder(config), shard)
+    observer, path = observer or Silence(), out or shard_folder(default_run_folder(config), shard)
     plan = plan_shard(config, shard, policies)
     with RunFolder.open(
         path,

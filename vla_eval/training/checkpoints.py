@@ -11,9 +11,7 @@ from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
 from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
 from vla_eval.training.job import TrainingJob
-from vla_eval.training.run_folder import LAST, point
-
-PARTIAL_PREFIX = ".partial-"
+from vla_eval.training.run_folder import LAST, PARTIAL_PREFIX, point
 
 
 def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any]) -> Path | None:

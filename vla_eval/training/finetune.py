@@ -21,7 +21,14 @@ from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
-from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, RUN_FILE, open_folder, read_metrics
+from vla_eval.training.run_folder import (
+    LOG_FILE,
+    METRICS_FILE,
+    RUN_FILE,
+    newest_step,
+    open_folder,
+    read_metrics,
+)
 from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
 from vla_eval.training.waiting import about_decisions
 
@@ -29,23 +36,49 @@ LOCK_FILE = "finetune.lock"
 OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
 Say = Callable[[str], None]
 """Takes a line for a person."""
+IsStopping = Callable[[], bool]
+"""Says whether to stop early."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneSummary:
-    """The result of a call: the run folder, and the checkpoint that an evaluation takes."""
+    """The result of a call.
+
+    Attributes:
+        out: the run folder.
+        step: of its newest checkpoint; 0: there is none.
+        is_finished: it is the last step, and evaluated if it should be; False: `is_stopping` said yes.
+    """
 
     out: Path
-    checkpoint: Path
+    step: int
+    is_finished: bool
+
+    @property
+    def checkpoint(self) -> Path:
+        """The checkpoint that an evaluation takes.
+
+        Raises:
+            CheckpointError: there is none: training was stopped before the first.
+        """
+        return find_checkpoint(self.out)
 
 
-def finetune(config: FinetuneConfig, *, command: str = "", say: Say = lambda _line: None) -> FinetuneSummary:
+def finetune(
+    config: FinetuneConfig,
+    *,
+    command: str = "",
+    say: Say = lambda _line: None,
+    is_stopping: IsStopping = lambda: False,
+) -> FinetuneSummary:
     """Fine-tune, or resume a fine-tuning.
 
     Args:
         config: what to train on what.
         command: what the user typed, for the record.
         say: gets lines for a person.
+        is_stopping: asked between steps, and during evaluations; once it says yes, a checkpoint is written,
+            from which the same call resumes.
 
     Raises:
         VlaEvalError: a mistake; what was saved stays.
@@ -59,11 +92,13 @@ def finetune(config: FinetuneConfig, *, command: str = "", say: Say = lambda _li
         say(f"run: {job.out}" + (f", resuming from step {job.first_step}" if job.resume_from else ""))
         project = job.recipe.trackio_project if _is_first_process() else None
         with trackio_run(project, name=job.out.resolve().name, settings=to_data(job.recipe)) as track:
-            held_out = _held_out(job, say, track)
+            held_out = _held_out(job, say, track, is_stopping)
             if held_out is not None:
                 held_out.catch_up(read_metrics(job.out))
-            train(job, _listeners(job, say, track, held_out))
-    return FinetuneSummary(out=job.out, checkpoint=find_checkpoint(job.out))
+            is_finished = train(job, _listeners(job, say, track, held_out, is_stopping))
+            if held_out is not None and held_out.missing(read_metrics(job.out)):
+                is_finished = False
+    return FinetuneSummary(out=job.out, step=newest_step(job.out), is_finished=is_finished)
 
 
 def _describe(job: TrainingJob, say: Say) -> None:
@@ -88,7 +123,9 @@ def _describe(job: TrainingJob, say: Say) -> None:
         )
 
 
-def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None) -> Listeners:
+def _listeners(
+    job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None, is_stopping: IsStopping
+) -> Listeners:
     """Return what gets the progress: a person, a tracker of metrics, the evaluation of checkpoints."""
     steps = job.recipe.steps
 
@@ -116,10 +153,16 @@ def _listeners(job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None)
         if held_out is not None and held_out.is_due(int(checkpoint.name)):
             held_out.evaluate(checkpoint)
 
-    return Listeners(on_model=describe, on_metrics=report, on_checkpoint=evaluate, on_step=time_step)
+    return Listeners(
+        on_model=describe,
+        on_metrics=report,
+        on_checkpoint=evaluate,
+        on_step=time_step,
+        is_stopping=is_stopping,
+    )
 
 
-def _held_out(job: TrainingJob, say: Say, track: Log) -> HeldOut | None:
+def _held_out(job: TrainingJob, say: Say, track: Log, is_stopping: IsStopping) -> HeldOut | None:
     if job.held_out is None or job.held_out_task is None or not _is_first_process():
         return None
 
@@ -135,6 +178,7 @@ def _held_out(job: TrainingJob, say: Say, track: Log) -> HeldOut | None:
         last_step=job.recipe.steps,
         on_metrics=report,
         say=say,
+        is_stopping=is_stopping,
     )
 
 

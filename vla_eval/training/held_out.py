@@ -17,7 +17,7 @@ from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.evaluation.evaluate import Silence, evaluate
 from vla_eval.policies.checkpoint import MODEL_FOLDER
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
@@ -42,6 +42,7 @@ class HeldOut:
         last_step: its last step, whose checkpoint is evaluated in any case.
         on_metrics: takes one line of metrics.
         say: gets lines for a person.
+        is_stopping: an evaluation ends early once it says yes, without a figure; `catch_up` resumes it.
     """
 
     settings: HeldOutConfig
@@ -50,6 +51,7 @@ class HeldOut:
     last_step: int
     on_metrics: Callable[[Mapping[str, float | str]], None]
     say: Callable[[str], None]
+    is_stopping: Callable[[], bool]
 
     @property
     def identity(self) -> str:
@@ -63,15 +65,20 @@ class HeldOut:
         return step % self.settings.every_steps == 0 or step == self.last_step
 
     def catch_up(self, done: Iterable[Mapping[str, object]]) -> None:
-        """Evaluate the checkpoints that are there and have no result.
+        """Evaluate the checkpoints that are there and have no result, until asked to stop.
 
         Args:
             done: lines of metrics.
         """
-        evaluated = {line["step"] for line in done if line.get(METRIC_KEY) == self.identity}
-        for checkpoint in whole_checkpoints(self.out):
-            if self.is_due(int(checkpoint.name)) and int(checkpoint.name) not in evaluated:
+        for checkpoint in self.missing(done):
+            if not self.is_stopping():
                 self.evaluate(checkpoint)
+
+    def missing(self, done: Iterable[Mapping[str, object]]) -> list[Path]:
+        """Return the checkpoints that are there and have no result, given the lines of metrics."""
+        evaluated = {line["step"] for line in done if line.get(METRIC_KEY) == self.identity}
+        steps = {folder: int(folder.name) for folder in whole_checkpoints(self.out)}
+        return [folder for folder, step in steps.items() if self.is_due(step) and step not in evaluated]
 
     def evaluate(self, checkpoint: Path) -> None:
         """Evaluate a checkpoint (`…/000100`) and report its figure; finished episodes are not run again.
@@ -81,7 +88,10 @@ class HeldOut:
         """
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
-        evaluate(self._config(checkpoint), out=folder, allow_environment_change=True)
+        stops = _UntilStopped(self.is_stopping)
+        config = self._config(checkpoint)
+        if evaluate(config, out=folder, allow_environment_change=True, observer=stops).was_stopped:
+            return
         records = read_run(folder).records
         results = [bool(record.success_once) for record in records if record.error is None]
         n_success, n_episodes, n_errors = sum(results), len(results), len(records) - len(results)
@@ -119,6 +129,17 @@ class HeldOut:
             inference="in_process",  # results of one training have to be comparable on any machine
             workers=settings.workers,
         )
+
+
+class _UntilStopped(Silence):
+    """Stops an evaluation with the training that it is of."""
+
+    def __init__(self, is_stopping: Callable[[], bool]) -> None:
+        self._is_stopping = is_stopping
+
+    def on_tick(self) -> bool:
+        """Return whether to stop."""
+        return self._is_stopping()
 
 
 def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: TrainingDataset) -> str:

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import math
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -45,11 +46,12 @@ from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.model import local_files_only, make_model, make_processors
-from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE
+from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, drop_extra_checkpoints
 from vla_eval.training.segments import preprocessed
 
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
 LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,23 +63,28 @@ class Listeners:
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
         on_step: called with each step, counted from 1, and its seconds, loading included.
+        is_stopping: asked between steps; once it says yes, a checkpoint is written and training ends.
     """
 
     on_model: Callable[[Any], None]
     on_metrics: Callable[[Mapping[str, float]], None]
     on_checkpoint: Callable[[Path], None]
     on_step: Callable[[int, float], None]
+    is_stopping: Callable[[], bool]
 
 
-def train(job: TrainingJob, listeners: Listeners) -> None:
+def train(job: TrainingJob, listeners: Listeners) -> bool:
     """Train to the job's last step; a finished job is left as it is.
+
+    Returns:
+        Whether the last step is done; False if training was asked to stop.
 
     Raises:
         TrainingError: the loss is not finite, or the model does not fit the job.
     """
     recipe = job.recipe
     if job.first_step >= recipe.steps:
-        return
+        return True
     accelerator = Accelerator(
         # One process may train in several precisions, and accelerate has one for all: see `autocast_dtype`.
         mixed_precision="no",
@@ -90,7 +97,13 @@ def train(job: TrainingJob, listeners: Listeners) -> None:
         is_main = accelerator.is_main_process
         wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
         silent = not (is_main and sys.stderr.isatty())
+        is_saved = is_finished = True
         for step in tqdm(range(job.first_step + 1, recipe.steps + 1), desc="Training", disable=silent):
+            if _is_asked_to_stop(accelerator, listeners):
+                if not is_saved:
+                    _save(training, step - 1, listeners, wandb)
+                is_finished = False
+                break
             started = time.perf_counter()
             training.do_step(step)
             listeners.on_step(step, time.perf_counter() - started)
@@ -98,15 +111,12 @@ def train(job: TrainingJob, listeners: Listeners) -> None:
                 line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
                 if is_main:
                     _report(line, job.out / METRICS_FILE, listeners, wandb)
-            if step % recipe.save_every_steps == 0 or step == recipe.steps:
-                folder = write_checkpoint(job, step, accelerator, training.parts())
-                if folder is not None:
-                    listeners.on_checkpoint(folder)
-                    if wandb is not None:
-                        wandb.log_policy(folder)
-                accelerator.wait_for_everyone()
-        logging.info("End of training")
+            is_saved = step % recipe.save_every_steps == 0 or step == recipe.steps
+            if is_saved:
+                _save(training, step, listeners, wandb)
+        logging.info("End of training" if is_finished else "Stopped, as asked")
         accelerator.end_training()
+    return is_finished
 
 
 class _Training:
@@ -185,6 +195,26 @@ class _Training:
         return float(norm)
 
 
+def _is_asked_to_stop(accelerator: Accelerator, listeners: Listeners) -> bool:
+    """Return whether any of the processes is asked to stop: all write one checkpoint, and have to agree."""
+    is_stopping = listeners.is_stopping()
+    if accelerator.num_processes == 1:
+        return is_stopping
+    asked = accelerator.reduce(torch.tensor(int(is_stopping), device=accelerator.device), reduction="sum")
+    return bool(asked.item())
+
+
+def _save(training: _Training, step: int, listeners: Listeners, wandb: Any) -> None:
+    job, accelerator = training.job, training.accelerator
+    folder = write_checkpoint(job, step, accelerator, training.parts())
+    if folder is not None:
+        drop_extra_checkpoints(job.out, save_every_steps=job.recipe.save_every_steps)
+        listeners.on_checkpoint(folder)
+        if wandb is not None:
+            wandb.log_policy(folder)
+    accelerator.wait_for_everyone()
+
+
 def seed_step(run_seed: int, step: int, process: int) -> None:
     """Seed all global generators from these three numbers: lerobot's policies draw from them."""
     drawn = np.random.SeedSequence(run_seed, spawn_key=(step, process)).generate_state(1)
@@ -238,9 +268,16 @@ def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerato
         sampler=sampler,
         num_workers=config.num_workers,
         pin_memory=accelerator.device.type == "cuda",
+        worker_init_fn=_leave_signals_to_the_parent,
         collate_fn=lerobot_collate_fn if dataset.meta.has_language_columns else None,
         **(in_workers if config.num_workers else {}),
     )
+
+
+def _leave_signals_to_the_parent(_worker: int) -> None:
+    """Let a process that loads samples live on at Ctrl-C, which reaches all of them: a step may need it."""
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _report(line: Mapping[str, float], file: Path, listeners: Listeners, wandb: Any) -> None:

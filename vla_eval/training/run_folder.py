@@ -24,6 +24,7 @@ FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"
 CHECKPOINTS_FOLDER, LAST = "checkpoints", "last"
 STATE_FOLDER = "training_state"
+PARTIAL_PREFIX = ".partial-"
 COMPARED = "settings"  # what results depend on; the rest is for the record
 
 
@@ -75,7 +76,7 @@ def newest_checkpoint(path: Path) -> Path | None:
         shutil.rmtree(path / TRAIN_FOLDER, ignore_errors=True)
         (path / METRICS_FILE).unlink(missing_ok=True)
         return None
-    for partial in folder.glob(".partial-*"):
+    for partial in folder.glob(f"{PARTIAL_PREFIX}*"):
         shutil.rmtree(partial)
     point(folder / LAST, whole[-1].name)
     _cut_metrics(path / METRICS_FILE, int(whole[-1].name))
@@ -86,6 +87,15 @@ def whole_checkpoints(path: Path) -> list[Path]:
     """Return the folders of the checkpoints that training can resume from, oldest first."""
     folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
     return sorted(entry for entry in folder.glob("[0-9]*") if (entry / STATE_FOLDER).is_dir())
+
+
+def drop_extra_checkpoints(path: Path, *, save_every_steps: int) -> None:
+    """Remove all checkpoints but the newest that were written only because a training was asked to stop."""
+    for folder in whole_checkpoints(path)[:-1]:
+        if int(folder.name) % save_every_steps:
+            partial = folder.with_name(f"{PARTIAL_PREFIX}{folder.name}")
+            os.replace(folder, partial)  # a kill leaves nothing that looks like a checkpoint
+            shutil.rmtree(partial)
 
 
 def newest_step(path: Path) -> int:
