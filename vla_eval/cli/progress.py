@@ -42,8 +42,11 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """What shells expect of a command that a signal has ended."""
-        return 128 + (self.signal_number or 0)
+        """What shells expect of a command that a signal has ended; without one, that of SIGTERM.
+
+        Of several processes that train together, the others stop, too.
+        """
+        return 128 + (self.signal_number or signal.SIGTERM)
 
 
 @contextmanager
