@@ -32,8 +32,8 @@ CONFIG may also be a table of learned policies, such as paper_vla_table: all its
 those of some rows (--policy) and tasks (--task).
 Then: mikasa-vla eval --policy RUN --task TASK"""
 
-EPILOG = """docs/finetuning.md explains recipes, memory and resuming. Exit codes: 0 trained to the last step; 1 a
-mistake; 130, 143 stopped by Ctrl-C, SIGTERM, with a checkpoint of that step (the same command resumes)."""
+EPILOG = """docs/finetuning.md explains recipes, memory and resuming. Exit codes: 0 trained to the last step;
+1 a mistake; 130, 143 stopped by Ctrl-C, SIGTERM, with a checkpoint (the same command resumes)."""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
