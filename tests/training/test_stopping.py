@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,16 @@ def test_processes_that_load_samples_outlive_ctrl_c(
     assert set(interrupted) >= {0, 1, 2}
 
 
+@pytest.fixture
+def signals_as_on_a_terminal() -> Iterator[None]:
+    """A process that a script has started in the background ignores Ctrl-C, and so do we."""
+    before = [(number, signal.signal(number, signal.SIG_DFL)) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    for number, handler in before:
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signals_as_on_a_terminal")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_stops_the_command_with_a_checkpoint_and_the_same_command_resumes(
     recorded: Path,
