@@ -11,7 +11,7 @@ import pytest
 
 from tests.training import tiny_trainings
 from tests.training.test_held_out import metrics, same_weights
-from tests.training.tiny_trainings import TINY_ACT, act
+from tests.training.tiny_trainings import SHORT, TINY_ACT, act
 from vla_eval.cli.main import main
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.training import loop
@@ -97,21 +97,11 @@ def test_a_signal_stops_the_command_with_a_checkpoint_and_the_same_command_resum
     code: int,
 ) -> None:
     run = tmp_path / "run"
-    command = [
-        "finetune",
-        "--policy",
-        "act",
-        "--dataset",
-        str(recorded),
-        "--out",
-        str(run),
-        "--device",
-        "cpu",
-    ]
-    fields = {"steps": 4, "batch_size": 2, "save_every_steps": 4, "num_workers": 0, "log_every_steps": 1}
-    for name, value in (fields | {f"policy.{key}": value for key, value in TINY_ACT.items()}).items():
+    command = ["finetune", "--policy", "act", "--dataset", str(recorded), "--out", str(run)]
+    command += ["--device", "cpu", "--allow-unreplayed"]
+    fields = {**SHORT, "save_every_steps": 4, **{f"policy.{key}": value for key, value in TINY_ACT.items()}}
+    for name, value in fields.items():
         command += ["--set", f"{name}={value}"]
-    command.append("--allow-unreplayed")
 
     def send(run_seed: int, step: int, process: int, original: Any = loop.seed_step) -> None:
         if step == 1:

@@ -121,21 +121,24 @@ def things_in(image: Bytes, usual: Mask) -> tuple[Thing, ...]:
     rows, columns = ndimage.find_objects(_widened(unusual).astype(np.int8))[0]
     part = image[:, rows, columns]
     numbers = _numbered(unusual[rows, columns], _hues(part))
-    things = []
-    for number, box in enumerate(ndimage.find_objects(numbers), start=1):
-        mask, down, right = numbers[box] == number, box[0].start + rows.start, box[1].start + columns.start
-        color = _bright_color(part[:, *box][:, mask])
-        things.append(_with_an_edge(mask, down, right, image.shape[1:], color))
-    return tuple(things)
+    # The part has an edge around all things, too, but where the image ends.
+    boxes = [tuple(_widened_by_one(side) for side in box) for box in ndimage.find_objects(numbers)]
+    masks = [numbers[box] == number for number, box in enumerate(boxes, start=1)]
+    return tuple(
+        Thing(
+            (_later(down, rows), _later(across, columns)), mask, _bright_color(part[:, down, across][:, mask])
+        )
+        for (down, across), mask in zip(boxes, masks, strict=True)
+    )
 
 
-def _with_an_edge(mask: Mask, down: int, right: int, size: tuple[int, ...], color: Color) -> Thing:
-    """Return a thing whose box is a pixel wider than its mask (H, W), but where the image ends."""
-    above, before = min(down, 1), min(right, 1)
-    below, behind = min(size[0] - down - mask.shape[0], 1), min(size[1] - right - mask.shape[1], 1)
-    wide = np.pad(mask, ((above, below), (before, behind)))
-    top, left = down - above, right - before
-    return Thing((slice(top, top + wide.shape[0]), slice(left, left + wide.shape[1])), wide, color)
+def _widened_by_one(side: slice) -> slice:
+    return slice(max(side.start - 1, 0), side.stop + 1)
+
+
+def _later(side: slice, begin: slice) -> slice:
+    """Return a side of a box in a part of an image as one of the image, which ends where the part does."""
+    return slice(begin.start + side.start, min(begin.start + side.stop, begin.stop))
 
 
 def _hues(image: Bytes) -> NDArray[np.int64]:
