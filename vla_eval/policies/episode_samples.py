@@ -42,7 +42,17 @@ class Episodes(NamedTuple):
     @property
     def frames(self) -> Tensor:
         """(B, T) which of `images` each step shows; padding shows the last one of its episode."""
-        return self.first.flatten().cumsum(dim=0).sub(1).reshape(self.first.shape)
+        return last_of(self.first)
+
+    @property
+    def real(self) -> Tensor:
+        """(B, T) False for padding: the first action of a chunk counts at every other step."""
+        return self.counts.sum(dim=-1) > 0
+
+
+def last_of(chosen: Tensor) -> Tensor:
+    """Return (B, T): which of the chosen steps, episode by episode, each step is or comes after."""
+    return chosen.flatten().cumsum(dim=0).sub(1).reshape(chosen.shape)
 
 
 def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:

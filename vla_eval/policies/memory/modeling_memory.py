@@ -50,14 +50,14 @@ class MikasaMemoryPolicy(EpisodePolicy):
         same = SAME_JOINTS if config.joint_targets else SAME_ACTION
         episodes = self.samples(scaled, same_action=same)
         said = said_at_each_step(self.network.sentence, batch, episodes.state.shape[1])
-        images = in_numbers(episodes.images)[episodes.frames]
-        answer = self.network(images, episodes.state, said)
+        first, real = episodes.first, episodes.real
+        images = in_numbers(episodes.images)
+        answer = self.network.answers(images, episodes.state, said, first=first, real=real)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
-        real = (episodes.counts.sum(dim=-1) > 0).float()
-        goal, goals = goals_missed(answer, episodes.goal_m, real)
+        goal, goals = goals_missed(answer, episodes.goal_m, real.float())
         if self.training:
-            self._note_errors(answer, episodes, real > 0)
+            self._note_errors(answer, episodes, real)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
         surprise = weighted_mean(surprises, episodes.counts)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.policies.eef_state import POSITION_SCALE, SPACE, STATE
+from vla_eval.policies.episode_samples import last_of
 from vla_eval.policies.memory.action_head import WAY_SCALE_M, ActionHead
 from vla_eval.policies.memory.goal_layer import GoalLayer
 from vla_eval.policies.memory.joint_layer import JointLayer
@@ -249,12 +250,40 @@ class MemoryNetwork(nn.Module):
             state: (B, T, state) in SI units.
             said: (B, T, hidden), see `see`.
         """
-        shape = state.shape[:2]
-        flat_state = state.flatten(0, 1)
-        sight = self.see(images.flatten(0, 1), flat_state, None if said is None else said.flatten(0, 1))
-        memories = self.write(sight, shape, self.begin(shape[0]))
-        flat = Memory(*(part.flatten(0, 1) for part in memories))
-        return Answer(*(by_episode(part, shape) for part in self.act(sight, flat, flat_state)))
+        every = torch.ones(state.shape[:2], dtype=torch.bool, device=state.device)
+        return self.answers(images.flatten(0, 1), state, said, first=every, real=every)
+
+    def answers(
+        self, images: Tensor, state: Tensor, said: Tensor | None, *, first: Tensor, real: Tensor
+    ) -> Answer:
+        """Answer for each step of padded episodes. Nothing is computed for padding but its memory.
+
+        Args:
+            images: (N, cameras, 3, H, W) in [0, 1], those of `first`, one episode after the other.
+            state: (B, T, state) in SI units.
+            said: (B, T, hidden), see `see`.
+            first: (B, T) where a frame is shown for the first time; later steps show it again.
+            real: (B, T) False for padding, which comes last and gets the answer of the step before it.
+        """
+        sight = self.see(images, state[first], None if said is None else said[first])
+        shown = last_of(first)
+        seen = sight._replace(
+            things=sight.things[shown].flatten(0, 1), summary=sight.summary[shown].flatten(0, 1)
+        )
+        memories = self.write(seen, state.shape[:2], self.begin(len(state)))
+        at_real = sight if len(images) == int(real.sum()) else _of(sight, shown[real])
+        answer = self.act(at_real, Memory(*(part[real] for part in memories)), state[real])
+        return Answer(*(part[last_of(real)] for part in answer))
+
+
+def _of(sight: Sight, steps: Tensor) -> Sight:
+    """Return what is seen at these (M,) of the N steps."""
+    return Sight(
+        [Places(*(part[steps] for part in places)) for places in sight.places],
+        [keys[steps] for keys in sight.keys],
+        sight.things[steps],
+        sight.summary[steps],
+    )
 
 
 def by_episode(steps: Tensor, shape: Sequence[int]) -> Tensor:
