@@ -156,7 +156,7 @@ class Likeness(nn.Module):
         """
         counts = functional.softplus(self.counts)
         # Minus the squared distance, without what all places have in common.
-        scores = 2 * keys @ (asked * counts).transpose(1, 2) - keys.square() @ counts.T
+        scores = keys @ (2 * asked * counts).transpose(1, 2) - keys.square() @ counts.T
         shares = scores.transpose(1, 2).softmax(dim=-1)
         values = places.look(shares)
         color = slice(-RGB - PLACE, -PLACE)  # of values and of keys
