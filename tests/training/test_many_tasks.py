@@ -79,6 +79,8 @@ def test_two_tasks_are_learned_at_once_and_a_killed_run_ends_with_the_same_weigh
     assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
     assert any(name.startswith("network.sentence") for name in one)
 
+    (line, *_) = (json.loads(text) for text in (straight / "metrics.jsonl").read_text().splitlines())
+    assert (line["episodes"], line["epochs"]) == (line["samples"], line["samples"] / 6)
     assert f"tasks: {TASK}, {SECOND}" in lines
     facts = read_facts(find_checkpoint(straight))
     assert facts is not None
@@ -89,7 +91,9 @@ def test_two_tasks_are_learned_at_once_and_a_killed_run_ends_with_the_same_weigh
     assert acted(straight, SECOND, SENTENCE) == acted(straight, SECOND, SENTENCE.upper())
 
 
-def test_a_dry_run_counts_the_frames_of_all_tasks(mixed: Path, tmp_path: Path) -> None:
+def test_a_dry_run_counts_the_episodes_of_all_tasks(mixed: Path, tmp_path: Path) -> None:
     options = DryRunOptions(device_bytes=None, tflops=None)
-    lines = describe_finetuning(asked("memory_many", mixed, tmp_path / "run"), options)
-    assert any("82 frames begin a sample" in line for line in lines)
+    config = asked("memory_many", mixed, tmp_path / "run")
+    passes = SHORT["steps"] * SHORT["batch_size"] / 6
+    lines = describe_finetuning(config, options)
+    assert f"dataset: 6 episodes of 82 frames, each a sample; {passes:.1f} passes over them" in lines

@@ -16,7 +16,7 @@ from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.conversion.octo import SIZES
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
-from vla_eval.training.dataset import training_dataset
+from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.job import default_out, load_finetune_recipe
@@ -83,7 +83,7 @@ def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[
     recipe = loaded.value
     check_lora_targets(recipe)
     out = Path(config.out) if config.out is not None else default_out(config)
-    found, missing, frames = _estimate(config, recipe, options)
+    found, missing, passes = _estimate(config, recipe, options)
     done = newest_step(out)
     kind = "full" if recipe.lora is None else f"LoRA of rank {recipe.lora.rank}"
     lines = [
@@ -91,16 +91,15 @@ def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[
         f"run seed {config.run_seed}, to {out}" + (f", resuming from step {done}" if done else ""),
         *(f"not there: {line}" for line in missing),
     ]
-    if frames is not None:
-        passes = recipe.steps * recipe.batch_size / frames
-        lines.append(f"dataset: {frames:,} frames begin a sample; {passes:.1f} passes over them")
+    if passes is not None:
+        lines.append(passes)
     return [*lines, *estimate_lines(found, device_bytes=options.device_bytes or _memory_here())]
 
 
 def _estimate(
     config: FinetuneConfig, recipe: FinetuneRecipe, options: DryRunOptions
-) -> tuple[Estimate, list[str], int | None]:
-    """Return the estimate, what is missing for the real run, and the number of frames, if it is known."""
+) -> tuple[Estimate, list[str], str | None]:
+    """Return the estimate, what is missing for the real run, and a line about the dataset, if it is there."""
     # A memory that is named is that of a GPU, which need not be here.
     is_named = options.device_bytes is not None and config.device == "auto"
     device = "cuda" if is_named else choose_device(config.device)
@@ -118,11 +117,23 @@ def _estimate(
         )
     if dataset is not None and (base is None or _is_there(base)):
         policy = policy_config(recipe, dataset, device="cpu")
-        frames: int | None = used_frames(policy, dataset).n_used
+        passes: str | None = _passes(policy, dataset, recipe)
     else:
-        policy, frames = options.assume(recipe), None
+        policy, passes = options.assume(recipe), None
     model = unfilled_model(policy, recipe)
-    return estimate(model, policy, recipe, device=device, tflops=options.tflops), missing, frames
+    return estimate(model, policy, recipe, device=device, tflops=options.tflops), missing, passes
+
+
+def _passes(policy: Any, dataset: TrainingDataset, recipe: FinetuneRecipe) -> str:
+    """Return a line that says how often a training sees the dataset."""
+    n_samples, frames = recipe.steps * recipe.batch_size, used_frames(policy, dataset).n_used
+    if getattr(policy, "whole_episodes", False):
+        episodes = len(dataset.lengths)
+        return (
+            f"dataset: {episodes:,} episodes of {frames:,} frames, each a sample; "
+            f"{n_samples / episodes:.1f} passes over them"
+        )
+    return f"dataset: {frames:,} frames begin a sample; {n_samples / frames:.1f} passes over them"
 
 
 def _is_there(base: str) -> bool:
