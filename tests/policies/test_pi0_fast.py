@@ -61,6 +61,17 @@ class TestTokens:
         (ids,) = fast(np.full((1, 4, 1), -4.0))  # -4 * 2 * 10 = -80
         assert ord(fast.bpe_tokenizer.decode(ids)[0]) + fast.min_token == fast.min_token == -60
 
+    def test_its_vocabulary_may_lie_in_a_folder_of_its_own(
+        self, fast: FastActionTokenizer, tmp_path: Path
+    ) -> None:
+        folder = write_tiny_fast_tokenizer(tmp_path / "published")
+        below = folder / "bpe_tokenizer"
+        below.mkdir()
+        for file in folder.glob("tokenizer*"):
+            file.rename(below / file.name)
+        actions = np.linspace(-1, 1, 24).reshape(1, 8, 3)
+        assert load_fast_tokenizer(str(folder))(actions) == fast(actions)
+
     def test_another_scheme_is_refused(self, tmp_path: Path) -> None:
         folder = write_tiny_fast_tokenizer(tmp_path / "fast")
         file = folder / "processor_config.json"

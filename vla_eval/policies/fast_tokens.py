@@ -20,6 +20,8 @@ from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint_json import read_json
 
 SETTINGS_FILE = "processor_config.json"
+VOCABULARY_FOLDER = "bpe_tokenizer"
+"""Where processors of transformers keep it; that of physical-intelligence/fast lies beside the settings."""
 CLASS = "UniversalActionProcessor"
 """What the published tokenizers call this scheme; another name is another scheme."""
 
@@ -64,8 +66,7 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
     try:
         file = Path(str(cached_file(name, SETTINGS_FILE)))
         settings = read_json(file)
-        tokenizer: Any = PreTrainedTokenizerFast
-        loaded = tokenizer.from_pretrained(name)
+        loaded = _vocabulary(name)
     except (OSError, ValueError) as exc:
         raise CheckpointError(
             f"the action tokenizer '{name}' cannot be read: {exc} Fetch its folder, and name it by "
@@ -85,6 +86,22 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
             "Fetch the action tokenizer again."
         )
     return FastActionTokenizer(loaded, scale=float(scale), min_token=min_token)
+
+
+def _vocabulary(name: str) -> Any:
+    """Return the byte-pair encoding, which lies beside the settings, or in `VOCABULARY_FOLDER`.
+
+    Raises:
+        OSError, ValueError: it is in neither.
+    """
+    tokenizer: Any = PreTrainedTokenizerFast
+    try:
+        return tokenizer.from_pretrained(name)
+    except (OSError, ValueError) as beside:
+        try:
+            return tokenizer.from_pretrained(name, subfolder=VOCABULARY_FOLDER)
+        except (OSError, ValueError):
+            raise beside from None
 
 
 class FastProcessors:
