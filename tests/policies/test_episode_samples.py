@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.policies.episode_samples import Episodes, episodes_of
+from vla_eval.policies.episode_samples import Episodes, count_motions, episodes_of
 from vla_eval.policies.sequence.configuration_sequence import MikasaSequenceConfig
 from vla_eval.policies.steps.levels import in_numbers
 
@@ -196,3 +196,26 @@ def test_a_late_decision_may_be_where_an_episode_ends() -> None:
     for steps, counts in zip(episodes.steps, episodes.counts, strict=True):
         shown = steps[counts[:, 0] > 0].tolist()
         assert shown[:3] == [0, 1, 2] and set(shown[3:]) == {3} and len(shown) <= 7
+
+
+class TestMotions:
+    @pytest.mark.parametrize(
+        ("sizes", "n_motions"),
+        [
+            ([0, 0, 1, 0.6, 0.3, 0.1], 1),  # waits, sets out, slows down
+            ([1, 0.6, 0.3, 0.1, 0.05, 0], 1),  # sets out at once
+            ([0, 1, 0.2, 0.1, 1.2, 0.4], 2),  # slows down, and sets out again
+            ([0, 1, 0.2, 0, 0, 1], 2),  # waits in between
+            ([0, 0.4, 0.8, 0.4, 0.2, 0], 0),  # no jerk
+        ],
+    )
+    def test_a_motion_begins_where_the_arm_sets_out(self, sizes: list[float], n_motions: int) -> None:
+        actions = torch.zeros(1, len(sizes), 7)
+        actions[0, :, 1] = -torch.tensor(sizes)  # any direction
+        actions[0, :, 6] = torch.tensor(sizes).roll(1)  # the gripper is no motion of the arm
+        assert count_motions(actions, torch.ones(1, len(sizes), dtype=torch.bool)).tolist() == [n_motions]
+
+    def test_padding_before_an_episode_does_not_move(self) -> None:
+        actions = torch.ones(1, 6, 7)
+        real = torch.tensor([[False, False, True, True, True, True]])
+        assert count_motions(actions, real).tolist() == [1]

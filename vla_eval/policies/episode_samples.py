@@ -12,7 +12,12 @@ from vla_eval.policies.steps.levels import in_bytes, in_numbers
 from vla_eval.policies.things import changed_things
 
 LEAST_VARIANCE_M2 = 1e-6
+LEAST_WEIGHT = 1e-12
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
+MOTION_BEGINS = 0.5
+"""By so much more than the one before it, in units of the controller's limits, a translation moves the arm
+where a motion begins. Then all of 1,500 demonstrations of six tasks with one place to go to have one motion;
+of 750 with three cubes to touch, 731 have three, the others two."""
 
 
 class Episodes(NamedTuple):
@@ -28,6 +33,7 @@ class Episodes(NamedTuple):
         goal_counts: (B, T) float, how much the goal counts at each step.
         goal_m: (B, 3) the tool centre point at the episode's end.
         steps: (B, T) which step of the window each is.
+        n_motions: (B,) see `count_motions`, of the whole episode.
     """
 
     images: Tensor
@@ -38,6 +44,7 @@ class Episodes(NamedTuple):
     goal_counts: Tensor
     goal_m: Tensor
     steps: Tensor
+    n_motions: Tensor
 
     @property
     def frames(self) -> Tensor:
@@ -121,7 +128,21 @@ def episodes_of(
         goal_counts=counts.sum(dim=-1) * taken(can_know),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=steps,
+        n_motions=count_motions(actions[:, :, 0], real),
     )
+
+
+def count_motions(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B,): how often the arm begins to move, from rest or from where it has slowed down.
+
+    Args:
+        actions: (B, T, action), the first three of them a translation of the tool.
+        real: (B, T) False for padding, at which nothing moves.
+    """
+    sizes = actions[..., :SPACE].norm(dim=-1) * real
+    rises = sizes.diff(dim=1, prepend=torch.zeros_like(sizes[:, :1]))
+    n_motions: Tensor = (rises > MOTION_BEGINS).sum(dim=1)
+    return n_motions
 
 
 def _first(steps: Tensor, is_there: Tensor) -> Tensor:
@@ -311,5 +332,5 @@ def _moved_along(images: Tensor, px: int, *, dim: int) -> Tensor:
 
 
 def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    """Return the mean of values with these weights, of the same shape."""
-    return (values * weights).sum() / weights.sum()
+    """Return the mean of values with these weights, of the same shape; 0 if all weights are."""
+    return (values * weights).sum() / weights.sum().clamp(min=LEAST_WEIGHT)

@@ -176,6 +176,32 @@ class TestTraining:
         _, parts = policy.forward(batch)
         assert parts["goal"] == pytest.approx(1.0, rel=1e-4)
 
+    def test_an_episode_of_several_motions_does_not_teach_the_goal(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded, goal_of_one_motion=True).train()
+        batch = self.batch(policy, n_real=5)
+        n_steps = policy.config.n_window_steps
+        batch["action"][:, :, :3] = 0.0
+        batch["action"][:, n_steps - 4, :3] = 1.0  # both set out; then, the second does so again
+        batch["action"][1, n_steps - 2, :3] = 1.0
+        goals = batch["observation.state"][:, -1, :3]  # a view
+        missed = []
+        for _ in range(2):
+            _, parts = policy.forward(batch)
+            missed.append(parts["goal"] * float((goals - goals.mean(dim=0)).square().mean()))
+            goals[1] += 1.0  # the second ends elsewhere: that changes the unit, the variance, alone
+        assert missed[1] == pytest.approx(missed[0], rel=1e-3)
+
+    def test_where_no_episode_teaches_the_goal_the_rest_is_learned(self, recorded: Path) -> None:
+        policy = tiny_policy(recorded, goal_of_one_motion=True).train()
+        batch = self.batch(policy, n_real=5)
+        batch["action"][:, ::2, :3] = 1.0  # sets out again and again
+        batch["action"][:, 1::2, :3] = 0.0
+        before = policy.network.goal.usual_error.clone()
+        loss, parts = policy.forward(batch)
+        loss.backward()
+        assert parts["goal"] == 0 and parts["imitation"] > 0
+        assert torch.isfinite(loss) and torch.equal(policy.network.goal.usual_error, before)
+
     def test_waiting_is_thinned_but_the_first_and_the_sampled_frame_stay(self, recorded: Path) -> None:
         policy = tiny_policy(recorded, waiting_share=1e-6).train()
         batch = self.batch(policy, n_real=5)

@@ -24,6 +24,9 @@ class MikasaMemoryConfig(EpisodeConfig):
         arm_cameras: the images whose camera is on the arm and moves with it.
         free_translation: a part of the translation does not depend on where the demonstration ends, for
             tasks that are more than a way to a place.
+        goal_of_one_motion: episodes in which the arm begins to move more than once do not teach the goal:
+            theirs is that of the last motion, and wrong until then. Where half of what is learned is wrong,
+            none of it is learned.
         joint_targets: actions are those of `pd_joint_pos`; `finetune` sets it by the dataset's control mode.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         doubt_weight: of the loss that teaches the policy how large its error will be.
@@ -40,6 +43,7 @@ class MikasaMemoryConfig(EpisodeConfig):
     hidden: int = 256
     longest_span_steps: float = 100.0
     free_translation: bool = False
+    goal_of_one_motion: bool = False
     joint_targets: bool = False
 
     doubt_weight: float = 0.1
@@ -63,6 +67,11 @@ class MikasaMemoryConfig(EpisodeConfig):
                 f"Convert it: mikasa-vla dataset convert DATASET --control-mode {JOINT_POS} --out OUT."
             )
         self.joint_targets = mode == JOINT_POS
+        if self.joint_targets and self.goal_of_one_motion:
+            raise SpecMismatchError(
+                f"goal_of_one_motion is true; motions are told by translations of the tool, and actions of "
+                f"the dataset are for {mode}. Set policy.goal_of_one_motion to false."
+            )
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""

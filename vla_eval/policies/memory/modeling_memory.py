@@ -55,9 +55,12 @@ class MikasaMemoryPolicy(EpisodePolicy):
         answer = self.network.answers(images, episodes.state, said, first=first, real=real)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
-        goal, goals = goals_missed(answer, episodes.goal_m, real.float())
-        if self.training:
-            self._note_errors(answer, episodes, real)
+        has_goal = real
+        if config.goal_of_one_motion:
+            has_goal = real & (episodes.n_motions <= 1)[:, None]
+        goal, goals = goals_missed(answer, episodes.goal_m, has_goal.float())
+        if self.training and has_goal.any():
+            self._note_errors(answer, episodes, has_goal)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
         surprises = errors.detach() / answer.doubts + answer.doubts.log()
         surprise = weighted_mean(surprises, episodes.counts)
