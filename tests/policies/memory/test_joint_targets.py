@@ -21,6 +21,7 @@ from vla_eval.oracles.kinematics import tool_pose
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.memory.configuration_memory import MikasaMemoryConfig
 from vla_eval.policies.memory.joint_layer import JOINT_UNIT_RAD, REST_RAD, JointLayer
 from vla_eval.policies.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
 from vla_eval.policies.memory.network import Answer
@@ -86,6 +87,13 @@ def test_it_is_trained_without_rotation_and_refused_in_another_mode(
         make_lerobot(context, checkpoint=str(folder))
     context = replace(context, env=env_spec(None, control_mode=EE_DELTA_POS, image_size_px=128))
     assert make_lerobot(context, checkpoint=str(folder)).spec.reads == "every"
+
+
+def test_motions_are_not_looked_for_in_joint_positions() -> None:
+    config = MikasaMemoryConfig(goal_of_one_motion=True)
+    config.fit_to_control_mode(EE_DELTA_POS)
+    with pytest.raises(SpecMismatchError, match="expected actions that translate the tool, found those of"):
+        config.fit_to_control_mode(JOINT_POS)
 
 
 def test_joint_deltas_are_refused_with_what_to_do(recorded: Path, tmp_path: Path) -> None:
