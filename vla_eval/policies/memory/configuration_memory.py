@@ -69,8 +69,8 @@ class MikasaMemoryConfig(EpisodeConfig):
         self.joint_targets = mode == JOINT_POS
         if self.joint_targets and self.goal_of_one_motion:
             raise SpecMismatchError(
-                f"goal_of_one_motion is true: expected actions that translate the tool, found those of {mode}. "
-                "Set policy.goal_of_one_motion to false."
+                "goal_of_one_motion is true: expected actions that translate the tool, found those of "
+                f"{mode}. Set policy.goal_of_one_motion to false."
             )
 
     def validate_features(self) -> None:
