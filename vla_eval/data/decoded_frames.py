@@ -70,7 +70,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
             storage = "ram"
         check_names("storage", [storage], get_args(Storage), where="DecodedFramesDataset")
         reader = source._ensure_reader()
-        self.source, self.whole_episodes = source, whole_episodes
+        self.source, self._whole_episodes = source, whole_episodes
         self.meta, self.episodes = source.meta, source.episodes
         self._deltas: Mapping[str, list[int]] | None = reader.delta_indices
         self._transforms: Callable[[Any], Any] | None = reader._image_transforms
@@ -130,7 +130,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
         index %= len(self)
-        if self.whole_episodes:
+        if self._whole_episodes:
             index = int(self._bounds[index, 1]) - 1
         fields = {
             key: column[index].clone() if isinstance(column, torch.Tensor) else column[index]

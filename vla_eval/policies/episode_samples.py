@@ -33,7 +33,6 @@ class Episodes(NamedTuple):
         goal_counts: (B, T) float, how much the goal counts at each step.
         goal_m: (B, 3) the tool centre point at the episode's end.
         steps: (B, T) which step of the window each is.
-        n_motions: (B,) see `count_motions`, of the whole episode.
     """
 
     images: Tensor
@@ -44,7 +43,6 @@ class Episodes(NamedTuple):
     goal_counts: Tensor
     goal_m: Tensor
     steps: Tensor
-    n_motions: Tensor
 
     @property
     def frames(self) -> Tensor:
@@ -128,7 +126,6 @@ def episodes_of(
         goal_counts=counts.sum(dim=-1) * taken(can_know),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=steps,
-        n_motions=count_motions(actions[:, :, 0], real),
     )
 
 

@@ -20,14 +20,12 @@ REDUCTIONS = {
 def new_tracker(job: TrainingJob, dataset: Any, accelerator: Any) -> Any:
     """Return lerobot's tracker, at the job's first step."""
     measured = dict(REDUCTIONS)
-    n_episodes = dataset.num_episodes
-    is_an_episode = getattr(dataset, "whole_episodes", False)
     if not torch.cuda.is_available():
         del measured["gpu_mem_gb"]
     return MetricsTracker(
         job.recipe.batch_size,
-        n_episodes if is_an_episode else dataset.num_frames,  # what begins a sample of an epoch
-        n_episodes,
+        dataset.num_episodes if job.whole_episodes else dataset.num_frames,  # samples of an epoch
+        dataset.num_episodes,
         {name: AverageMeter(name, ":.3g", reduction) for name, reduction in measured.items()},
         initial_step=job.first_step,
         accelerator=accelerator,

@@ -122,14 +122,14 @@ class TestPadding:
         """Two episodes, of 5 steps and of 3; the second frame of the longer one is shown twice."""
         network = tiny_policy(recorded).network
         seen = frames(5, n_episodes=2)
-        pictures = torch.stack([seen[BASE], seen[WRIST]], dim=2)
+        images = torch.stack([seen[BASE], seen[WRIST]], dim=2)
         state = seen["observation.state"]
-        pictures[0, 2], state[0, 2] = pictures[0, 1], state[0, 1]
+        images[0, 2], state[0, 2] = images[0, 1], state[0, 1]
         first = torch.tensor([[1, 1, 0, 1, 1], [1, 1, 1, 0, 0]]).bool()
         real = torch.tensor([[1, 1, 1, 1, 1], [1, 1, 1, 0, 0]]).bool()
         with torch.no_grad():
-            padded = network.answers(pictures[first], state, None, first=first, real=real)
-            longer, shorter = network(pictures[:1], state[:1]), network(pictures[1:, :3], state[1:, :3])
+            padded = network.answers(images[first], state, None, first=first, real=real)
+            longer, shorter = network(images[:1], state[:1]), network(images[1:, :3], state[1:, :3])
         for found, of_longer, of_shorter in zip(padded, longer, shorter, strict=True):
             torch.testing.assert_close(found[:1], of_longer, atol=1e-5, rtol=1e-4)
             torch.testing.assert_close(found[1:, :3], of_shorter, atol=1e-5, rtol=1e-4)

@@ -25,8 +25,8 @@ class MikasaMemoryConfig(EpisodeConfig):
         free_translation: a part of the translation does not depend on where the demonstration ends, for
             tasks that are more than a way to a place.
         goal_of_one_motion: episodes in which the arm begins to move more than once do not teach the goal:
-            theirs is that of the last motion, and wrong until then. Where half of what is learned is wrong,
-            none of it is learned.
+            theirs is that of the last motion, and wrong until then. On ten tasks that kept the goal from
+            being learned at all.
         joint_targets: actions are those of `pd_joint_pos`; `finetune` sets it by the dataset's control mode.
         channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
         doubt_weight: of the loss that teaches the policy how large its error will be.

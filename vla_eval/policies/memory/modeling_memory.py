@@ -10,6 +10,7 @@ from vla_eval.policies.episode_policy import EpisodePolicy
 from vla_eval.policies.episode_samples import (
     SAME_ACTION,
     Episodes,
+    count_motions,
     goal_missed,
     goal_variance,
     stacked_images,
@@ -55,9 +56,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
         answer = self.network.answers(images, episodes.state, said, first=first, real=real)
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
-        has_goal = real
-        if config.goal_of_one_motion:
-            has_goal = real & (episodes.n_motions <= 1)[:, None]
+        has_goal = real & self._has_one_goal(batch)[:, None] if config.goal_of_one_motion else real
         goal, goals = goals_missed(answer, episodes.goal_m, has_goal.float())
         if self.training and has_goal.any():
             self._note_errors(answer, episodes, has_goal)
@@ -67,6 +66,12 @@ class MikasaMemoryPolicy(EpisodePolicy):
         loss = imitation + config.goal_weight * goals + config.doubt_weight * surprise
         parts = {"imitation": imitation, "goal": goal, "surprise": surprise}
         return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    def _has_one_goal(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return (B,): whether the arm begins to move once in an episode."""
+        n_steps = self.config.n_window_steps
+        actions, is_pad = batch[ACTION_KEY][:, :n_steps], batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
+        return count_motions(actions, ~is_pad) <= 1
 
     @torch.no_grad()
     def _note_errors(self, answer: Answer, episodes: Episodes, real: Tensor) -> None:

@@ -167,7 +167,6 @@ class MemoryNetwork(nn.Module):
         known = torch.cat([things.flatten(1), *strongest, state * POSITION_SCALE], dim=-1)
         return Sight(places, keys, things, with_sentence(self.summary, known, said))
 
-    @in_float32
     def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
         """Return the memories (B, T, …) after each step of what was seen at B · T steps.
 
@@ -176,7 +175,11 @@ class MemoryNetwork(nn.Module):
             shape: (B, T).
             memory: before the first of these steps.
         """
-        things, summaries = by_episode(sight.things, shape), by_episode(sight.summary, shape)
+        return self._written(by_episode(sight.things, shape), by_episode(sight.summary, shape), memory)
+
+    @in_float32
+    def _written(self, things: Tensor, summaries: Tensor, memory: Memory) -> Memory:
+        """See `write`; things and summaries are (B, T, …)."""
         apart = things[..., self.sizes.channels]
         importance = self.importance(summaries) + IMPORTANCE_OF_STANDING_OUT * apart
         gates, candidates = self.gates(summaries).sigmoid(), self.candidate(summaries)
@@ -267,10 +270,7 @@ class MemoryNetwork(nn.Module):
         """
         sight = self.see(images, state[first], None if said is None else said[first])
         shown = last_of(first)
-        seen = sight._replace(
-            things=sight.things[shown].flatten(0, 1), summary=sight.summary[shown].flatten(0, 1)
-        )
-        memories = self.write(seen, state.shape[:2], self.begin(len(state)))
+        memories = self._written(sight.things[shown], sight.summary[shown], self.begin(len(state)))
         at_real = sight if len(images) == int(real.sum()) else _of(sight, shown[real])
         answer = self.act(at_real, Memory(*(part[real] for part in memories)), state[real])
         return Answer(*(part[last_of(real)] for part in answer))
