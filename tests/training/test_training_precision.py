@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.policies.lerobot_device import autocast
 from vla_eval.policies.memory.action_head import ActionHead
 from vla_eval.policies.octo.diffusion_head import DiffusionHead
 from vla_eval.policies.octo.transformer import OctoTransformer
@@ -191,3 +192,14 @@ def test_the_recipe_says_the_precision_and_else_accelerates_launcher(
 ) -> None:
     monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", launched)
     assert autocast_dtype(SimpleNamespace(**fields), "cpu") == expected
+
+
+@pytest.mark.filterwarnings("ignore:CUDA is not available")
+@pytest.mark.parametrize(("knows_bfloat16", "expected"), [(True, torch.bfloat16), (False, torch.float16)])
+def test_a_gpu_trains_and_acts_in_the_precision_of_a_cpu_if_it_knows_it(
+    monkeypatch: pytest.MonkeyPatch, knows_bfloat16: bool, expected: torch.dtype
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: knows_bfloat16)
+    assert autocast_dtype(SimpleNamespace(use_amp=True), "cuda:0") == expected
+    acting: Any = autocast(SimpleNamespace(use_amp=True, device="cuda:0"))
+    assert acting.fast_dtype == expected

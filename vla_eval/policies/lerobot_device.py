@@ -29,9 +29,22 @@ def cuda_devices(device: str) -> list[torch.device]:
     return [torch.device(device)] if str(device).startswith("cuda") else []
 
 
+def amp_dtype(device: str) -> torch.dtype:
+    """Return the half precision of `use_amp`: bfloat16, or float16 on a GPU that does not know it.
+
+    torch's own choice on any GPU is float16, whose small gradients become 0 and whose large ones overflow; a
+    policy would be trained in another precision than on a CPU.
+    """
+    kind = torch.device(device).type
+    if kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False):
+        return torch.bfloat16
+    return torch.get_autocast_dtype(kind)
+
+
 def autocast(config: Any) -> AbstractContextManager[None]:
     """Return the context in which a policy of this configuration computes."""
     if not config.use_amp:
         return nullcontext()
-    context: AbstractContextManager[None] = torch.autocast(torch.device(config.device).type)
+    device = str(config.device)
+    context: AbstractContextManager[None] = torch.autocast(torch.device(device).type, amp_dtype(device))
     return context

@@ -1,5 +1,6 @@
 """Checkpoints in lerobot's form: each is written atomically, and a damaged one gives an error message."""
 
+import json
 import os
 from pathlib import Path
 from typing import Any  # lerobot and accelerate are untyped
@@ -10,11 +11,16 @@ from lerobot.common import train_utils
 from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
 from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
+from vla_eval.strict_json import Source, read_file, read_json, shown
 from vla_eval.training.job import TrainingJob
-from vla_eval.training.run_folder import LAST, PARTIAL_PREFIX, point
+from vla_eval.training.run_folder import LAST, PARTIAL_PREFIX, STATE_FOLDER, point
+
+LOSS_SCALE_FILE = "loss_scale.json"
 
 
-def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any]) -> Path | None:
+def write_checkpoint(
+    job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any], scaler: Any
+) -> Path | None:
     """Write the checkpoint of a step, with what it was trained on; every process has to take part.
 
     Args:
@@ -23,6 +29,7 @@ def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[
         accelerator: accelerate's `Accelerator`.
         parts: `cfg`, `policy`, `optimizer`, `scheduler`, `preprocessor`, `postprocessor`, see lerobot's
             `save_checkpoint`.
+        scaler: torch's `GradScaler` of the training; enabled in float16 alone.
 
     Returns:
         The folder (`…/000100`); None in all processes but the first, which writes.
@@ -42,6 +49,8 @@ def write_checkpoint(job: TrainingJob, step: int, accelerator: Any, parts: dict[
         batch_size=job.recipe.batch_size,
         **parts,
     )
+    if scaler.is_enabled():
+        (partial / STATE_FOLDER / LOSS_SCALE_FILE).write_text(f"{json.dumps(scaler.state_dict())}\n")
     write_facts(partial / MODEL_FOLDER, job.facts)
     save_tokenizers(parts["preprocessor"], partial / MODEL_FOLDER)
     save_vlm_files(job.policy, partial / MODEL_FOLDER)
@@ -64,6 +73,30 @@ def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: 
             f"{folder}: the state of the training cannot be read ({exc!r:.300}). Remove this checkpoint's "
             "folder to resume from the one before it, or use another --out."
         ) from exc
+
+
+def load_loss_scale(folder: Path, scaler: Any) -> None:
+    """Load the scale of the loss: from another one, other steps would be left out because of an overflow.
+
+    Raises:
+        TrainingError: the training is in float16, and the scale is missing or damaged.
+    """
+    if not scaler.is_enabled():
+        return
+    file = folder / STATE_FOLDER / LOSS_SCALE_FILE
+    if not file.is_file():
+        raise TrainingError(
+            f"{file}: is missing. A training in float16 resumes with the scale of its loss; this checkpoint "
+            "was written before there was this file, or in another precision. Use another --out."
+        )
+    source = Source(
+        where=str(file), what="the scale of a loss", remedy="Use another --out.", error=TrainingError
+    )
+    data = read_json(read_file(file, source), source)
+    try:
+        scaler.load_state_dict(data)
+    except (KeyError, TypeError, ValueError) as exc:
+        raise source.refuse(shown(data), f"{exc!r}") from exc
 
 
 def _sync(folder: Path) -> None:

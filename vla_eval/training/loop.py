@@ -40,8 +40,9 @@ from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import light_metadata
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
+from vla_eval.policies.lerobot_device import amp_dtype
 from vla_eval.policies.steps.levels import in_numbers
-from vla_eval.training.checkpoints import load_state, write_checkpoint
+from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
@@ -148,6 +149,8 @@ class _Training:
         self.autocast = autocast_dtype(job.policy, job.device)
         half = self.autocast == torch.float16  # whose small gradients would be 0
         self.scaler = torch.GradScaler(accelerator.device.type, enabled=half)
+        if job.resume_from is not None:
+            load_loss_scale(job.resume_from, self.scaler)
 
     def parts(self) -> dict[str, Any]:
         """Return what a checkpoint is made of, by lerobot's names."""
@@ -206,7 +209,7 @@ def _is_asked_to_stop(accelerator: Accelerator, listeners: Listeners) -> bool:
 
 def _save(training: _Training, step: int, listeners: Listeners, wandb: Any) -> None:
     job, accelerator = training.job, training.accelerator
-    folder = write_checkpoint(job, step, accelerator, training.parts())
+    folder = write_checkpoint(job, step, accelerator, training.parts(), training.scaler)
     if folder is not None:
         drop_extra_checkpoints(job.out, save_every_steps=job.recipe.save_every_steps)
         listeners.on_checkpoint(folder)
@@ -226,7 +229,7 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
     if getattr(policy, "dtype", None) in ("bfloat16", "float16", "float32"):
         return None if policy.dtype == "float32" else getattr(torch, policy.dtype)
     if getattr(policy, "use_amp", False) and not hasattr(policy, "dtype"):
-        return torch.get_autocast_dtype(torch.device(device).type)
+        return amp_dtype(device)
     return LAUNCHED.get(os.environ.get(LAUNCHED_PRECISION, ""))
 
 
