@@ -4,12 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.training import tiny_trainings
 from tests.training.test_held_out import same_weights
 from tests.training.test_stopping import after
 from tests.training.tiny_trainings import act
 from vla_eval.errors import TrainingError
+from vla_eval.training.checkpoints import load_loss_scale
 from vla_eval.training.finetune import finetune
 
 pytestmark = pytest.mark.usefixtures("small_act")
@@ -44,6 +46,15 @@ def test_a_checkpoint_without_that_scale_is_refused(recorded: Path, tmp_path: Pa
     (run / SCALE).unlink()
     with pytest.raises(TrainingError, match=r"loss_scale\.json: is missing"):
         finetune(act(recorded, run))
+
+
+@pytest.mark.parametrize("damage", ["{}", '{"scale": "much"}', "1.0", ""])
+def test_a_damaged_scale_is_refused(tmp_path: Path, damage: str) -> None:
+    scaler = torch.GradScaler("cpu")
+    (tmp_path / "training_state").mkdir()
+    (tmp_path / "training_state/loss_scale.json").write_text(damage)
+    with pytest.raises(TrainingError, match="expected the scale of a loss, found"):
+        load_loss_scale(tmp_path, scaler)
 
 
 def test_other_precisions_have_no_scale(recorded: Path, tmp_path: Path) -> None:

@@ -93,10 +93,11 @@ def load_loss_scale(folder: Path, scaler: Any) -> None:
         where=str(file), what="the scale of a loss", remedy="Use another --out.", error=TrainingError
     )
     data = read_json(read_file(file, source), source)
-    try:
-        scaler.load_state_dict(data)
-    except (KeyError, TypeError, ValueError) as exc:
-        raise source.refuse(shown(data), f"{exc!r}") from exc
+    fields = scaler.state_dict()
+    if data.keys() != fields.keys() or any(type(data[name]) is not type(fields[name]) for name in fields):
+        kinds = ", ".join(f"{name} ({type(value).__name__})" for name, value in fields.items())
+        raise source.refuse(shown(data), f"its fields are {kinds}")
+    scaler.load_state_dict(data)
 
 
 def _sync(folder: Path) -> None:
