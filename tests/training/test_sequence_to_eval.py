@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import TASK, context
@@ -99,3 +100,40 @@ def test_episodes_in_one_pass_get_the_chunks_of_a_pass_of_their_own(
 def test_rewards_are_served_from_decoded_frames_alone(recorded: Path, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"decode_ahead is false; 'mikasa_sequence' is trained on whole"):
         finetune(tiny("rate", recorded, tmp_path / "o", decode_ahead=False))
+
+
+def in_one_storage(cells: nn.RNNBase) -> None:
+    """What `flatten_parameters` does on a GPU, done on a CPU: all weights become parts of one storage."""
+    weights = list(cells.parameters())
+    whole = torch.cat([weight.detach().flatten() for weight in weights])
+    for weight, part in zip(weights, whole.split([weight.numel() for weight in weights]), strict=True):
+        weight.data = part.view_as(weight)
+
+
+@pytest.mark.parametrize("kind", ["gru", "lstm"])
+def test_recurrent_weights_that_share_a_storage_are_saved_resumed_and_evaluated(
+    kind: str, recorded: Path, tmp_path: Path, killed_at: KilledAt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(name: str) -> FinetuneConfig:
+        sizes = {
+            "core": kind,
+            "core_options": {},
+            "width": 16,
+            "layers": 2,
+            "chunk_size": 3,
+            "n_action_steps": 2,
+        }
+        return dataclasses.replace(
+            tiny("gtrxl", recorded, tmp_path / name), policy="recurrent", finetune={**SHORT, "policy": sizes}
+        )
+
+    finetune(run("apart"))
+    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", in_one_storage)
+    with killed_at(1):
+        finetune(run("one_storage"))
+    finetune(run("one_storage"))
+    apart, one = (
+        load_file(find_checkpoint(tmp_path / name) / "model.safetensors") for name in ("apart", "one_storage")
+    )
+    assert apart.keys() == one.keys() and all(torch.equal(apart[key], one[key]) for key in apart)
+    assert chunks_of_an_episode(make_lerobot(context(), checkpoint=str(tmp_path / "one_storage"))) == 5

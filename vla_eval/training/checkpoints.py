@@ -1,12 +1,15 @@
 """Checkpoints in lerobot's form: each is written atomically, and a damaged one gives an error message."""
 
+import contextlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any  # lerobot and accelerate are untyped
 
 from accelerate.utils import DistributedType
 from lerobot.common import train_utils
+from torch import nn
 
 from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import MODEL_FOLDER, write_facts
@@ -42,13 +45,14 @@ def write_checkpoint(
     folder: Path = train_utils.get_step_checkpoint_dir(parts["cfg"].output_dir, job.recipe.steps, step)
     partial = folder.with_name(f"{PARTIAL_PREFIX}{folder.name}")
     parts["policy"] = accelerator.unwrap_model(parts["policy"])
-    train_utils.save_checkpoint(
-        checkpoint_dir=partial,
-        step=step,
-        num_processes=accelerator.num_processes,
-        batch_size=job.recipe.batch_size,
-        **parts,
-    )
+    with _recurrent_weights_apart(parts["policy"]):
+        train_utils.save_checkpoint(
+            checkpoint_dir=partial,
+            step=step,
+            num_processes=accelerator.num_processes,
+            batch_size=job.recipe.batch_size,
+            **parts,
+        )
     if scaler.is_enabled():
         (partial / STATE_FOLDER / LOSS_SCALE_FILE).write_text(f"{json.dumps(scaler.state_dict())}\n")
     write_facts(partial / MODEL_FOLDER, job.facts)
@@ -58,6 +62,30 @@ def write_checkpoint(
     os.replace(partial, folder)
     point(folder.parent / LAST, folder.name)
     return folder
+
+
+@contextlib.contextmanager
+def _recurrent_weights_apart(policy: nn.Module) -> Iterator[None]:
+    """Let a policy's `state_dict` have each weight of a GRU or LSTM in a storage of its own.
+
+    On a GPU torch keeps all of them in one, as cuDNN wants it (`flatten_parameters`). safetensors refuses to
+    save a part of a storage.
+    """
+
+    def copied(module: nn.Module, state: dict[str, Any], prefix: str, metadata: Any) -> None:
+        for name, _ in module.named_parameters():
+            state[prefix + name] = state[prefix + name].clone()
+
+    recurrent = [module for module in policy.modules() if isinstance(module, nn.RNNBase)]
+    hooks = [
+        module.register_state_dict_post_hook(copied)  # type: ignore[no-untyped-call]
+        for module in recurrent
+    ]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: bool) -> None:
