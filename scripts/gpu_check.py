@@ -27,6 +27,7 @@ GB = 1e9
 REHEARSED = ("smolvla", "pi0", "openvla_oft")
 LEFT_OVER = ("rehearsal", "training")
 LORA = ("pi0_lora", "openvla_oft")
+WITH_MEMORY = ("smolvla_frames", "pi05_frames", "pi05_memory_tokens")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,8 +93,8 @@ def rehearsals(check: Check) -> dict[str, Any]:
 
 
 def training_steps(check: Check) -> dict[str, Any]:
-    """Measure seconds of a training step, in full and with LoRA."""
-    names = (*REHEARSED[:2], *LORA)
+    """Measure seconds of a training step: in full, with LoRA, with memory."""
+    names = (*REHEARSED[:2], *LORA, *WITH_MEMORY)
     return {name: _or_reason(lambda name=name: _training(check, name)) for name in names}
 
 

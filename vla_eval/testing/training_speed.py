@@ -14,12 +14,15 @@ from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_K
 from vla_eval.policies.lerobot_loading import LoadOptions, load_weights, make_unfilled_policy, read_config
 from vla_eval.policies.lerobot_processors import load_processors
 from vla_eval.policies.verify import random_batch
+from vla_eval.policies.vla_memory.fields import SEGMENT_PADDING_KEY
 from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.estimate import estimate
 from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.loop import autocast_dtype
 from vla_eval.training.lora import peft_config
+from vla_eval.training.segments import preprocessed
+from vla_eval.training.stages import EPISODE_STEPS
 
 LEARNING_RATE = 1e-5
 TINY_BATCH = 2
@@ -65,7 +68,7 @@ def _measure(
         model = model.wrap_with_peft(peft_cli_overrides=asdict(adapters))
     model.train()
     before, _ = load_processors(model_folder, config, tokenizer=None)
-    batch = before(random_samples(config, n_samples))
+    batch = preprocessed(before, in_segments(random_samples(config, n_samples), config))
     trained = [x for x in model.parameters() if x.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=LEARNING_RATE)
     seconds = [_step(model, batch, optimizer, config, device) for _ in range(1 + n_steps)]
@@ -115,3 +118,21 @@ def random_samples(config: Any, n_samples: int) -> dict[str, Any]:
     batch[f"{REWARD_KEY}_is_pad"] = torch.zeros(n_samples, n_rewards, dtype=torch.bool)
     batch[DONE_KEY] = torch.zeros(n_samples, dtype=torch.bool)
     return batch
+
+
+def in_segments(samples: dict[str, Any], config: Any) -> dict[str, Any]:
+    """Return samples (B, …) as a policy of this configuration is given them in training.
+
+    With memory tokens a sample is a sequence of frames (B, T, …), as long as the longest episode needs. Other
+    policies are given their samples as they are.
+    """
+    if not hasattr(config, "n_passes") or not config.memory_tokens:
+        return samples
+    n_segments = sum(config.n_passes(EPISODE_STEPS))
+    inputs: dict[str, Any] = {
+        key: value.unsqueeze(1).repeat_interleave(n_segments, dim=1) if isinstance(value, Tensor) else value
+        for key, value in samples.items()
+    }
+    n_samples = len(samples[ACTION_KEY])
+    inputs[SEGMENT_PADDING_KEY] = torch.zeros(n_samples, n_segments, dtype=torch.bool)
+    return inputs
