@@ -20,9 +20,9 @@ from vla_eval.data.changed_actions import copy_with_actions
 from vla_eval.data.converted_episode import AimFollower, convert_episode
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.demonstrations import NoisyEnv, attempt
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import RecordedEpisode, decode_actions, encode_actions, read_facts, read_manifest
 from vla_eval.data.recording_plan import plan_recording
+from vla_eval.data.tables import read_columns
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError
 from vla_eval.policies.context import PolicyContext

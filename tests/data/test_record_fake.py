@@ -20,6 +20,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from tests.data.hostile_datasets import Bait, addresses, hostile_columns
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.decoding import decode
@@ -28,7 +29,6 @@ from vla_eval.data import replay as replay_module
 from vla_eval.data.dataset_folder import check_dataset, open_recorded
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.initial_states import read_initial_states
 from vla_eval.data.leak import check_leak
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
@@ -39,6 +39,7 @@ from vla_eval.data.recording_plan import plan_recording
 from vla_eval.data.recording_worker import RecordingRunner
 from vla_eval.data.replay_report import require_passed
 from vla_eval.data.shard_writer import ShardWriter
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
 from vla_eval.storage.durable import FolderLock
 from vla_eval.training import held_out
@@ -253,6 +254,17 @@ class TestReplay:
         assert report.pixels
         assert set(report.lowest_psnr_db) == {"base_camera", "hand_camera"}
         check_dataset(copy)  # the report is no part of what was recorded
+
+    def test_nothing_that_a_column_names_is_opened(
+        self, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bait = Bait(tmp_path / "mark", tmp_path / "secret", 9)
+        for way in hostile_columns(copy, addresses(bait)["reference"], "Image"):
+            if "episodes" in way or "struct" in way:
+                code = self.replay(str(copy), "--pixels", "--episodes", "0")
+                assert "Traceback" not in capsys.readouterr().err
+                assert code == (0 if "text" in way else 1), way
+        assert not bait.mark.exists()
 
     def test_changed_actions_and_seeds_are_found(
         self, copy: Path, capsys: pytest.CaptureFixture[str]

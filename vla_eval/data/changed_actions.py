@@ -17,6 +17,7 @@ from vla_eval.core import FloatArray
 from vla_eval.data.dataset_folder import check_dataset, digest_files
 from vla_eval.data.exact_statistics import vector_statistics
 from vla_eval.data.info_file import INFO_FILE
+from vla_eval.data.lerobot_tables import STATS_FILE
 from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
@@ -29,13 +30,10 @@ from vla_eval.data.manifest import (
     write_lines,
 )
 from vla_eval.data.recording_worker import stored_actions
+from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, read_table
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
-
-STATS_FILE = Path("meta/stats.json")
-EPISODE_TABLES = "meta/episodes/*/*.parquet"
-DATA_TABLES = "data/*/*.parquet"
 
 
 def copy_with_actions(
@@ -89,7 +87,7 @@ def _replace_actions(root: Path, actions: Sequence[FloatArray], recipe: DatasetR
     stats = json.loads((root / STATS_FILE).read_text(encoding="utf-8"))
     stats[ACTION_KEY] = {name: value.tolist() for name, value in vector_statistics(rows).items()}
     _write_json(root / STATS_FILE, stats)
-    _replace_columns(root, DATA_TABLES, {ACTION_KEY: rows.tolist()})
+    _replace_columns(root, FRAME_TABLES, {ACTION_KEY: rows.tolist()})
     by_episode = [vector_statistics(one) for one in actions]
     columns = {
         f"stats/{ACTION_KEY}/{name}": [one[name].tolist() for one in by_episode] for name in by_episode[0]
@@ -98,20 +96,16 @@ def _replace_actions(root: Path, actions: Sequence[FloatArray], recipe: DatasetR
 
 
 def _replace_columns(root: Path, pattern: str, columns: dict[str, list[list[float]]]) -> None:
-    """Replace columns of lists in a table that lies in several files, one after the other.
-
-    What the `datasets` library notes of the old columns is left out: the lists may have another length.
-    """
+    """Replace columns of lists in a table that lies in several files, one after the other."""
     first = 0
     for path in sorted(root.glob(pattern)):
-        table = pq.read_table(path)
+        table = read_table(path)
         for name, values in columns.items():
             kind = pa.list_(table.schema.field(name).type.value_type)
             part = pa.array(values[first : first + len(table)], type=kind)
             table = table.set_column(table.schema.get_field_index(name), pa.field(name, kind), part)
         first += len(table)
-        noted = {key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"}
-        pq.write_table(table.replace_schema_metadata(noted), path, compression="snappy")
+        pq.write_table(table, path, compression="snappy")
 
 
 def _write_json(path: Path, data: object) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from vla_eval.data.dataset_folder import check_dataset, digest_file
+from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.imported import IMPORT_FILE, ImportFacts, read_import
 from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, DatasetFacts, FileDigest
 from vla_eval.data.mixture import MixtureFacts, read_mixture
@@ -17,6 +18,7 @@ def check_complete(root: Path) -> DatasetFacts | ImportFacts | MixtureFacts:
     Raises:
         DatasetError: it is not finished, or files are missing or not what they were.
     """
+    check_folder(root)
     if (root / RECORDING_FILE).exists():
         return check_dataset(root)
     imported = read_import(root)

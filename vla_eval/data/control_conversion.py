@@ -17,7 +17,6 @@ from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
 from vla_eval.data.changed_actions import copy_with_actions
 from vla_eval.data.converted_episode import convert_episode
 from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import RecordedEpisode, read_facts, read_failed, read_manifest
 from vla_eval.data.rebuild import failed_attempt
 from vla_eval.data.recording import RecordedDataset, RecordingObserver, run_plan
@@ -26,6 +25,7 @@ from vla_eval.data.recording_plan import plan_recording
 from vla_eval.data.replay import check_task_versions, recipe_of
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.seed_queue import Selection
+from vla_eval.data.tables import read_columns
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError
 from vla_eval.workers.backend import Backend

@@ -9,6 +9,7 @@ from typing import Any  # arrays of several types
 
 import numpy as np
 
+from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.import_writer import ImportWriter
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.layouts import Source, SourceEpisode, lerobot_layout, npz_files, read_npz
@@ -26,6 +27,7 @@ def find_source(path: Path) -> Source:
     Raises:
         DatasetError: nothing that can be read.
     """
+    check_folder(path)
     if (path / "meta/info.json").is_file():
         layout = lerobot_layout(open_local_dataset(path).meta.features, where=path)
         files = [file for file in sorted(path.rglob("*")) if file.suffix in (".parquet", ".mp4", ".json")]

@@ -9,9 +9,9 @@ import numpy as np
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWindow, SimEnv, Stage, StepResult
 from vla_eval.data.demonstrations import ONE_BY_ONE, Attempt, EpisodeLog, RecordedActions, attempt
 from vla_eval.data.episode_check import check_states
-from vla_eval.data.frame_table import Columns, rows_of_episode
 from vla_eval.data.manifest import RecordedEpisode, encode_actions
 from vla_eval.data.recording_jobs import TaskPlan
+from vla_eval.data.tables import Columns, rows_of_episode
 from vla_eval.errors import DatasetError
 from vla_eval.oracles.translation import command, joint_target
 from vla_eval.rollout import RolloutSettings, rollout

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.demonstrations import EpisodeLog, images_digests, states_digest
-from vla_eval.data.frame_table import Columns
 from vla_eval.data.manifest import RecordedEpisode
+from vla_eval.data.tables import Columns
 from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY, proprioception
 
 STATE_TOLERANCE = 1e-2  # m, rad, rad/s; for machines whose arithmetic differs in the last bits

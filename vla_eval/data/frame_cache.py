@@ -22,12 +22,12 @@ from av.error import FFmpegError
 from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
 
 from vla_eval.core import ImageArray
+from vla_eval.data.tables import MIB, available_ram_bytes
 from vla_eval.errors import DatasetError, StorageFullError
 
 FORMAT_VERSION = 1  # raised when the files' layout changes: old ones are then not found any more
 FRAMES_FOLDER = "frames"  # in the user's cache
 DIGEST_DIGITS = 24
-MIB = 1024**2
 # Beyond the frames: file headers, and what a file system keeps for itself.
 HEADROOM_BYTES = 16 * MIB
 _MORE_ROOM = "free some space, let XDG_CACHE_HOME name another disk, or select fewer episodes"
@@ -161,16 +161,6 @@ def frames_on_disk(source: FrameSource, folder: Path) -> dict[str, Path]:
         if not final.is_dir():
             _build(source, final)
     return paths
-
-
-def available_ram_bytes() -> int | None:
-    """Return how much RAM a process may still take without swapping, where Linux says so."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return kib[0] * 1024 if kib else None
 
 
 def _files(source: FrameSource, root: Path) -> list[Path]:

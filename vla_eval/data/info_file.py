@@ -4,6 +4,7 @@ lerobot fills in the templates of paths with `str.format`, which can reach any a
 and takes text for numbers. Knows nothing of the files that the templates name.
 """
 
+import re
 import string
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -21,6 +22,13 @@ TEMPLATES = {
 }
 FORMAT_LETTERS = frozenset("0123456789d")  # of `{file_index:03d}`
 MAX_FORMAT_LETTERS = 3  # a width of up to 99
+VERSION = re.compile(r"v?3\.\d{1,9}(\.\d{1,9})?")
+OLD_VERSION = re.compile(r"v?2\.\d{1,9}(\.\d{1,9})?")
+NUMBERS = ("bool", *(f"{sign}int{n_bits}" for sign in ("", "u") for n_bits in (8, 16, 32, 64)))
+DTYPES = frozenset({*NUMBERS, "float16", "float32", "float64", "string", "image", "video", "language"})
+"""What lerobot's features may be. Another word reaches `datasets`, which has types that open files."""
+NOT_IN_PATHS = frozenset(":*?[]%\\|")
+"""By these fsspec and FFmpeg distinguish addresses and patterns from paths."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,13 +80,16 @@ def check_info(root: Path) -> None:
     except (FileNotFoundError, NotADirectoryError) as exc:
         raise source.refuse("nothing", "the file is missing") from exc
     info = as_dataclass(DatasetInfo, _known(DatasetInfo, data), source)
+    _check_version(info.codebase_version, source)
     for name, feature in info.features.items():
         if not _is_feature_name(name):
             raise source.refuse(
                 f"the feature {shown(name)}", "expected a printable name without '/' and '..'"
             )
         within = Source(where=f"{path}: {name}", what="a feature", remedy=REMEDY, error=DatasetError)
-        as_dataclass(_Feature, _known(_Feature, feature), within)
+        dtype = as_dataclass(_Feature, _known(_Feature, feature), within).dtype
+        if dtype not in DTYPES:
+            raise within.refuse(f"dtype {shown(dtype)}", f"expected one of {', '.join(sorted(DTYPES))}")
     for name, allowed in TEMPLATES.items():
         template = getattr(info, name)
         if template is not None and not _is_template(template, allowed):
@@ -89,21 +100,36 @@ def check_info(root: Path) -> None:
             )
 
 
+def _check_version(version: str, source: Source) -> None:
+    if OLD_VERSION.fullmatch(version):
+        raise source.error(
+            f"{source.where}: a dataset of version {version}; expected version 3. Convert it with lerobot: "
+            "python -m lerobot.scripts.convert_dataset_v21_to_v30 --help"
+        )
+    if not VERSION.fullmatch(version):
+        raise source.refuse(f"codebase_version {shown(version)}", "expected a version 3")
+
+
 def _known(cls: type, data: dict[str, Any]) -> dict[str, Any]:  # Any: JSON
     return {one.name: data[one.name] for one in fields(cls) if one.name in data}
 
 
 def _is_feature_name(name: str) -> bool:
-    return name.isprintable() and name != "" and "/" not in name and ".." not in name
+    is_part = name.isprintable() and name != "" and "/" not in name and ".." not in name
+    return is_part and NOT_IN_PATHS.isdisjoint(name)
 
 
 def _is_template(template: str, allowed: frozenset[str]) -> bool:
-    """Whether `str.format` can fill it in with nothing but the allowed values as they are."""
+    """Whether `str.format` fills it in with nothing but the allowed values, as a path below the dataset."""
+    if Path(template).is_absolute() or ".." in Path(template).parts:
+        return False
     try:
         parts = list(string.Formatter().parse(template))
     except ValueError:
         return False
-    for _, place, spec, conversion in parts:
+    for text, place, spec, conversion in parts:
+        if not NOT_IN_PATHS.isdisjoint(text):
+            return False
         if place is None:
             continue
         letters = spec or ""

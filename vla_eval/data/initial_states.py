@@ -12,13 +12,13 @@ import numpy as np
 from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.convert import find_source
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.import_writer import eef_of_proprio
 from vla_eval.data.imported import IMPORT_FILE, read_import
 from vla_eval.data.layouts import LEROBOT_CAMERAS, Source, SourceEpisode
 from vla_eval.data.manifest import RECORDING_FILE, read_facts, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import PROPRIO_KEYS, STATE_KEY, StateKind
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import FloatArray
+from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
 from vla_eval.strict_json import (
@@ -242,6 +243,7 @@ def read_manifest(dataset: Path) -> tuple[RecordedEpisode, ...]:
     Raises:
         DatasetError: there is no manifest, or it is damaged.
     """
+    check_folder(dataset)
     episodes = read_entries(dataset / MANIFEST_FILE, RecordedEpisode)
     numbers = [episode.episode_index for episode in episodes]
     if numbers != list(range(len(episodes))):
@@ -262,6 +264,7 @@ def read_facts(dataset: Path) -> DatasetFacts:
     Raises:
         DatasetError: there is no `recording.json`, it is damaged, or the dataset is not complete.
     """
+    check_folder(dataset)
     path = dataset / RECORDING_FILE
     facts = from_json(DatasetFacts, _content(path), where=str(path))
     check_file_names(facts.files, where=path)

@@ -17,12 +17,12 @@ from vla_eval import __version__
 from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import DatasetFacts, read_failed, read_manifest
 from vla_eval.data.mixture import MixtureFacts, MixtureSource, write_mixture
 from vla_eval.data.opening import join_datasets, open_local_dataset
 from vla_eval.data.replay_report import require_passed
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import whole_folder
 from vla_eval.storage.durable import storage_full

@@ -9,10 +9,10 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, ImageArray, SimEnv
 from vla_eval.data.demonstrations import SLOT, replay_actions
 from vla_eval.data.episode_check import MIN_PSNR_DB, check_pictures, check_rows, check_states
-from vla_eval.data.frame_table import Columns, read_columns, rows_of_episode
 from vla_eval.data.manifest import RecordedEpisode
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay import EpisodeReplayed, ReplayJob
+from vla_eval.data.tables import Columns, read_columns, rows_of_episode
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import VlaEvalError
 from vla_eval.features import CAMERA_KEYS

@@ -18,9 +18,9 @@ from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import join_datasets, video_decoder
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
     ACTION_NAMES,

@@ -9,13 +9,13 @@ import numpy as np
 from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import open_recorded
-from vla_eval.data.frame_table import read_columns
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import DatasetFacts, read_manifest
 from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.seeding import SeedRange, seed_ranges

@@ -15,7 +15,7 @@ from vla_eval.config.decoding import decode
 from vla_eval.config.files import Recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig, merge_fields
 from vla_eval.config.policy import load_policy
-from vla_eval.data.opening import video_decoder
+from vla_eval.data.opening import decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
@@ -205,7 +205,7 @@ def lerobot_config(job: TrainingJob) -> Any:
             episodes=dataset.episodes,
             use_imagenet_stats=recipe.imagenet_statistics,
             image_transforms=image_transforms(recipe),
-            video_backend=video_decoder(),
+            video_backend=decoder_for(dataset.root),
         ),
         policy=job.policy,
         output_dir=job.out / TRAIN_FOLDER,

@@ -37,7 +37,7 @@ from lerobot.utils.utils import cycle, has_method, init_logging
 from tqdm import tqdm
 
 from vla_eval.data.decoded_frames import DecodedFramesDataset
-from vla_eval.data.opening import light_metadata
+from vla_eval.data.opening import local_readers
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
 from vla_eval.policies.lerobot_device import amp_dtype
@@ -235,7 +235,7 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
 
 def _dataset(job: TrainingJob, config: Any) -> Any:
     """Return lerobot's dataset, or one that serves the same from decoded frames."""
-    with light_metadata():
+    with local_readers():
         dataset = make_dataset(config)
     if job.sample_memory is not None:
         return RememberedFramesDataset(dataset, job.sample_memory)

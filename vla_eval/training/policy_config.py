@@ -15,7 +15,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.data.frame_table import read_columns
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import (
     RecipeError,
     SpecMismatchError,

@@ -6,7 +6,7 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 import torch
 
-from vla_eval.data.frame_table import read_columns
+from vla_eval.data.tables import read_columns
 from vla_eval.features import ACTION_KEY
 from vla_eval.policies.episode_samples import decisions
 from vla_eval.training.dataset import TrainingDataset

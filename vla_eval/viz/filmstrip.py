@@ -10,6 +10,7 @@ import numpy as np
 from vla_eval.core import ImageArray
 from vla_eval.errors import ViewingError
 from vla_eval.viz.frames import PANEL_PX
+from vla_eval.viz.mp4 import open_mp4
 from vla_eval.viz.video import CUE_SECONDS, HOLD_SECONDS
 
 
@@ -33,7 +34,7 @@ def read_strip(path: Path, *, n_frames: int, n_steps: int, control_hz: float) ->
         ViewingError: the video cannot be read.
     """
     try:
-        with av.open(str(path)) as container:
+        with open_mp4(path, ViewingError) as container:
             rate = container.streams.video[0].average_rate
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     except (OSError, av.error.FFmpegError) as exc:

@@ -11,7 +11,7 @@ from tests.policies.sequence.test_sequence_parts import SMALL_OPTIONS
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.data.frame_table import read_columns
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import RecipeError
 from vla_eval.policies.episode_samples import Episodes, episodes_of
 from vla_eval.policies.sequence.modeling_sequence import Demonstrated, MikasaSequencePolicy

@@ -13,7 +13,7 @@ from scipy.stats import norm
 from tests.policies import tiny_prompted
 from tests.policies.spatialvla import spatialvla_golden as golden
 from tests.policies.tiny_prompted import BOTH, SPATIALVLA, section
-from vla_eval.data.frame_table import read_columns
+from vla_eval.data.tables import read_columns
 from vla_eval.errors import (
     RecipeError,
     SpecMismatchError,

@@ -1,0 +1,178 @@
+"""The tables of a dataset in the form in which lerobot keeps them: what its own loaders would return.
+
+Each function replaces one of `lerobot.datasets.io_utils`, which reads by Hugging Face's `datasets` (see
+`tables.py`), caches what it read by the file's name and time, and takes brackets in a path for a pattern.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any  # pyarrow and datasets are untyped
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from datasets import Dataset, DatasetInfo, Features, Image  # type: ignore[attr-defined]  # a folder of recipes
+from datasets.table import table_cast
+from numpy.typing import NDArray
+
+from vla_eval.data.tables import (
+    EPISODE_TABLES,
+    FRAME_TABLES,
+    REMEDY,
+    check_columns,
+    is_image,
+    read_table,
+    refused,
+    table_paths,
+)
+from vla_eval.errors import DatasetError
+from vla_eval.strict_json import Source, read_file, read_json, shown
+
+TASKS_FILE = Path("meta/tasks.parquet")
+STATS_FILE = Path("meta/stats.json")
+STATISTICS = "stats/"
+"""Beginning of the columns with the statistics of each episode, which lerobot drops."""
+EPISODE_COLUMNS = (
+    *("episode_index", "dataset_from_index", "dataset_to_index"),
+    *("data/chunk_index", "data/file_index"),
+)
+SENTENCE_COLUMNS = ("task", "__index_level_0__")  # what pandas calls an index with and without a name
+IMAGE_BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  # PNG, JPEG, TIFF of depth
+
+
+def read_frames(folder: Path, features: Features, episodes: Sequence[int] | None = None) -> Dataset:
+    """Return the rows of frames, as lerobot's `load_nested_dataset` does.
+
+    Args:
+        folder: `data` of the dataset.
+        features: the columns and their types, of `meta/info.json`.
+        episodes: these; None: all.
+
+    Raises:
+        DatasetError: see `read_table`; or a table has other columns or types.
+    """
+    tables = [_frames(path, features, episodes) for path in table_paths(folder.parent, FRAME_TABLES)]
+    return _as_dataset(pa.concat_tables(tables), features)
+
+
+def read_episodes(root: Path) -> Dataset:
+    """Return one row per episode, as lerobot's `load_episodes` does.
+
+    Raises:
+        DatasetError: see `read_table`; or the episodes are not numbered from 0 on and one after the other.
+    """
+    tables = []
+    for path in table_paths(root, EPISODE_TABLES):
+        table = read_table(path, lambda name: not name.startswith(STATISTICS))
+        check_columns(path, table, EPISODE_COLUMNS)
+        tables.append(table.replace_schema_metadata(None))
+    try:
+        joined = pa.concat_tables(tables, promote_options="default")
+    except pa.ArrowException as exc:
+        raise DatasetError(f"{root / 'meta/episodes'}: its tables differ ({exc!s:.200}). {REMEDY}") from exc
+    _check_episodes(root / "meta/episodes", joined)
+    return _as_dataset(joined, Features.from_arrow_schema(joined.schema))
+
+
+def read_tasks(root: Path) -> pd.DataFrame:
+    """Return the sentences in the order of `task_index`, by which lerobot looks them up.
+
+    lerobot's `load_tasks` keeps the order of the file.
+
+    Raises:
+        DatasetError: see `read_table`; or the sentences are not numbered 0, 1, 2 …
+    """
+    path = root / TASKS_FILE
+    table = read_table(path)
+    column = next((name for name in SENTENCE_COLUMNS if name in table.column_names), SENTENCE_COLUMNS[0])
+    check_columns(path, table, ("task_index", column))
+    numbers, sentences = table["task_index"].to_pylist(), table[column].to_pylist()
+    no_text = [sentence for sentence in sentences if not isinstance(sentence, str)]
+    if no_text:
+        raise refused(path, "a sentence in each row", shown(no_text[0]))
+    if not pa.types.is_integer(table["task_index"].type) or set(numbers) != set(range(len(numbers))):
+        raise refused(path, f"each task_index from 0 to {len(numbers) - 1} once", shown(numbers))
+    by_number = dict(zip(numbers, sentences, strict=True))
+    in_order = pd.Index([by_number[number] for number in range(len(numbers))], name="task")
+    return pd.DataFrame({"task_index": range(len(numbers))}, index=in_order)
+
+
+def read_statistics(root: Path) -> dict[str, dict[str, NDArray[np.generic]]] | None:
+    """Return field -> name -> numbers, as lerobot's `load_stats` does; None if there is no such file.
+
+    Raises:
+        DatasetError: the file holds something else.
+    """
+    path = root / STATS_FILE
+    if not path.exists():
+        return None
+    source = Source(where=str(path), what="statistics by field and name", remedy=REMEDY, error=DatasetError)
+    fields = read_json(read_file(path, source), source)
+    for field, values in fields.items():
+        if not isinstance(values, dict):
+            raise source.refuse(f"{shown(field)}: {shown(values)}", "expected a mapping")
+    return {
+        field: {name: _numbers(value, f"{field}: {name}", source) for name, value in values.items()}
+        for field, values in fields.items()
+    }
+
+
+def _frames(path: Path, features: Features, episodes: Sequence[int] | None) -> Any:  # Any: pyarrow.Table
+    table = read_table(path, with_images=True)
+    check_columns(path, table, list(features))
+    undeclared = [name for name in table.column_names if name not in features]
+    if undeclared:
+        raise refused(path, "only columns that meta/info.json declares", shown(undeclared[0]))
+    if episodes is not None:
+        table = table.filter(pc.is_in(table["episode_index"], pa.array(list(episodes), pa.int64())))
+    for name, feature in features.items():
+        if isinstance(feature, Image):
+            table = _embedded_images(path, table, name)
+    try:
+        return table_cast(table.select(list(features)), features.arrow_schema)
+    except (pa.ArrowException, TypeError, ValueError, OverflowError) as exc:
+        raise DatasetError(
+            f"{path}: its values are not of the types in meta/info.json ({exc!s:.200}). {REMEDY}"
+        ) from exc
+
+
+def _embedded_images(path: Path, table: Any, name: str) -> Any:  # Any: pyarrow.Table
+    """Return the table with the bytes of its images alone: a path in their place would be opened."""
+    if not is_image(table[name].type):
+        raise refused(path, f"images in the column {name}", f"the type {shown(str(table[name].type))}")
+    content = pc.struct_field(table[name], "bytes").combine_chunks()
+    for row, value in enumerate(content):
+        if not value.is_valid or not value.as_py()[:8].startswith(IMAGE_BEGINNINGS):
+            raise refused(path, f"the bytes of a PNG, JPEG or TIFF in each {name}", f"others in row {row}")
+    images = pa.StructArray.from_arrays([content, pa.nulls(len(content), pa.string())], ["bytes", "path"])
+    return table.set_column(table.column_names.index(name), name, images)
+
+
+def _check_episodes(where: Path, table: Any) -> None:  # Any: pyarrow.Table
+    for name in EPISODE_COLUMNS:
+        if not pa.types.is_integer(table[name].type) or table[name].null_count:
+            raise refused(where, f"a whole number in each row of {name}", shown(table[name].to_pylist()))
+    numbers, firsts, stops = (table[name].to_pylist() for name in EPISODE_COLUMNS[:3])
+    if numbers != list(range(len(numbers))):
+        raise refused(where, f"the episodes 0 to {len(numbers) - 1} in a row", shown(numbers))
+    begin = 0
+    for number, first, stop in zip(numbers, firsts, stops, strict=True):
+        if first != begin or stop <= first:
+            raise refused(where, f"frames of episode {number} from {begin} on", f"{first} to {stop}")
+        begin = stop
+
+
+def _numbers(value: object, what: str, source: Source) -> NDArray[np.generic]:
+    try:
+        numbers = np.atleast_1d(np.array(value))
+    except ValueError as exc:  # lists of unlike lengths
+        raise source.refuse(f"{shown(what)} {shown(value)}", "expected lists of one length") from exc
+    if numbers.dtype.kind not in "iufb":
+        raise source.refuse(f"{shown(what)} {shown(value)}", "expected numbers")
+    return numbers
+
+
+def _as_dataset(table: Any, features: Features) -> Dataset:  # Any: pyarrow.Table
+    # Without a fingerprint `datasets` hashes the whole table for one. Nothing is cached under it.
+    return Dataset(table, info=DatasetInfo(features=features), fingerprint=f"{id(table):032x}")

@@ -1,0 +1,166 @@
+"""Read the tables of a LeRobotDataset: with pyarrow, by local path, columns of plain types alone.
+
+Hugging Face's `datasets` takes a column's type from the parquet file's own metadata, and opens the paths and
+addresses that a column of images, sounds or videos holds. So no other reader is given these files; lerobot
+gets tables that were read here (`lerobot_tables.py`). Knows nothing of lerobot.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any  # pyarrow is untyped
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from vla_eval.data.folder_contents import check_folder
+from vla_eval.errors import DatasetError
+from vla_eval.strict_json import shown
+
+EPISODE_TABLES = "meta/episodes/*/*.parquet"
+FRAME_TABLES = "data/*/*.parquet"
+LANGUAGE_COLUMNS = ("language_persistent", "language_events")
+"""lerobot's columns of annotations (`lerobot.datasets.language`): lists of texts with fields."""
+
+FOREIGN_METADATA = b"huggingface"
+PLAIN_EXTENSIONS = (
+    "arrow.json",
+    *(f"datasets.features.features.Array{n}DExtensionType" for n in range(2, 6)),
+)
+"""Extensions of arrow that are read as the plain type they are stored as."""
+PLAIN_TYPES = (
+    *(pa.types.is_string, pa.types.is_large_string),
+    *(pa.types.is_boolean, pa.types.is_integer, pa.types.is_floating),
+)
+MIB = 1024**2
+REMEDY = "It is not read. Fetch the dataset again, from where you trust it."
+
+Columns = dict[str, NDArray[np.generic]]
+"""Field -> (N,) or (N, D), in the order of frames."""
+
+
+def read_table(
+    path: Path, keep: Callable[[str], bool] | None = None, *, with_images: bool = False
+) -> Any:  # Any: pyarrow.Table
+    """Return a table of a dataset, without what Hugging Face's library noted in it.
+
+    Args:
+        path: a parquet file, of a folder that `check_folder` has seen.
+        keep: whether to read the column of a name; None: read all.
+        with_images: whether it may have columns of images as lerobot embeds them.
+
+    Raises:
+        DatasetError: it is damaged, does not fit into memory, or has a column of anything but numbers, text
+            and lists of them.
+    """
+    try:
+        with pq.ParquetFile(str(path.absolute())) as file:
+            _check_size(path, file.metadata)
+            schema = file.schema_arrow
+            for column in schema:
+                if not (with_images and is_image(column.type)):
+                    _check_type(path, column.name, column.type)
+            names = [name for name in schema.names if keep is None or keep(name)]
+            if len(set(names)) != len(names):
+                raise refused(path, "columns of different names", f"{', '.join(names):.500}")
+            table = file.read(columns=names).select(names)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as exc:
+        raise DatasetError(f"{path}: cannot be read as parquet ({exc!s:.200}). {REMEDY}") from exc
+    noted = {key: value for key, value in (table.schema.metadata or {}).items() if key != FOREIGN_METADATA}
+    return table.replace_schema_metadata(noted)
+
+
+def read_columns(root: Path, only: Sequence[str] | None = None) -> Columns:
+    """Return numbers of a dataset: field -> (N,) or (N, D), in the order of frames.
+
+    Args:
+        root: folder of the dataset.
+        only: these fields; None: all.
+
+    Raises:
+        DatasetError: there are none, or see `read_table`.
+    """
+    check_folder(root)
+    paths = table_paths(root, FRAME_TABLES)
+    keep = None if only is None else set(only).__contains__
+    tables = [read_table(path, keep, with_images=True) for path in paths]
+    names = only or [column.name for column in tables[0].schema if not is_image(column.type)]
+    for path, table in zip(paths, tables, strict=True):
+        check_columns(path, table, names)
+    return {name: np.concatenate([np.asarray(table[name].to_pylist()) for table in tables]) for name in names}
+
+
+def rows_of_episode(columns: Columns, episode_index: int) -> Columns:
+    """Return the rows of one episode."""
+    mask = columns["episode_index"] == episode_index
+    return {name: values[mask] for name, values in columns.items()}
+
+
+def table_paths(root: Path, pattern: str) -> list[Path]:
+    """Return the files of a table in the order of their rows.
+
+    Raises:
+        DatasetError: there are none.
+    """
+    paths = sorted(root.glob(pattern))
+    if not paths:
+        raise DatasetError(f"{root}: there is no {pattern}. Name the folder of one LeRobotDataset (v3).")
+    return paths
+
+
+def check_columns(path: Path, table: Any, names: Sequence[str]) -> None:  # Any: pyarrow.Table
+    """Raise `DatasetError` where a table lacks one of these columns."""
+    for name in names:
+        if name not in table.column_names:
+            raise refused(path, f"the column {name}", f"{', '.join(table.column_names):.500}")
+
+
+def refused(path: Path, expected: str, found: str) -> DatasetError:
+    """Build the error of a file of a dataset."""
+    return DatasetError(f"{path}: expected {expected}, found {found}. {REMEDY}")
+
+
+def available_ram_bytes() -> int | None:
+    """Return how much RAM a process may still take without swapping, where Linux says so."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return kib[0] * 1024 if kib else None
+
+
+def _check_size(path: Path, metadata: Any) -> None:  # Any: pyarrow's
+    needed = sum(metadata.row_group(index).total_byte_size for index in range(metadata.num_row_groups))
+    free = available_ram_bytes()
+    if free is not None and needed > free:
+        raise DatasetError(
+            f"{path}: takes {needed / MIB:.0f} MiB of memory, and {free / MIB:.0f} MiB are free. Select "
+            "fewer episodes, or use a machine with more."
+        )
+
+
+def _check_type(path: Path, name: str, kind: Any) -> None:  # Any: pyarrow.DataType
+    if not _is_plain(kind, with_fields=name in LANGUAGE_COLUMNS):
+        found = f"{shown(name)} of the type {shown(str(kind))}"
+        raise refused(path, "columns of numbers, text, or lists of them", found)
+
+
+def _is_plain(kind: Any, *, with_fields: bool = False) -> bool:  # Any: pyarrow.DataType
+    if isinstance(kind, pa.BaseExtensionType):
+        return kind.extension_name in PLAIN_EXTENSIONS and _is_plain(kind.storage_type)
+    if pa.types.is_dictionary(kind):
+        return _is_plain(kind.value_type)
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        return _is_plain(kind.value_type, with_fields=with_fields)
+    if pa.types.is_struct(kind):
+        return with_fields and all(_is_plain(field.type) for field in kind)
+    return any(is_kind(kind) for is_kind in PLAIN_TYPES)
+
+
+def is_image(kind: Any) -> bool:  # Any: pyarrow.DataType
+    """Whether a column may hold images: their bytes, and the name of the file that each once was."""
+    if not pa.types.is_struct(kind) or sorted(field.name for field in kind) != ["bytes", "path"]:
+        return False
+    return bool(pa.types.is_binary(kind.field("bytes").type)) and _is_plain(kind.field("path").type)
