@@ -124,6 +124,14 @@ class RemoteChangedError(RemotePolicyError):
     """A server is not what it was when the run was planned."""
 
 
+class LockedError(VlaEvalError, PermissionError):
+    """Something was refused by the lock of this process, see `vla_eval.lock`."""
+
+
+class LockedImportError(VlaEvalError, ImportError):
+    """A module was refused, since it lies where nothing is installed, see `vla_eval.lock`."""
+
+
 class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 

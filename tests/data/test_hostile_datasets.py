@@ -1,6 +1,7 @@
 """Nothing that a dataset names is run, opened or asked for, by whichever verb it is given to."""
 
 import ast
+import contextlib
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from lerobot.datasets.io_utils import load_episodes
 
 import vla_eval
 from tests.data.hostile_datasets import (
@@ -33,6 +35,7 @@ from tests.data.second_task import write_second_task
 from vla_eval.cli.main import main
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError, ViewingError
+from vla_eval.lock.switch import locked
 from vla_eval.viz.mp4 import check_mp4, open_mp4
 
 WATCHED = ("open", "os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect")
@@ -100,6 +103,20 @@ def test_no_protocol_that_is_installed_is_asked(recorded: Path, bait: Bait) -> N
         is_watching.set()
         assert open_local_dataset(recorded).meta.episodes[0]["evil"] == address
         is_watching.clear()
+
+
+@pytest.mark.parametrize("scheme", ["reference", "http", "simplecache", "zip"])
+def test_the_lock_alone_lets_nothing_run(
+    recorded: Path, bait: Bait, scheme: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With lerobot's own readers, which take the types of columns from the file."""
+    add_column(
+        recorded, EPISODES, "evil", as_struct(addresses(bait)[scheme], n_rows(recorded, EPISODES)), "Image"
+    )
+    rows = load_episodes(recorded)
+    with locked(), contextlib.suppress(Exception):  # fsspec and jinja make other errors of it, or none
+        _ = rows[0]
+    assert "refused to" in caplog.text
 
 
 def verbs(root: Path, other: Path, out: Path) -> dict[str, list[str]]:

@@ -25,6 +25,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import SimEnv
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import ConformanceError, MissingDependencyError
+from vla_eval.lock.switch import own_need
 from vla_eval.storage.folders import EPISODES_FILE
 from vla_eval.testing.looking_policy import CAMERAS, write_looking
 from vla_eval.workers.guard import become_subreaper
@@ -198,7 +199,8 @@ def _evaluation(task: str, folder: Path, name: str, k: int, n_episodes: int, *fl
     cpu, begun = _children_seconds(), time.perf_counter()
     times: list[float] = []
     with tempfile.TemporaryFile("w+") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output)
+        with own_need():
+            process = subprocess.Popen(command, stdout=output, stderr=output)
         while process.poll() is None:
             time.sleep(POLL_SECONDS)
             n_records = records.read_bytes().count(b"\n") if records.exists() else 0
@@ -238,7 +240,8 @@ def _official(task: str, python: Path, n_episodes: int, horizon_steps: int) -> B
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     begun = time.perf_counter()
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        with own_need():
+            done = subprocess.run(command, env=environment, capture_output=True, text=True)
     except OSError as exc:
         raise MissingDependencyError(
             f"bench: expected a Python interpreter that has mikasa-robo-suite at {python}, found none "

@@ -20,6 +20,7 @@ import torch
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import BatchPolicy, EpisodeStart, FloatArray, Observation, ObservationWindow, Policy
 from vla_eval.errors import RemotePolicyError
+from vla_eval.lock.switch import own_need
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import make_from_adapter
@@ -124,7 +125,8 @@ def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
     command = [sys.executable, "-m", "vla_eval.cli", "serve", "--policy", policy]
     command += ["--port", "0", "--max-batch", str(n_rows)]
     with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        with own_need():
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
         try:
             assert process.stdout is not None  # it is a pipe
             found = SERVING.search(process.stdout.readline())

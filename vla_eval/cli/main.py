@@ -5,13 +5,16 @@ Each verb is a module with `add_parser(subparsers)` and `run(args) -> int`, impo
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
 from vla_eval import __version__
 from vla_eval.cli.streams import standard_streams
 from vla_eval.errors import VlaEvalError, did_you_mean
+from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
 
 PROGRAM = "mikasa-vla"
 VERBS = (
@@ -90,7 +93,11 @@ def _run(arguments: list[str]) -> int:
         args, unknown = parser.parse_known_args(arguments)
         if unknown:
             return _fail(_unknown_arguments(parser, first, unknown))
-        code = _verb(args.verb).run(args)
+        if getattr(args, "no_lock", False):
+            os.environ[OFF_VARIABLE] = "1"
+        with locked():
+            let_write(Path("runs"), *_paths(args))
+            code = _verb(args.verb).run(args)
         sys.stdout.flush()
     except VlaEvalError as exc:
         return _fail(str(exc))
@@ -116,7 +123,31 @@ def build_parser(verbs: Sequence[str] = VERBS) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
     for verb in verbs:
         _verb(verb).add_parser(subparsers)
+    for below in subparsers.choices.values():
+        _add_no_lock(below)
     return parser
+
+
+def _add_no_lock(parser: argparse.ArgumentParser) -> None:
+    """Add `--no-lock` to a verb, and to each of its actions."""
+    parser.add_argument(
+        "--no-lock",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="let what is read run programs and code (docs/security.md)",
+    )
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                _add_no_lock(below)
+
+
+def _paths(args: argparse.Namespace) -> list[Path]:
+    """Return the files and folders that the user named: what may be written to."""
+    values = [
+        each for value in vars(args).values() for each in (value if isinstance(value, list) else [value])
+    ]
+    return [value for value in values if isinstance(value, Path)]
 
 
 def _verb(name: str) -> Verb:

@@ -56,7 +56,10 @@ def run(args: argparse.Namespace) -> int:
     for name, value in WORKER_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     # Here and not above: `mikasa-vla --help` need not wait for torch, which reads the number of threads.
+    from vla_eval.lock.switch import let_resolve
     from vla_eval.serving.host import HostOptions, host_policy
+
+    let_resolve(args.host)
     from vla_eval.serving.server import ServerOptions, run_server
 
     options = ServerOptions(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.cli.arguments import add_verb
+from vla_eval.lock.switch import own_need
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
 
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
             f"{len(found)} rerun files; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr
         )
     command = [sys.executable, "-m", "rerun", *map(str, found[:MOST_OPENED])]
-    return subprocess.run([*command, "--web-viewer"] if args.web else command, check=False).returncode
+    with own_need():
+        return subprocess.run([*command, "--web-viewer"] if args.web else command, check=False).returncode
 
 
 def _of_run(args: argparse.Namespace) -> list[Path]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vla_eval.errors import DatasetError
+from vla_eval.lock.switch import distrust
 
 SNAPSHOTS, BLOBS = "snapshots", "blobs"
 """The Hub's cache keeps a dataset as `snapshots/REVISION`, whose files are links into `blobs` beside it."""
@@ -18,6 +19,7 @@ def check_folder(root: Path) -> None:
     Args:
         root: the folder; it may be a link itself, since the user named it.
     """
+    distrust(root)
     inside = root.resolve()
     blobs = inside.parent.parent / BLOBS if inside.parent.name == SNAPSHOTS else None
     for path in _entries(root):

@@ -21,6 +21,7 @@ from vla_eval.data.completeness import check_complete
 from vla_eval.data.imported import IMPORT_FILE
 from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, REPLAY_FILE
 from vla_eval.errors import DatasetError
+from vla_eval.lock.switch import let_connect, let_write
 from vla_eval.storage.drafts import publish
 
 REPO_TYPE = "dataset"
@@ -48,6 +49,7 @@ def push_dataset(root: Path, repo_id: str, *, private: bool = False, api: HfApi 
     Raises:
         DatasetError: the dataset is not complete, or the Hub refuses it.
     """
+    let_connect("dataset push")
     facts = check_complete(root)
     if not (root / CARD_FILE).exists():
         write_card(root)
@@ -89,6 +91,8 @@ def pull_dataset(
     Raises:
         DatasetError: `out` exists, the Hub does not give it, or it is not a complete dataset.
     """
+    let_connect("dataset pull")
+    let_write(out)
     if out.exists():
         raise DatasetError(f"{out}: exists already. Name a new folder, or remove this one.")
     api = api or HfApi()

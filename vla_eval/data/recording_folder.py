@@ -21,6 +21,7 @@ from typing import Self
 from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.errors import DatasetError, RunFolderError
+from vla_eval.lock.switch import let_write
 from vla_eval.storage.continuing import continued, without_device
 from vla_eval.storage.durable import LineFile, sync_folder
 from vla_eval.storage.episodes_file import cut_tail, read_lines
@@ -68,6 +69,7 @@ class RecordingFolder:
             StorageFullError: the disk is full.
         """
         state = out / STATE_FOLDER
+        let_write(out)
 
         def make(folder: Path) -> None:
             _refuse_foreign(out)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from vla_eval.lock.switch import own_need
+
 Status = Literal["ok", "warn", "fail"]
 
 PROBE_TIMEOUT_SECONDS = 300.0  # a first import on a cold disk takes a minute
@@ -45,9 +47,10 @@ def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
     """
     command = (sys.executable, "-m", "vla_eval.doctor.probe", name)
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_SECONDS
-        )
+        with own_need():
+            done = subprocess.run(
+                command, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_SECONDS
+            )
     except subprocess.TimeoutExpired:
         raise ProbeFailure(f"no answer within {PROBE_TIMEOUT_SECONDS:.0f} s") from None
     if done.returncode < 0:

@@ -15,6 +15,7 @@ from pathlib import Path
 from vla_eval.config.decoding import decode
 from vla_eval.config.shipped import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
+from vla_eval.lock.switch import distrust
 from vla_eval.policies.bases import how_to_get
 from vla_eval.policies.checkpoint_json import get_text
 from vla_eval.policies.checkpoint_json import read_json as read_json  # where most look for it
@@ -93,6 +94,7 @@ def find_checkpoint(path: Path) -> Path:
     for folder in (place / inside for place in places for inside in INSIDE):
         # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
         if os.path.isfile(folder / CONFIG_FILE) and weights_file(folder) is not None:
+            distrust(path if os.path.isdir(path) else folder)
             return folder
     if not os.path.isdir(path):
         found = "no such folder"

@@ -22,6 +22,7 @@ from huggingface_hub.file_download import http_get
 from huggingface_hub.utils import build_hf_headers, filter_repo_objects  # type: ignore[attr-defined]
 
 from vla_eval.errors import CheckpointError, some_of
+from vla_eval.lock.switch import let_connect, let_write
 from vla_eval.policies.bases import Base, Source
 from vla_eval.policies.checkpoint import BASE_FILE, file_sha256, find_checkpoint
 
@@ -82,6 +83,8 @@ def fetch_base(
         return out
     api = api or HfApi()
     downloads = out.parent / DOWNLOADS / out.name
+    let_connect("checkpoint fetch")
+    let_write(downloads)
     sources = [
         *base.parts[:-1],
         dataclasses.replace(base.weights, revision=revision or base.weights.revision),

@@ -27,6 +27,7 @@ from vla_eval.errors import (
     did_you_mean,
     unknown_name,
 )
+from vla_eval.lock.switch import let_everything
 from vla_eval.policies.context import PolicyContext
 from vla_eval.seeding import seed_global_generators
 
@@ -96,6 +97,8 @@ def policy_factory(adapter: str) -> PolicyFactory:
         MissingDependencyError: the adapter's module needs a package that is not installed.
     """
     module_name, attribute = _target(adapter)
+    if not module_name.startswith(_OWN_ADAPTERS):
+        let_everything(f"{adapter} is a policy of the user's own")
     try:
         found: Any = importlib.import_module(module_name)  # Any: whatever the module holds
     except ModuleNotFoundError as exc:

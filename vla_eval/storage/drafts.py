@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vla_eval.errors import VlaEvalError
+from vla_eval.lock.switch import let_write
 from vla_eval.storage.durable import sync_folder
 
 DRAFT_SUFFIX = ".draft"
@@ -24,6 +25,7 @@ def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
     """
     if out.exists():
         raise error(f"{out}: exists already. Name a new folder with --out, or remove this one.")
+    let_write(out)
     remove_drafts(out)
     draft = draft_path(out)
     draft.parent.mkdir(parents=True, exist_ok=True)

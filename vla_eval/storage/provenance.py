@@ -14,6 +14,7 @@ import subprocess
 from pathlib import Path
 
 import vla_eval
+from vla_eval.lock.switch import own_need
 from vla_eval.storage.run_file import JsonValue
 
 PACKAGE_FOLDER = Path(vla_eval.__file__).parent
@@ -126,9 +127,10 @@ def _git(root: Path, *arguments: str) -> bytes | None:
 def _output(command: tuple[str, ...], environment: dict[str, str] | None = None) -> bytes | None:
     """Return what a tool prints, or None if it is missing, fails or hangs."""
     try:
-        done = subprocess.run(
-            command, capture_output=True, env=environment, check=True, timeout=TOOL_TIMEOUT_SECONDS
-        )
+        with own_need():
+            done = subprocess.run(
+                command, capture_output=True, env=environment, check=True, timeout=TOOL_TIMEOUT_SECONDS
+            )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from vla_eval.errors import ConformanceError
+from vla_eval.lock.switch import let_connect
 from vla_eval.wire import check
 
 
@@ -27,6 +28,7 @@ def check_remote(
     Raises:
         ConformanceError: one is not, or the server cannot be reached.
     """
+    let_connect(f"the server that is checked, {url}")
     try:
         return check.check_remote(url, api_key=api_key, timeout_seconds=timeout_seconds, report=report)
     except check.CheckFailedError as exc:

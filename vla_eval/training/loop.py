@@ -40,6 +40,7 @@ from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import local_readers
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
+from vla_eval.lock.switch import let_connect
 from vla_eval.policies.lerobot_device import amp_dtype
 from vla_eval.policies.steps.levels import in_numbers
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
@@ -96,6 +97,8 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
     with _logging(job.out / LOG_FILE, accelerator), local_files_only(job):
         training = _Training(job, accelerator, listeners.on_model)
         is_main = accelerator.is_main_process
+        if recipe.wandb_project is not None:
+            let_connect("finetune.wandb_project")
         wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
         silent = not (is_main and sys.stderr.isatty())
         is_saved = is_finished = True

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any  # wandb and trackio are optional: not looked at by mypy
 
 from vla_eval.errors import MissingDependencyError
+from vla_eval.lock.switch import let_connect
 
 Log = Callable[[Mapping[str, float | str]], None]
 """Takes one line of metrics, with its `step`."""
@@ -34,6 +35,7 @@ def trackio_run(project: str | None, *, name: str, settings: Mapping[str, Any]) 
         yield lambda _line: None
         return
     try:
+        let_connect("finetune.trackio_project")
         trackio: Any = importlib.import_module("trackio")
     except ModuleNotFoundError as exc:
         raise MissingDependencyError(

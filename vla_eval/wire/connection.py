@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from vla_eval.errors import RemoteConnectionError, RemotePolicyError, RemoteReplyError, RemoteTimeoutError
+from vla_eval.lock.switch import own_need
 from vla_eval.wire.addresses import is_loopback
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb
 
@@ -132,17 +133,18 @@ def _connect(url: str, *, connect_seconds: float, api_key: str | None) -> Client
     deadline, pause = time.monotonic() + connect_seconds, FIRST_PAUSE_SECONDS
     while True:
         try:
-            return connect(
-                url,
-                additional_headers=headers,
-                compression=None,
-                max_size=MAX_MESSAGE_BYTES,
-                open_timeout=OPEN_SECONDS,
-                close_timeout=CLOSE_SECONDS,
-                # A server that computes for a minute answers no pings, and is healthy.
-                ping_interval=None,
-                proxy=None if is_loopback(url) else True,
-            )
+            with own_need():  # the user named this server
+                return connect(
+                    url,
+                    additional_headers=headers,
+                    compression=None,
+                    max_size=MAX_MESSAGE_BYTES,
+                    open_timeout=OPEN_SECONDS,
+                    close_timeout=CLOSE_SECONDS,
+                    # A server that computes for a minute answers no pings, and is healthy.
+                    ping_interval=None,
+                    proxy=None if is_loopback(url) else True,
+                )
         except ConnectionRefusedError as exc:
             if time.monotonic() + pause > deadline:
                 raise _no_server(url, exc) from exc

@@ -18,6 +18,7 @@ from multiprocessing.context import ForkServerContext, SpawnContext
 from typing import Any  # private parts of multiprocessing
 
 from vla_eval.config.environment import Simulator
+from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers, lock
 from vla_eval.storage.provenance import nvidia_driver_version
 from vla_eval.workers.guard import fork_guarded
 from vla_eval.workers.server import IMPORTS_VARIABLE
@@ -68,6 +69,7 @@ def begin(
     _leave_helpers()
     os.environ.clear()
     os.environ.update(environment)
+    lock()
     main(*args)
 
 
@@ -124,7 +126,7 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
         added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
         os.environ.update(added)
         try:
-            environment = dict(os.environ)
+            environment = {**os.environ, WRITING_VARIABLE: folders_for_workers()}
             os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
             yield environment
         finally:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any  # Ray is optional: not looked at by mypy
 
 from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
+from vla_eval.lock.switch import let_connect, own_need
 from vla_eval.workers.start import available_cores, visible_gpus
 
 OBJECT_STORE_BYTES = 100 << 20  # jobs and answers have a few kilobytes, and do not go through it
@@ -68,8 +69,10 @@ def connected(address: str) -> Iterator[Any]:
             "num_gpus": len(visible_gpus()),
         }
     try:
+        let_connect(f"--cluster {address}")
         _check_listening(address)
-        ray.init(address=address, **quiet)
+        with own_need():
+            ray.init(address=address, **quiet)
     except ImportError as exc:
         raise _missing(exc) from exc
     except (OSError, OverflowError, RuntimeError, ValueError, ray.exceptions.RayError) as exc:
