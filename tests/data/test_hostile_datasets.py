@@ -105,7 +105,7 @@ def test_no_protocol_that_is_installed_is_asked(recorded: Path, bait: Bait) -> N
         is_watching.clear()
 
 
-@pytest.mark.parametrize("scheme", ["reference", "http", "simplecache", "zip"])
+@pytest.mark.parametrize("scheme", ["reference", "http", "zip"])
 def test_the_lock_alone_lets_nothing_run(
     recorded: Path, bait: Bait, scheme: str, caplog: pytest.LogCaptureFixture
 ) -> None:
