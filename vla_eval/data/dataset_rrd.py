@@ -20,7 +20,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from vla_eval.data.manifest import MANIFEST_FILE, RecordedEpisode, read_manifest
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.opening import open_local_dataset, read_sample
 from vla_eval.errors import ViewingError
 from vla_eval.features import (
     ACTION_KEY,
@@ -88,7 +88,9 @@ def _wished(
 
 def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Path) -> Path:
     row = dataset.meta.episodes[number]
-    frames = [dataset[index] for index in range(row["dataset_from_index"], row["dataset_to_index"])]
+    frames = [
+        read_sample(dataset, index) for index in range(row["dataset_from_index"], row["dataset_to_index"])
+    ]
     with rrd_when_whole(
         path,
         recording_id=f"{dataset.root.name}_{number}",

@@ -102,7 +102,7 @@ def summarize(root: Path) -> DatasetSummary:
         instructions=tuple(sorted(str(task) for task in dataset.meta.tasks.index)),
         fields={name: _type(feature) for name, feature in sorted(features.items())},
         action=ActionStatistics(
-            names=tuple(features[ACTION_KEY]["names"]),
+            names=tuple(map(str, features[ACTION_KEY].get("names") or range(action.shape[1]))),
             mean=action.mean(axis=0),
             std=action.std(axis=0),
             low=action.min(axis=0),

@@ -4,7 +4,6 @@ lerobot decodes video for every sample of every epoch. Frames of 128×128 are sm
 take 470 MiB, which a memory map serves from the page cache to any number of loader processes.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args  # Any: lerobot and datasets are untyped
@@ -242,8 +241,8 @@ def frame_layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> FrameLay
 def _channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
     """Return (channels, height, width) of a camera, whatever the order of its description."""
     # lerobot's own data sets call the last one `channel` as well as `channels`.
-    names = [{"channel": "channels"}.get(name, name) for name in feature["names"]]
-    sizes = dict(zip(names, feature["shape"], strict=True))
-    if "channels" not in sizes or not math.prod(sizes.values()):
+    names = [{"channel": "channels"}.get(str(name), name) for name in feature.get("names") or ()]
+    sizes = dict(zip(names, feature["shape"], strict=False))
+    if sorted(sizes) != ["channels", "height", "width"] or len(feature["shape"]) != 3:
         raise DatasetError(f"a camera is described by {dict(feature)}: expected height, width and channels.")
     return int(sizes["channels"]), int(sizes["height"]), int(sizes["width"])

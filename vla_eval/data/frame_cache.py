@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import numpy as np
-from av.error import FFmpegError
-from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
+from lerobot.datasets.video_utils import decode_video_frames
 
 from vla_eval.core import ImageArray
+from vla_eval.data.opening import UNREADABLE, reason
 from vla_eval.data.tables import MIB, available_ram_bytes
 from vla_eval.errors import DatasetError, StorageFullError
 
@@ -109,10 +109,10 @@ def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
             frames = decode_video_frames(
                 path, times_s, dataset.tolerance_s, dataset._video_backend, return_uint8=True
             )
-        except (OSError, RuntimeError, FFmpegError, FrameTimestampError) as exc:
+        except UNREADABLE as exc:
             raise DatasetError(
                 f"{path}: episode {episode.index} of camera '{camera}' cannot be decoded "
-                f"({str(exc).splitlines()[0]}). The video is damaged or belongs to another dataset."
+                f"({reason(exc)}). The video is damaged or belongs to another dataset."
             ) from exc
         shape = (episode.stop - episode.first, *source.shapes[camera])
         if tuple(frames.shape) != shape:

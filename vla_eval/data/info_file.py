@@ -4,6 +4,7 @@ lerobot fills in the templates of paths with `str.format`, which can reach any a
 and takes text for numbers. Knows nothing of the files that the templates name.
 """
 
+import math
 import re
 import string
 from dataclasses import dataclass, field, fields
@@ -22,6 +23,8 @@ TEMPLATES = {
 }
 FORMAT_LETTERS = frozenset("0123456789d")  # of `{file_index:03d}`
 MAX_FORMAT_LETTERS = 3  # a width of up to 99
+MAX_AXES = 5  # of what lerobot stores
+MAX_NUMBERS = 2**31  # of one field of one frame
 VERSION = re.compile(r"v?3\.\d{1,9}(\.\d{1,9})?")
 OLD_VERSION = re.compile(r"v?2\.\d{1,9}(\.\d{1,9})?")
 NUMBERS = ("bool", *(f"{sign}int{n_bits}" for sign in ("", "u") for n_bits in (8, 16, 32, 64)))
@@ -87,7 +90,10 @@ def check_info(root: Path) -> None:
                 f"the feature {shown(name)}", "expected a printable name without '/' and '..'"
             )
         within = Source(where=f"{path}: {name}", what="a feature", remedy=REMEDY, error=DatasetError)
-        dtype = as_dataclass(_Feature, _known(_Feature, feature), within).dtype
+        known = as_dataclass(_Feature, _known(_Feature, feature), within)
+        dtype = known.dtype
+        if not 1 <= len(known.shape) <= MAX_AXES or math.prod(known.shape) > MAX_NUMBERS:
+            raise within.refuse(f"shape {shown(known.shape)}", f"expected 1 to {MAX_AXES} axes of a frame")
         if dtype not in DTYPES:
             raise within.refuse(f"dtype {shown(dtype)}", f"expected one of {', '.join(sorted(DTYPES))}")
     for name, allowed in TEMPLATES.items():

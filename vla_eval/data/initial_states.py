@@ -17,7 +17,7 @@ from vla_eval.data.imported import IMPORT_FILE, read_import
 from vla_eval.data.layouts import LEROBOT_CAMERAS, Source, SourceEpisode
 from vla_eval.data.manifest import RECORDING_FILE, read_facts, read_manifest
 from vla_eval.data.mixture import read_mixture
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.opening import open_local_dataset, read_sample
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import PROPRIO_KEYS, STATE_KEY, StateKind
@@ -123,7 +123,7 @@ def _of_lerobot(source: Source) -> InitialStates:
         dataset = open_local_dataset(source.path, return_uint8=True)
         keys = zip(("base_camera", "hand_camera"), LEROBOT_CAMERAS[source.layout], strict=True)
         named = tuple(keys)
-        items = (dataset[int(row)] for row in first_rows)
+        items = (read_sample(dataset, int(row)) for row in first_rows)
         return [{name: item[key].permute(1, 2, 0).numpy() for name, key in named} for item in items]
 
     return InitialStates(

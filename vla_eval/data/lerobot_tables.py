@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from vla_eval.data.tables import (
     EPISODE_TABLES,
     FRAME_TABLES,
+    LANGUAGE_COLUMNS,
     REMEDY,
     check_columns,
+    check_values,
     is_image,
     read_table,
     refused,
@@ -124,6 +126,7 @@ def _frames(path: Path, features: Features, episodes: Sequence[int] | None) -> A
     undeclared = [name for name in table.column_names if name not in features]
     if undeclared:
         raise refused(path, "only columns that meta/info.json declares", shown(undeclared[0]))
+    check_values(path, table, [name for name in features if name not in LANGUAGE_COLUMNS])
     if episodes is not None:
         table = table.filter(pc.is_in(table["episode_index"], pa.array(list(episodes), pa.int64())))
     for name, feature in features.items():

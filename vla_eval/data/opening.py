@@ -13,10 +13,12 @@ from typing import Any, NoReturn  # lerobot is untyped
 from unittest.mock import patch
 
 import numpy as np
+from av.error import FFmpegError
 from lerobot.datasets import dataset_metadata, dataset_reader
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from PIL.Image import DecompressionBombError
 
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.info_file import check_info
@@ -25,6 +27,11 @@ from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, refused
 from vla_eval.errors import DatasetError
 from vla_eval.viz.mp4 import check_mp4
 
+UNREADABLE = (
+    *(OSError, RuntimeError, ValueError, LookupError, TypeError, OverflowError, MemoryError),
+    *(FFmpegError, DecompressionBombError),
+)
+"""What lerobot, FFmpeg, Pillow and pyarrow raise on damaged content."""
 NEEDED = ("meta/info.json", "meta/tasks.parquet", EPISODE_TABLES, FRAME_TABLES)
 
 
@@ -48,6 +55,27 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
     check_info(root)
     with local_readers():
         return _open(root, options)
+
+
+def read_sample(dataset: Any, index: int) -> dict[str, Any]:  # Any: LeRobotDataset; tensors, and a sentence
+    """Return one frame of an opened dataset, with its images.
+
+    Raises:
+        DatasetError: a video or an image is damaged, or holds nothing for this frame.
+    """
+    try:
+        sample: dict[str, Any] = dataset[index]
+    except UNREADABLE as exc:
+        raise DatasetError(
+            f"{dataset.root}: frame {index} cannot be read ({reason(exc)}). A video or image is damaged, or "
+            "belongs to another dataset. Fetch the dataset again."
+        ) from exc
+    return sample
+
+
+def reason(exc: BaseException) -> str:
+    """Return the first line of an error of another library."""
+    return next(iter(str(exc).splitlines()), type(exc).__name__)[:200]
 
 
 @contextlib.contextmanager
@@ -104,7 +132,7 @@ def _open(root: Path, options: dict[str, Any]) -> LeRobotDataset:
     repo_id = _repo_id(root)
     try:
         meta = LeRobotDatasetMetadata(repo_id, root=root)
-    except (OSError, ValueError, KeyError, TypeError) as exc:
+    except UNREADABLE as exc:
         raise DatasetError(f"{root}: lerobot cannot read its meta/ ({exc!r:.300}).") from exc
     _check_totals(root, meta)
     _check_videos(root, meta)
@@ -116,7 +144,7 @@ def _open(root: Path, options: dict[str, Any]) -> LeRobotDataset:
     options.setdefault("video_backend", decoder_for(root))
     try:
         dataset = LeRobotDataset(repo_id, root=root, **options)
-    except (OSError, ValueError, KeyError, RuntimeError, TypeError, IndexError) as exc:
+    except UNREADABLE as exc:
         raise DatasetError(f"{root}: lerobot cannot read the dataset ({exc!r:.300}).") from exc
     _check_rows(dataset)
     return dataset

@@ -10,7 +10,7 @@ from vla_eval.core import EpisodeStart, ImageArray, SimEnv
 from vla_eval.data.demonstrations import SLOT, replay_actions
 from vla_eval.data.episode_check import MIN_PSNR_DB, check_pictures, check_rows, check_states
 from vla_eval.data.manifest import RecordedEpisode
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.opening import open_local_dataset, read_sample
 from vla_eval.data.replay import EpisodeReplayed, ReplayJob
 from vla_eval.data.tables import Columns, read_columns, rows_of_episode
 from vla_eval.envs.factory import describe_device, make_env
@@ -93,7 +93,7 @@ class ReplayRunner:
     def _decode(self, episode: RecordedEpisode) -> dict[str, list[ImageArray]]:
         """Return camera -> frames of the episode's video, (H, W, 3) uint8."""
         first = int(self._videos.meta.episodes[episode.episode_index]["dataset_from_index"])
-        items = [self._videos[first + step] for step in range(episode.n_steps)]
+        items = [read_sample(self._videos, first + step) for step in range(episode.n_steps)]
         return {
             camera: [item[key].permute(1, 2, 0).numpy() for item in items]
             for camera, key in CAMERA_KEYS.items()

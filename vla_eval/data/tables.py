@@ -11,6 +11,7 @@ from typing import Any  # pyarrow is untyped
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -88,6 +89,7 @@ def read_columns(root: Path, only: Sequence[str] | None = None) -> Columns:
     names = only or [column.name for column in tables[0].schema if not is_image(column.type)]
     for path, table in zip(paths, tables, strict=True):
         check_columns(path, table, names)
+        check_values(path, table, names)
     return {name: np.concatenate([np.asarray(table[name].to_pylist()) for table in tables]) for name in names}
 
 
@@ -114,6 +116,26 @@ def check_columns(path: Path, table: Any, names: Sequence[str]) -> None:  # Any:
     for name in names:
         if name not in table.column_names:
             raise refused(path, f"the column {name}", f"{', '.join(table.column_names):.500}")
+
+
+def check_values(path: Path, table: Any, names: Sequence[str]) -> None:  # Any: pyarrow.Table
+    """Raise `DatasetError` where a row has no value, or a list is of another length than the others."""
+    for name in names:
+        column, level = table[name], 0
+        while True:
+            if column.null_count:
+                raise refused(path, f"a value in each row of {name}", f"{column.null_count} without one")
+            if isinstance(column.type, pa.BaseExtensionType):
+                column = pa.chunked_array(
+                    [chunk.storage for chunk in column.chunks], column.type.storage_type
+                )
+            if not pa.types.is_nested(column.type) or pa.types.is_struct(column.type):
+                break
+            lengths = pc.unique(pc.list_value_length(column)).to_pylist()
+            if len(lengths) > 1:
+                found = f"lengths {', '.join(map(str, sorted(lengths)[:5]))}"
+                raise refused(path, f"lists of one length in {name}, level {level}", found)
+            column, level = pc.list_flatten(column), level + 1
 
 
 def refused(path: Path, expected: str, found: str) -> DatasetError:
