@@ -192,6 +192,7 @@ class TestObservations:
         read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
         assert read.state_layouts == STATE_NAMES
         numbers = np.arange(25, dtype=np.float64)
+        numbers[3:7] = 0, 1, 0, 0  # the quaternion
         state = read.read(request(**{"observation/state": numbers}), step=0).state
         assert {name: (values[0], len(values)) for name, values in state.items()} == {
             "tcp_pose": (0, 7),
@@ -201,8 +202,9 @@ class TestObservations:
         assert all(values.dtype == np.float32 for values in state.values())
 
     def test_ten_numbers_are_the_end_effector_for_a_policy_that_reads_it(self) -> None:
-        ten = request(**{"observation/state": np.arange(10, dtype=np.float32)})
+        numbers = np.array([1, 2, 3, 0, 1, 0, 1, 0, 0, 4], dtype=np.float32)
+        ten = request(**{"observation/state": numbers})
         read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
-        assert read.read(ten, step=0).state["eef"].tolist() == list(range(10))
+        assert read.read(ten, step=0).state["eef"].tolist() == numbers.tolist()
         with pytest.raises(RequestError, match=r"expected 25 numbers \(joints\), found 10"):
             reader(states=("tcp_pose", "qpos", "qvel")).read(ten, step=0)

@@ -84,7 +84,12 @@ class PolicyServer:
         self._sessions = SessionTable(
             hosted.reader, reads=hosted.policy.spec.reads, n_rows=hosted.n_rows, task=hosted.task
         )
-        self._batcher = Batcher(hosted.policy, n_rows=hosted.n_rows, metrics=self._metrics)
+        self._batcher = Batcher(
+            hosted.policy,
+            n_rows=hosted.n_rows,
+            action_dims=hosted.metadata.action_dims or (),
+            metrics=self._metrics,
+        )
         self._service = Service(sessions=self._sessions, batcher=self._batcher, debug=options.debug)
         self._connections: set[ClientConnection] = set()
         self._numbers = itertools.count()

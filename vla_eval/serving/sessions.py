@@ -112,6 +112,7 @@ class SessionTable:
         Raises:
             RequestError: no instruction, or a field of another type or out of range.
         """
+        _number(request, "step")  # of a reset, it is only repeated in the reply
         row = _number(request, "row", most=self._n_rows - 1)
         session.row = session.row if row is None else row
         start = EpisodeStart(

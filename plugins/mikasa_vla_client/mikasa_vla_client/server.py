@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Callable, Mapping
 
+import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
 from websockets.sync.server import serve as listen
@@ -169,6 +170,9 @@ class PolicyServer:
             raise RequestError(f"there is no endpoint {endpoint!r:.80} (known: {', '.join(ENDPOINTS)}).")
         if not isinstance(session_id, str):
             raise RequestError(f"session_id: expected a text, found {session_id!r:.80}.")
+        step = request.get("step", 0)
+        if not isinstance(step, (int, np.integer)) or isinstance(step, bool):
+            raise RequestError(f"step: expected a whole number, found {step!r:.80}.")
         asked = time.perf_counter()
         with self._one_at_a_time:
             reply: dict[str, Any] = {"server_timing": {"queue_ms": _ms_since(asked)}}
