@@ -6,7 +6,6 @@ close healthy connections of a client that is busy simulating.
 
 import asyncio
 import contextlib
-import hmac
 import http
 import itertools
 import logging
@@ -27,6 +26,7 @@ from vla_eval.serving.host import HostedPolicy
 from vla_eval.serving.metrics import CONTENT_TYPE, ServerMetrics
 from vla_eval.serving.sessions import SessionTable
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES
+from vla_eval.wire.keys import HEADER, explanation, key_problem, refused
 
 MAX_PORT = 65_535
 GOING_AWAY = 1001  # close code of RFC 6455
@@ -63,8 +63,16 @@ class ServerOptions:
     log_seconds: float = LOG_SECONDS
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges, and the key.
+
+        Raises:
+            RecipeError: a number is out of range.
+            ServeError: the key cannot be sent in a header.
+        """
         check_bounds(self, {"port": (0, MAX_PORT), "idle_seconds": (0.001, MAX_SECONDS)})
+        problem = None if self.api_key is None else key_problem(self.api_key)
+        if problem is not None:
+            raise ServeError(f"the API key: {problem}. Choose another key.")
 
 
 class PolicyServer:
@@ -157,12 +165,9 @@ class PolicyServer:
             return socket.respond(
                 http.HTTPStatus.FORBIDDEN, "expected a policy client, found a page in a browser (Origin)\n"
             )
-        key = self._options.api_key
-        given = request.headers.get("Authorization", "")
-        if key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {key}".encode()):
-            return socket.respond(
-                http.HTTPStatus.UNAUTHORIZED, "expected the header 'Authorization: Api-Key KEY'\n"
-            )
+        status = refused(request.headers.get_all(HEADER), self._options.api_key)
+        if status is not None:
+            return socket.respond(status, explanation(status))
         if request.path == "/metrics":
             body = self._metrics.prometheus(
                 n_sessions=len(self._sessions), n_connections=len(self._connections)

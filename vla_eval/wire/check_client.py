@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
 from websockets.sync.client import connect
 
 from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
+from .keys import key_headers, key_problem
 from .numbers import noise_state
 
 N_INFERENCES = 3
@@ -64,7 +65,10 @@ class Server:
 
     def __init__(self, url: str, api_key: str | None, timeout_seconds: float) -> None:
         self.url, self.timeout_seconds = url, timeout_seconds
-        self._headers = {} if api_key is None else {"Authorization": "Api-Key " + api_key}
+        problem = None if api_key is None else key_problem(api_key)
+        if problem is not None:
+            raise self.failed(f"the API key cannot be sent: {problem}.")
+        self._headers = key_headers(api_key)
         self.facts: Any = None
         self.alone: dict[int, Chunks] = {}
 

@@ -16,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from vla_eval.errors import RemoteConnectionError, RemotePolicyError, RemoteReplyError, RemoteTimeoutError
 from vla_eval.wire.addresses import is_loopback
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb
+from vla_eval.wire.keys import key_headers, key_problem
 
 logger = logging.getLogger(__name__)
 
@@ -128,13 +129,17 @@ class Connection:
 
 
 def _connect(url: str, *, connect_seconds: float, api_key: str | None) -> ClientConnection:
-    headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+    problem = None if api_key is None else key_problem(api_key)
+    if problem is not None:
+        raise RemoteConnectionError(
+            f"{url}: the API key cannot be sent: {problem}. Correct the environment variable that holds it."
+        )
     deadline, pause = time.monotonic() + connect_seconds, FIRST_PAUSE_SECONDS
     while True:
         try:
             return connect(
                 url,
-                additional_headers=headers,
+                additional_headers=key_headers(api_key),
                 compression=None,
                 max_size=MAX_MESSAGE_BYTES,
                 open_timeout=OPEN_SECONDS,
