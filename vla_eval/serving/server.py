@@ -89,14 +89,18 @@ class PolicyServer:
     ) -> None:
         self._hosted, self._options = hosted, options
         self._metrics = metrics or ServerMetrics()
-        self._sessions = SessionTable(
-            hosted.reader, reads=hosted.policy.spec.reads, n_rows=hosted.n_rows, task=hosted.task
-        )
         self._batcher = Batcher(
             hosted.policy,
             n_rows=hosted.n_rows,
             action_dims=hosted.metadata.action_dims or (),
             metrics=self._metrics,
+        )
+        self._sessions = SessionTable(
+            hosted.reader,
+            reads=hosted.policy.spec.reads,
+            n_rows=hosted.n_rows,
+            task=hosted.task,
+            forget=self._batcher.forget,
         )
         self._service = Service(sessions=self._sessions, batcher=self._batcher, debug=options.debug)
         self._connections: set[ClientConnection] = set()
@@ -184,8 +188,7 @@ class PolicyServer:
     async def _drop_idle(self) -> None:
         while True:
             await asyncio.sleep(self._options.idle_seconds / IDLE_CHECKS)
-            for slot in self._sessions.drop_idle(self._options.idle_seconds):
-                self._batcher.forget(slot)
+            self._sessions.drop_idle(self._options.idle_seconds)
 
 
 def run_server(
