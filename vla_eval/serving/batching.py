@@ -114,15 +114,23 @@ class Batcher:
         """Have the policy forget a slot, after what was asked for it before."""
         self._put(_Forget(slot=slot))
 
-    def close(self) -> None:
-        """Finish the pass under way, cancel what has not begun, and end the thread."""
+    def close(self, *, seconds: float | None = None) -> bool:
+        """Finish the pass under way, cancel what has not begun, and end the thread.
+
+        Args:
+            seconds: how long the pass may take until its thread is left alone; None: as long as it takes.
+
+        Returns:
+            Whether the thread has ended.
+        """
         with self._changed:
             self._is_closed = True
             waiting, self._queue = self._queue, deque()
             self._changed.notify()
         for request in waiting:
             request.done.cancel()
-        self._thread.join()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def _put[R: (_Begin, _Infer, _Forget)](self, request: R) -> R:
         with self._changed:
