@@ -242,7 +242,7 @@ def run_server(
 
         def on_signal() -> None:
             stop.set()
-            # Of C: ends the process even if a policy, or the end of a library, never lets Python go on.
+            # In C: ends the process even if a policy, or the end of a library, blocks Python.
             faulthandler.dump_traceback_later(END_SECONDS, exit=True, file=STDERR_FD)
             for number in STOP_SIGNALS:
                 loop.remove_signal_handler(number)

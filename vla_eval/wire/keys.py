@@ -58,7 +58,7 @@ def refused(given: Sequence[str], key: str | None) -> HTTPStatus | None:
 
 
 def explanation(status: HTTPStatus) -> str:
-    """Return what a refused client is told."""
+    """Return the text for a refused client."""
     if status is HTTPStatus.BAD_REQUEST:
         return f"expected one header '{HEADER}', found several\n"
     return f"expected the header '{HEADER}: {SCHEME} KEY'\n"
