@@ -4,6 +4,7 @@ Knows nothing of when a policy is asked or a simulator stepped: that is `rollout
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -167,21 +168,35 @@ def check_first_inference(episode: EpisodeStart, chunking: ChunkingSpec) -> None
 
 def check_chunk(chunk: object, spec: PolicySpec, action_spec: ActionSpec, log: EpisodeLog) -> None:
     """Raise `InvalidActionError` unless this is a finite float chunk of the declared shape."""
-    where = f"policy '{spec.name}', {log.start.task}, seed {log.start.seed}, inference at step {log.n_steps}"
-    expected = f"an ActionChunk of shape ({spec.chunk_size}, {len(action_spec.dims)}), float32, all finite"
+    problem = chunk_problem(chunk, chunk_size=spec.chunk_size, dims=action_spec.dims)
+    if problem is not None:
+        raise InvalidActionError(
+            f"policy '{spec.name}', {log.start.task}, seed {log.start.seed}, inference at step "
+            f"{log.n_steps}: {problem}"
+        )
+
+
+def chunk_problem(chunk: object, *, chunk_size: int, dims: Sequence[str]) -> str | None:
+    """Return why a policy's answer is no chunk of actions; None if it is one.
+
+    Args:
+        chunk: what the policy returned.
+        chunk_size: how many actions it declares.
+        dims: names of an action's numbers.
+    """
     if not isinstance(chunk, ActionChunk) or not isinstance(chunk.actions, np.ndarray):
         found = f"{type(chunk).__name__}"
-    elif chunk.actions.shape != (spec.chunk_size, len(action_spec.dims)):
+    elif chunk.actions.shape != (chunk_size, len(dims)):
         found = f"shape {chunk.actions.shape}"
     elif chunk.actions.dtype != np.float32:
         found = f"dtype {chunk.actions.dtype}"
     elif not np.isfinite(chunk.actions).all():
         row, column = (int(i) for i in np.argwhere(~np.isfinite(chunk.actions))[0])
-        found = f"{chunk.actions[row, column]} at row {row}, dimension '{action_spec.dims[column]}'"
+        found = f"{chunk.actions[row, column]} at row {row}, dimension '{dims[column]}'"
     else:
-        return
-    raise InvalidActionError(
-        f"{where}: expected {expected}, found {found}. "
+        return None
+    return (
+        f"expected an ActionChunk of shape ({chunk_size}, {len(dims)}), float32, all finite, found {found}. "
         f"Check the policy's post-processing (un-normalisation, chunk length, dtype)."
     )
 

@@ -185,8 +185,3 @@ def check_names(kind: str, names: Iterable[str], known: Collection[str], *, wher
     for name in names:
         if name not in known:
             raise unknown_name(kind, name, known, where=where)
-
-
-def one_line(text: str) -> str:
-    r"""Return the text with its control characters as Python shows them: a line end as `\n`."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

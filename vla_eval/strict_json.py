@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
 
 from vla_eval.errors import VlaEvalError
+from vla_eval.plain_text import printable
 
 if TYPE_CHECKING:
     from pydantic_core import SchemaValidator
@@ -281,6 +282,5 @@ def shown(value: object) -> str:
 
 
 def shorten(text: str) -> str:
-    """Return the beginning of a text, without what cannot be printed."""
-    printable = "".join(letter if letter.isprintable() else "?" for letter in text[:MAX_SHOWN])
-    return printable if len(text) <= MAX_SHOWN else f"{printable}…"
+    """Return the beginning of a text, in one printable line."""
+    return printable(text[:MAX_SHOWN]) + ("…" if len(text) > MAX_SHOWN else "")

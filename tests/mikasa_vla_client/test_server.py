@@ -17,10 +17,10 @@ from vla_eval import features
 from vla_eval.wire.codec import packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata
 
-EEF = np.zeros(10, dtype=np.float32)
+EEF = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0, 0], dtype=np.float32)  # no rotation
 FRAME = {
     "observation/image": np.full((128, 128, 3), 7, dtype=np.uint8),
-    "observation/state": np.zeros(25, dtype=np.float32),
+    "observation/state": np.array([0, 0, 0, 1, *[0] * 21], dtype=np.float32),
     "prompt": "pick up the red cube",
 }
 
@@ -164,7 +164,7 @@ class TestRefusals:
             ({"prompt": "p"}, "the observation has no 'observation/state' .it has: prompt."),
             (
                 {"prompt": "p", "observation/state": EEF[:9]},
-                r"expected floating of shape \(10,\), found float32",
+                r"expected an array of 10 numbers, float32 or float64; found float32 of shape \(9,\)",
             ),
             ({"observation/state": EEF}, "'prompt': an episode begins with an instruction, found None"),
             ({"prompt": "p", "endpoint": "jump"}, "no endpoint 'jump' .known: infer, reset, observe"),

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[2]
 PLUGIN = ROOT / "plugins" / "mikasa_vla_client"
 PACKAGE = PLUGIN / "mikasa_vla_client"
-LINKED = ("codec.py", "check.py", "check_client.py")
+LINKED = ("codec.py", "check.py", "check_client.py", "keys.py", "numbers.py")
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +30,7 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_repository_holds_links_to_the_wire() -> None:
     for name in LINKED:
         assert (PACKAGE / name).resolve() == ROOT / "vla_eval" / "wire" / name
+    assert (PACKAGE / "plain_text.py").resolve() == ROOT / "vla_eval" / "plain_text.py"
 
 
 def test_the_wheel_holds_every_module_as_it_is_and_nothing_else(dist: Path) -> None:

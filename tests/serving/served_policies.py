@@ -88,7 +88,7 @@ def host(policy: Any, *, n_rows: int = 1) -> HostedPolicy:
         control_hz=env.control_hz,
         cameras=reader.cameras,
         state_key="observation/state",
-        state_dims=reader.state_layouts["qpos"],
+        state_dims=next(iter(reader.state_layouts.values())),
         state_layouts=reader.state_layouts,
         prompt_key="prompt",
         needs_every_frame=policy.spec.reads == "every",

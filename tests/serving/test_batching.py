@@ -12,6 +12,7 @@ import pytest
 
 from tests.serving.served_policies import CountingPolicy, OneByOnePolicy
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
+from vla_eval.features import ACTION_NAMES
 from vla_eval.serving.batching import Batcher, Inference, PolicyFailure
 from vla_eval.serving.metrics import ServerMetrics
 
@@ -20,7 +21,7 @@ SECONDS = 10.0
 
 @contextlib.contextmanager
 def batching(policy: Any, *, n_rows: int = 4) -> Iterator[Batcher]:
-    batcher = Batcher(policy, n_rows=n_rows, metrics=ServerMetrics())
+    batcher = Batcher(policy, n_rows=n_rows, action_dims=ACTION_NAMES, metrics=ServerMetrics())
     try:
         yield batcher
     finally:
@@ -156,7 +157,7 @@ class TestErrors:
 
 def test_closing_finishes_the_pass_under_way_and_no_other() -> None:
     policy = CountingPolicy()
-    batcher = Batcher(policy, n_rows=4, metrics=ServerMetrics())
+    batcher = Batcher(policy, n_rows=4, action_dims=ACTION_NAMES, metrics=ServerMetrics())
     start = begin(batcher, 0)
     policy.hold.clear()
     running, waiting = infer(batcher, start), infer(batcher, start, step=1)

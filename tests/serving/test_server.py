@@ -14,6 +14,7 @@ from websockets.typing import Origin
 
 from tests.serving.served_policies import CHUNK_SIZE, CountingPolicy, Running, frame, host, serving
 from tests.waiting import wait_until
+from vla_eval.serving import sessions
 from vla_eval.serving.server import PolicyServer, ServeError, ServerOptions
 from vla_eval.wire.codec import packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata
@@ -126,6 +127,24 @@ class TestSessions:
             client.ask(**frame(session_id="s"))
             wait_until(lambda: policy.forgotten == [0])
             assert "'s' was dropped" in client.ask(**frame(session_id="s"))
+
+    def test_a_client_with_too_many_sessions_loses_its_own_and_nobody_elses(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sessions, "MAX_SESSIONS_OF_CONNECTION", 2)
+        policy = CountingPolicy()
+        with serving(policy) as server:
+            other, greedy = Client(server), Client(server)
+            other.ask(**frame(session_id="s"))
+            for n in range(10):
+                greedy.ask(**frame(session_id=f"s{n}"))
+            assert values(other.ask(**frame(session_id="s"))) == (0, 1, 2)
+            assert policy.forgotten == [1, 2] * 4
+            assert "'s7' was dropped, since it was the idlest of more than 2" in greedy.ask(
+                **frame(session_id="s7")
+            )
+            assert greedy.close_code() == 1011
+            assert values(other.ask(**frame(session_id="s"))) == (0, 2, 3)
 
 
 class TestErrors:

@@ -13,6 +13,8 @@ from vla_eval.serving.sessions import Session, SessionTable
 from vla_eval.specs import PolicySpec
 from vla_eval.tasks.interface import env_spec
 
+LIMITS = ("MAX_SESSIONS_OF_CONNECTION", "MAX_SESSIONS_OF_ADDRESS", "MAX_SESSIONS")
+
 
 def reader(*, end_effector: bool = False, states: tuple[str, ...] = ("qpos",)) -> ObservationReader:
     spec = PolicySpec(name="any", reads="last", cameras=("base_camera",), states=states, chunk_size=1)
@@ -26,17 +28,27 @@ class Clock:
         return self.seconds
 
 
-def table(*, reads: Literal["last", "every"] = "every", n_rows: int = 2, clock: Any = None) -> SessionTable:
-    return SessionTable(reader(), reads=reads, n_rows=n_rows, task="any", clock=clock or Clock())
+class Table(SessionTable):
+    """Notes which slots are to be forgotten."""
+
+    def __init__(self, **options: Any) -> None:
+        self.forgotten: list[int] = []
+        super().__init__(reader(), task="any", forget=self.forgotten.append, **options)
+
+
+def table(*, reads: Literal["last", "every"] = "every", n_rows: int = 2, clock: Any = None) -> Table:
+    return Table(reads=reads, n_rows=n_rows, clock=clock or Clock())
 
 
 def request(**fields: Any) -> dict[str, Any]:
     return frame(**{"observation/image": np.zeros((128, 128, 3), np.uint8), **fields})
 
 
-def begun(sessions: SessionTable, name: str = "s", connection: int = 0, **fields: Any) -> Session:
+def begun(
+    sessions: SessionTable, name: str = "s", connection: int = 0, address: str = "here", **fields: Any
+) -> Session:
     message = request(session_id=name, endpoint="reset", **fields)
-    session = sessions.session(connection, message)
+    session = sessions.session(connection, message, address=address)
     sessions.begin(session, message)
     return session
 
@@ -45,7 +57,8 @@ class TestSlotsAndRows:
     def test_every_session_has_a_slot_of_its_own_and_a_freed_one_is_used_again(self) -> None:
         table_ = table()
         assert [begun(table_, name, connection=n % 2).slot for n, name in enumerate("abc")] == [0, 1, 2]
-        assert table_.drop_connection(1) == [1]
+        table_.drop_connection(1)
+        assert table_.forgotten == [1]
         assert begun(table_, "d").slot == 1
 
     def test_a_session_without_a_row_gets_the_one_with_the_fewest(self) -> None:
@@ -72,7 +85,7 @@ class TestSlotsAndRows:
     def test_a_wrong_field_is_refused(self, fields: dict[str, Any], message: str) -> None:
         table_, wrong = table(), request(endpoint="reset", **fields)
         with pytest.raises(RequestError, match=message):
-            table_.begin(table_.session(0, wrong), wrong)
+            table_.begin(table_.session(0, wrong, address="here"), wrong)
 
 
 class TestFrames:
@@ -122,7 +135,7 @@ class TestFrames:
 class TestEpisodesWithoutReset:
     def test_the_first_request_and_another_instruction_begin_an_episode(self) -> None:
         table_ = table()
-        session = table_.session(0, request())
+        session = table_.session(0, request(), address="here")
         assert table_.begins(session, request())
         table_.begin(session, request())
         assert not table_.begins(session, request())
@@ -131,7 +144,7 @@ class TestEpisodesWithoutReset:
     def test_an_episode_that_the_server_lost_is_not_continued(self) -> None:
         table_ = table()
         with pytest.raises(RequestError, match="step 8 of an episode that the server does not have"):
-            table_.begins(table_.session(0, request()), request(step=8))
+            table_.begins(table_.session(0, request(), address="here"), request(step=8))
 
     def test_another_instruction_in_the_middle_of_an_episode_is_refused(self) -> None:
         table_ = table()
@@ -146,17 +159,73 @@ class TestLimits:
         idle, busy = begun(table_, "idle"), begun(table_, "busy")
         busy.n_pending = 1
         clock.seconds = 601.0
-        assert table_.drop_idle(600.0) == [idle.slot]
-        with pytest.raises(RequestError, match="'idle' was dropped"):
-            table_.session(0, request(session_id="idle"))
+        table_.drop_idle(600.0)
+        assert table_.forgotten == [idle.slot]
+        with pytest.raises(RequestError, match="'idle' was dropped, since no message came for too long"):
+            table_.session(0, request(session_id="idle"), address="here")
         assert begun(table_, "idle").episode is not None
 
-    def test_the_number_of_sessions_is_limited(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(sessions, "MAX_SESSIONS", 1)
+    @pytest.mark.parametrize("limit", LIMITS)
+    def test_one_session_too_many_takes_the_place_of_the_idlest_of_its_connection(
+        self, limit: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sessions, limit, 4)
+        clock = Clock()
+        table_ = table(clock=clock)
+        others = [] if limit == "MAX_SESSIONS_OF_CONNECTION" else [begun(table_, "other", connection=1)]
+        mine = []
+        for name in "abcd"[len(others) :]:
+            clock.seconds += 1
+            mine.append(begun(table_, name))
+        mine[0].n_pending = 1  # the oldest, but not idle
+        clock.seconds += 1
+        new = begun(table_, "new")
+        assert table_.forgotten == [mine[1].slot] == [new.slot] and len(table_) == 4
+        with pytest.raises(
+            RequestError, match=f"{mine[1].name!r} was dropped, since it was the idlest of more"
+        ):
+            table_.session(0, request(session_id=mine[1].name), address="here")
+        for one in (mine[0], *mine[2:], new, *others):
+            message = request(session_id=one.name)
+            assert table_.session(one.connection, message, address="here") is one
+
+    @pytest.mark.parametrize("limit", LIMITS)
+    def test_a_session_too_many_is_refused_if_none_of_its_connection_is_idle(
+        self, limit: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sessions, limit, 1)
         table_ = table()
-        begun(table_, "a")
-        with pytest.raises(RequestError, match="at most 1 sessions"):
+        begun(table_, "a").n_pending = 1
+        with pytest.raises(RequestError, match="at most 1 sessions of a"):
             begun(table_, "b")
+        if limit != "MAX_SESSIONS_OF_CONNECTION":
+            with pytest.raises(RequestError, match="at most 1 sessions of a"):
+                begun(table_, "b", connection=1)  # whose own is idle or not, it has none
+        assert table_.forgotten == [] and len(table_) == 1
+
+    def test_no_machine_takes_the_place_of_others_however_many_connections_it_opens(self) -> None:
+        table_ = table()
+        other = begun(table_, "other", connection=-1, address="there")
+        with pytest.raises(RequestError, match="at most 3072 sessions of a machine"):
+            for connection in range(sessions.MAX_SESSIONS):
+                table_.session(connection, request(), address="here")
+        for n in range(sessions.MAX_SESSIONS):  # one that has a connection keeps to its own
+            begun(table_, f"s{n}", connection=0)
+        assert len(table_) == sessions.MAX_SESSIONS_OF_ADDRESS + 1
+        assert other.slot not in table_.forgotten
+        for n in range(sessions.MAX_SESSIONS - len(table_)):
+            table_.session(10_000 + n, request(), address="there")
+        assert other.slot not in table_.forgotten and len(table_) == sessions.MAX_SESSIONS
+
+    def test_the_names_of_dropped_sessions_are_limited(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sessions, "MAX_SESSIONS_OF_CONNECTION", 1)
+        monkeypatch.setattr(sessions, "MAX_DROPPED_NAMES", 3)
+        table_ = table()
+        for n in range(9):
+            begun(table_, f"s{n}")
+        assert sum(len(names) for names in table_._dropped.values()) == 3
+        table_.drop_connection(0)
+        assert not table_._dropped and len(table_) == 0
 
 
 class TestObservations:
@@ -192,6 +261,7 @@ class TestObservations:
         read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
         assert read.state_layouts == STATE_NAMES
         numbers = np.arange(25, dtype=np.float64)
+        numbers[3:7] = 0, 1, 0, 0  # the quaternion
         state = read.read(request(**{"observation/state": numbers}), step=0).state
         assert {name: (values[0], len(values)) for name, values in state.items()} == {
             "tcp_pose": (0, 7),
@@ -201,8 +271,9 @@ class TestObservations:
         assert all(values.dtype == np.float32 for values in state.values())
 
     def test_ten_numbers_are_the_end_effector_for_a_policy_that_reads_it(self) -> None:
-        ten = request(**{"observation/state": np.arange(10, dtype=np.float32)})
+        numbers = np.array([1, 2, 3, 0, 1, 0, 1, 0, 0, 4], dtype=np.float32)
+        ten = request(**{"observation/state": numbers})
         read = reader(states=("tcp_pose", "qpos", "qvel"), end_effector=True)
-        assert read.read(ten, step=0).state["eef"].tolist() == list(range(10))
+        assert read.read(ten, step=0).state["eef"].tolist() == numbers.tolist()
         with pytest.raises(RequestError, match=r"expected 25 numbers \(joints\), found 10"):
             reader(states=("tcp_pose", "qpos", "qvel")).read(ten, step=0)

@@ -50,6 +50,7 @@ def test_a_policy_with_memory_by_session_passes_and_the_check_says_what_it_tried
     assert "Two sessions side by side on one connection get what each gets alone." in met
     assert "Two sessions side by side on two connections get what each gets alone." in met
     assert "Refused with a text: an image of another shape." in met
+    assert "Refused with a text: a state with a number that is infinite." in met
     assert met[-1] == "After refused messages the server answers as before."
 
 
@@ -70,6 +71,22 @@ def test_a_function_passes() -> None:
 )
 def test_a_fault_is_named(policy: Any, options: dict[str, Any], message: str) -> None:
     with served(policy, MEMORY_SPEC, **options) as url, pytest.raises(ConformanceError, match=message):
+        check_remote(url)
+
+
+def test_a_server_that_takes_a_state_of_nan_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unchecked(value: Any, _names: Any) -> Any:
+        if np.shape(value) != (25,):
+            raise ValueError("another shape")
+        return value
+
+    monkeypatch.setattr("mikasa_vla_client.spec.as_state", unchecked)
+    with (
+        served(Sums(), MEMORY_SPEC) as url,
+        pytest.raises(
+            ConformanceError, match="Refused with a text: a state with a number that is not a number"
+        ),
+    ):
         check_remote(url)
 
 

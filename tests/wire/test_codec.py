@@ -82,15 +82,21 @@ def test_plain_data_comes_back_with_tuples_as_lists() -> None:
 
 @pytest.mark.parametrize(
     "array",
-    [np.array([object()]), np.zeros(1, dtype="i4,f4"), np.zeros(1, complex), np.zeros(1, "M8[s]")],
-    ids=["object", "record", "complex", "time"],
+    [
+        np.array([object()]),
+        np.zeros(1, dtype="i4,f4"),
+        np.zeros(1, complex),
+        np.zeros(1, "M8[s]"),
+        np.zeros(1, np.longdouble),
+    ],
+    ids=["object", "record", "complex", "time", "longdouble"],
 )
 def test_other_types_of_arrays_are_not_written(array: np.ndarray) -> None:
     with pytest.raises(CodecError, match="refused"):
         packb({"x": array})
 
 
-@pytest.mark.parametrize("dtype", ["|O", "|O8", "O", "<c8", "|V4", "<M8", "<m8"])
+@pytest.mark.parametrize("dtype", ["|O", "|O8", "O", "<c8", "|V4", "<M8", "<m8", "<f16", "g"])
 def test_other_types_of_arrays_are_not_read(dtype: str) -> None:
     with pytest.raises(CodecError, match="refused"):
         unpackb(array_map(dtype=dtype))

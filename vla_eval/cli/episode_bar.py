@@ -7,6 +7,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from vla_eval.plain_text import printable
+
 FIRST_LINE_SECONDS = 30.0
 LINE_EVERY_SECONDS = 60.0
 
@@ -39,7 +41,7 @@ class EpisodeBar:
             self._bar = tqdm(
                 total=n_total,
                 initial=n_done,
-                desc=title or None,
+                desc=printable(title) or None,  # tqdm adds codes of its own to what has some
                 unit="ep",
                 file=sys.stderr,
                 dynamic_ncols=True,
@@ -49,7 +51,7 @@ class EpisodeBar:
         """Say what is being done before the first episode ends."""
         self._doing = text
         if self._bar is not None and self._n_done == self._n_before:
-            self._bar.set_postfix_str(text)
+            self._bar.set_postfix_str(printable(text))
 
     def advance(self, *, n_done: int, n_steps: int = 0, note: str = "") -> None:
         """Count; `n_steps` control steps were executed for it, and `note` says how it goes."""
@@ -94,7 +96,8 @@ class EpisodeBar:
 
     def _redraw(self) -> None:
         assert self._bar is not None  # the callers look
-        self._bar.set_postfix_str(", ".join(filter(None, (self._steps(), self._note, self._load))))
+        text = ", ".join(filter(None, (self._steps(), self._note, self._load)))
+        self._bar.set_postfix_str(printable(text))
 
     def _steps(self) -> str:
         n_steps = self._n_steps + self._n_running_steps

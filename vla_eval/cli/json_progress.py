@@ -14,6 +14,7 @@ from typing import Any
 
 from vla_eval.evaluation.dry_run import horizon_steps
 from vla_eval.evaluation.plan import Plan
+from vla_eval.plain_text import printable
 from vla_eval.records import EpisodeKey, EpisodeRecord
 from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load
@@ -51,7 +52,7 @@ class JsonLines:
         if self.descriptor is None:
             return
         line = json.dumps({"format_version": FORMAT_VERSION, "event": event, **fields}, allow_nan=False)
-        data = f"{line}\n".encode()
+        data = f"{printable(line)}\n".encode()  # of the control characters, JSON leaves one (DEL)
         try:
             while data:
                 data = data[os.write(self.descriptor, data) :]

@@ -1,17 +1,20 @@
 """Standard output and error for the command line, whatever they are connected to, or if they are closed.
 
 Standard error carries messages: if it cannot be written, the run does not stop. Standard output carries the
-result: if it cannot be written, the command reports that and fails.
+result: if it cannot be written, the command reports that and fails. Both print no control characters.
 """
 
 import contextlib
 import os
 import sys
+import traceback
 from collections.abc import Iterator
+from types import TracebackType
 from typing import Any, TextIO, cast
 
 from vla_eval.cli.screen import folded, message_width
 from vla_eval.errors import VlaEvalError
+from vla_eval.plain_text import PlainStream
 
 STDOUT_FD, STDERR_FD = 1, 2
 
@@ -20,22 +23,14 @@ class UnwritableOutputError(VlaEvalError):
     """Standard output cannot be written."""
 
 
-class _Stream:
-    """A text stream of which `write` and `flush` meet an `OSError` in their own way."""
+class _Stream(PlainStream):
+    """A plain stream of which `write` and `flush` meet an `OSError` in their own way."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:  # Any: whatever a text stream has
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        """Write the text."""
+    def _put(self, text: str) -> None:
         try:
-            return self._stream.write(text)
+            self._stream.write(text)
         except OSError as exc:
             self._meet(exc)
-        return len(text)
 
     def flush(self) -> None:
         """Pass on what was written."""
@@ -51,11 +46,9 @@ class _Stream:
 class _Messages(_Stream):
     """Standard error; on a terminal, sentences are folded to its width."""
 
-    def write(self, text: str) -> int:
-        """Write the text."""
+    def _put(self, text: str) -> None:
         width = message_width(self._stream)
-        super().write(text if width is None or "\r" in text else folded(text, width))
-        return len(text)
+        super()._put(text if width is None or "\r" in text else folded(text, width))
 
 
 class _Output(_Stream):
@@ -80,10 +73,19 @@ def standard_streams() -> Iterator[None]:
     sys.stdout, sys.stderr = cast(TextIO, _Output(out)), cast(TextIO, _Messages(error))
     try:
         yield
+    except Exception:
+        sys.excepthook = _print_traceback  # which Python calls when the streams are its own again
+        raise
     finally:
         sys.stdout, sys.stderr = before
         for stream, previous in zip((out, error), errors, strict=True):
             _leave(stream, previous)
+
+
+def _print_traceback(kind: type[BaseException], exc: BaseException, trace: TracebackType | None) -> None:
+    """Print a traceback as Python does, without the control characters of its message."""
+    if sys.stderr is not None:
+        PlainStream(sys.stderr).writelines(traceback.format_exception(kind, exc, trace))
 
 
 def _fill_descriptors() -> None:

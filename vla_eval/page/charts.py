@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from vla_eval.page.svg import PALETTE, PNG_DPI, inline_svg, own_style, text_width_px
+from vla_eval.plain_text import printable
 
 COLORS = tuple(PALETTE[name] for name in ("c0", "c1", "c2", "c3", "c4", "c5", "ink"))
 MARKERS = (("o", 8), ("s", 7.5), ("^", 9), ("D", 7), ("X", 9), ("v", 9), ("P", 9))  # with their sizes, px
@@ -112,11 +113,11 @@ def forest(
 
 def labels_width_px(labels: Iterable[str]) -> float:
     """Return the width of the longest label."""
-    return max((text_width_px(_printable(label)) for label in labels), default=0)
+    return max((text_width_px(printable(label)) for label in labels), default=0)
 
 
 def _forest(bars: Sequence[Bar], width_px: float, label_px: float) -> Figure:
-    labels = [_printable(bar.label) for bar in bars]
+    labels = [printable(bar.label) for bar in bars]
     left = 16 + max(label_px, labels_width_px(labels))
     figure, axes = _plot(width_px, ROW_HEIGHT_PX * len(bars), left=left, right=20, top=4, bottom=26)
     axes.set(xlim=(0, 1), ylim=(len(bars) - 0.5, -0.5))
@@ -178,7 +179,7 @@ def curves_png(
         handles = [Line2D([], [], **_line(one), label=one.name) for one in named]
         # Beside the axes: with several series no corner is free.
         axes.legend(handles=handles, frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
-        axes.set_title(_printable(title), pad=10)
+        axes.set_title(printable(title), pad=10)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=PNG_DPI, bbox_inches="tight", metadata={"Software": None})
         return file.getvalue()
@@ -293,8 +294,3 @@ def _color(number: int) -> str:
 
 def _dashes(number: int) -> tuple[float, ...] | None:
     return DASHES[number % len(DASHES)] or None
-
-
-def _printable(text: str) -> str:
-    """Return text in which characters that XML cannot hold, such as control characters, are replaced."""
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

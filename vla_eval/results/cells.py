@@ -7,7 +7,7 @@ import html
 import re
 from collections.abc import Sequence
 
-from vla_eval.errors import one_line
+from vla_eval.plain_text import printable
 
 FORMULA_SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n")
 """First characters of a cell that a spreadsheet reads as a formula. Source: https://owasp.org/www-community/attacks/CSV_Injection"""
@@ -21,12 +21,12 @@ def csv_cell(value: object) -> object:
     if not isinstance(value, str):
         return value
     is_formula = value.startswith(FORMULA_SIGNS) and not _is_number(value)
-    return f"'{one_line(value)}" if is_formula else one_line(value)
+    return f"'{printable(value)}" if is_formula else printable(value)
 
 
 def markdown_text(text: str) -> str:
     """Return one line of Markdown without HTML, for our own sentences around names."""
-    return _TAG.sub("&lt;", one_line(text))
+    return _TAG.sub("&lt;", printable(text))
 
 
 def markdown_cell(text: str) -> str:
@@ -39,7 +39,7 @@ def markdown_cell(text: str) -> str:
 
 def markdown_code(text: str) -> str:
     """Return a code span of Markdown, for a cell too: a text of backticks cannot end it."""
-    line = one_line(text).replace("|", "\\|")
+    line = printable(text).replace("|", "\\|")
     fence = "`" * (_longest_run(line) + 1)
     space = " " if "`" in line else ""
     return f"{fence}{space}{line}{space}{fence}"
@@ -54,7 +54,7 @@ def markdown_block(text: str, language: str) -> str:
 
 def html_text(text: str) -> str:
     """Return one line of HTML: escaped, names in backticks as code."""
-    parts = [html.escape(part) for part in re.split("`([^`]*)`", one_line(text))]
+    parts = [html.escape(part) for part in re.split("`([^`]*)`", printable(text))]
     return "".join(f"<code>{part}</code>" if i % 2 else part for i, part in enumerate(parts))
 
 
@@ -64,7 +64,7 @@ def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_number: 
 
     def line(cells: Sequence[str], tag: str) -> str:
         whole = (
-            f"<{tag}{style}>{html.escape(one_line(cell))}</{tag}>"
+            f"<{tag}{style}>{html.escape(printable(cell))}</{tag}>"
             for cell, style in zip(cells, styles, strict=True)
         )
         return f"<tr>{''.join(whole)}</tr>"

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 
-from vla_eval.errors import one_line
+from vla_eval.plain_text import printable
 
 _LATEX = str.maketrans(
     {
@@ -90,6 +90,6 @@ def latex_first(cell: str) -> str:
 def latex_text(text: str) -> str:
     """Return text for LaTeX: its own characters escaped, names in backticks as code."""
     parts = [
-        part.translate(_LATEX) for part in re.split("`([^`]*)`", one_line(text))
+        part.translate(_LATEX) for part in re.split("`([^`]*)`", printable(text))
     ]  # every second one was code
     return "".join(f"\\texttt{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

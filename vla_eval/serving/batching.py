@@ -9,13 +9,14 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, ForgettingPolicy, ObservationWindow, Policy
-from vla_eval.errors import VlaEvalError
+from vla_eval.episode_log import chunk_problem
+from vla_eval.errors import InvalidActionError, VlaEvalError
 from vla_eval.seeding import seed_global_generators
 from vla_eval.serving.metrics import ServerMetrics
 from vla_eval.workers.messages import describe_error
@@ -78,6 +79,7 @@ class Batcher:
     Args:
         policy: nobody else may call it any more.
         n_rows: rows of a pass.
+        action_dims: names of an action's numbers.
         metrics: counts what is done.
         clock: seconds; not of a calendar.
     """
@@ -87,10 +89,12 @@ class Batcher:
         policy: Policy,
         *,
         n_rows: int,
+        action_dims: Sequence[str],
         metrics: ServerMetrics,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._policy, self._n_rows, self._metrics, self._clock = policy, n_rows, metrics, clock
+        self._action_dims = action_dims
         self._queue: deque[_Request] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
@@ -110,15 +114,23 @@ class Batcher:
         """Have the policy forget a slot, after what was asked for it before."""
         self._put(_Forget(slot=slot))
 
-    def close(self) -> None:
-        """Finish the pass under way, cancel what has not begun, and end the thread."""
+    def close(self, *, seconds: float | None = None) -> bool:
+        """Finish the pass under way, cancel what has not begun, and end the thread.
+
+        Args:
+            seconds: how long the pass may take until its thread is left alone; None: as long as it takes.
+
+        Returns:
+            Whether the thread has ended.
+        """
         with self._changed:
             self._is_closed = True
             waiting, self._queue = self._queue, deque()
             self._changed.notify()
         for request in waiting:
             request.done.cancel()
-        self._thread.join()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def _put[R: (_Begin, _Infer, _Forget)](self, request: R) -> R:
         with self._changed:
@@ -189,7 +201,11 @@ class Batcher:
         waits = [begun - request.asked_at for request in due]
         self._metrics.count_pass(n_requests=len(due), infer_seconds=seconds, queue_seconds=sum(waits))
         for request, chunk, wait in zip(due, chunks, waits, strict=True):
-            request.done.set_result(Inference(chunk, wait, seconds))
+            problem = chunk_problem(chunk, chunk_size=self._policy.spec.chunk_size, dims=self._action_dims)
+            if problem is None:
+                request.done.set_result(Inference(chunk, wait, seconds))
+            else:  # not asked again: the policy has seen the frames
+                request.done.set_exception(self._failure(InvalidActionError(problem), "inference"))
 
     def _ask(self, due: list[_Infer]) -> list[ActionChunk]:
         start, step = due[0].start, due[0].window.last.step

@@ -60,6 +60,7 @@ class ClientConnection:
 
     def __init__(self, socket: ServerConnection, number: int, service: Service) -> None:
         self._socket, self._number, self._service = socket, number, service
+        self._address = str((socket.remote_address or ("",))[0])  # None: it is gone already
         self._replies: set[asyncio.Task[None]] = set()
         self._previous_seconds: float | None = None
         self._has_failed = False
@@ -78,8 +79,7 @@ class ClientConnection:
         finally:
             for reply in self._replies:
                 reply.cancel()
-            for slot in self._service.sessions.drop_connection(self._number):
-                self._service.batcher.forget(slot)
+            self._service.sessions.drop_connection(self._number)
 
     async def finish_replies(self, seconds: float) -> None:
         """Wait until what the policy has answered is sent; for a server that stops.
@@ -106,7 +106,7 @@ class ClientConnection:
         if len(self._replies) >= MAX_PENDING:
             raise RequestError(f"expected at most {MAX_PENDING} requests without a reply.")
         sessions, batcher = self._service.sessions, self._service.batcher
-        session = sessions.session(self._number, request)
+        session = sessions.session(self._number, request, address=self._address)
         if endpoint == "reset":
             start = sessions.begin(session, request)
             self._answer_later(session, request, batcher.begin(start), begun)

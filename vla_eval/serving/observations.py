@@ -15,6 +15,7 @@ from vla_eval.features import PROPRIO_STATES, STATE_NAMES
 from vla_eval.specs import EnvSpec, PolicySpec
 from vla_eval.strict_json import shown
 from vla_eval.wire.metadata import CameraImage
+from vla_eval.wire.numbers import FLOAT_TYPES, NumbersError, as_state
 
 CAMERA_WIRE_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/wrist_image"}
 """Camera -> key of its image. Source: openpi's policy for LIBERO,
@@ -72,22 +73,23 @@ class ObservationReader:
         )
 
     def _read_state(self, request: Mapping[str, Any]) -> dict[str, FloatArray]:
-        sizes = {name: len(dims) for name, dims in self.state_layouts.items()}
-        expected = " or ".join(f"{size} numbers ({name})" for name, size in sizes.items())
+        layouts = {len(names): (kind, names) for kind, names in self.state_layouts.items()}
+        expected = " or ".join(f"{size} numbers ({kind})" for size, (kind, _) in layouts.items())
         vector = _required(request, STATE_WIRE_KEY, expected)
-        if not isinstance(vector, np.ndarray) or vector.dtype.kind != "f" or vector.ndim != 1:
+        is_vector = isinstance(vector, np.ndarray) and vector.ndim == 1
+        if not is_vector or vector.dtype.name not in FLOAT_TYPES:
             raise RequestError(
                 f"'{STATE_WIRE_KEY}': expected an array of {expected}, float32; found {_described(vector)}."
             )
-        if not np.isfinite(vector).all():
-            raise RequestError(
-                f"'{STATE_WIRE_KEY}': expected finite numbers, found {shown(vector.tolist())}."
-            )
-        values = vector.astype(np.float32)
-        if self.end_effector and len(values) == sizes["eef"]:
+        if len(vector) not in layouts:
+            raise RequestError(f"'{STATE_WIRE_KEY}': expected {expected}, found {len(vector)} numbers.")
+        kind, names = layouts[len(vector)]
+        try:
+            values = as_state(vector, names)
+        except NumbersError as exc:
+            raise RequestError(f"'{STATE_WIRE_KEY}': {exc}.") from exc
+        if self.end_effector and kind == "eef":
             return {"eef": values}
-        if len(values) != sum(len(dims) for dims in self.states.values()):
-            raise RequestError(f"'{STATE_WIRE_KEY}': expected {expected}, found {len(values)} numbers.")
         ends = np.cumsum([len(dims) for dims in self.states.values()])[:-1]
         return {name: part.copy() for name, part in zip(self.states, np.split(values, ends), strict=True)}
 

@@ -6,11 +6,14 @@ close healthy connections of a client that is busy simulating.
 
 import asyncio
 import contextlib
-import hmac
+import faulthandler
+import functools
 import http
 import itertools
 import logging
+import os
 import signal
+import sys
 import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
@@ -27,13 +30,20 @@ from vla_eval.serving.host import HostedPolicy
 from vla_eval.serving.metrics import CONTENT_TYPE, ServerMetrics
 from vla_eval.serving.sessions import SessionTable
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES
+from vla_eval.wire.keys import HEADER, explanation, key_problem, refused
 
 MAX_PORT = 65_535
 GOING_AWAY = 1001  # close code of RFC 6455
-CLOSE_SECONDS = 5.0  # for a client to take its reply, and then to answer the closing of its connection
+# Of a stop, one after the other; whoever stops a service waits 10 s before it kills.
+PASS_SECONDS = 4.0  # for the pass under way; then the policy is left alone
+REPLY_SECONDS = 1.5  # for clients to take their replies
+CLOSE_SECONDS = 1.5  # for clients to answer the closing of their connections; then they are cut
+END_SECONDS = 9.0  # for all of it and the end of the process, which is then ended as it is
 LOG_SECONDS = 60.0
 IDLE_CHECKS = 4  # per idle time
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STDERR_FD = 2
+EXIT_UNANSWERED = 1  # of a server whose policy was still computing when it ended
 
 logger = logging.getLogger(__name__)
 
@@ -63,8 +73,16 @@ class ServerOptions:
     log_seconds: float = LOG_SECONDS
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges, and the key.
+
+        Raises:
+            RecipeError: a number is out of range.
+            ServeError: the key cannot be sent in a header.
+        """
         check_bounds(self, {"port": (0, MAX_PORT), "idle_seconds": (0.001, MAX_SECONDS)})
+        problem = None if self.api_key is None else key_problem(self.api_key)
+        if problem is not None:
+            raise ServeError(f"the API key: {problem}. Choose another key.")
 
 
 class PolicyServer:
@@ -81,16 +99,29 @@ class PolicyServer:
     ) -> None:
         self._hosted, self._options = hosted, options
         self._metrics = metrics or ServerMetrics()
-        self._sessions = SessionTable(
-            hosted.reader, reads=hosted.policy.spec.reads, n_rows=hosted.n_rows, task=hosted.task
+        self._batcher = Batcher(
+            hosted.policy,
+            n_rows=hosted.n_rows,
+            action_dims=hosted.metadata.action_dims or (),
+            metrics=self._metrics,
         )
-        self._batcher = Batcher(hosted.policy, n_rows=hosted.n_rows, metrics=self._metrics)
+        self._sessions = SessionTable(
+            hosted.reader,
+            reads=hosted.policy.spec.reads,
+            n_rows=hosted.n_rows,
+            task=hosted.task,
+            forget=self._batcher.forget,
+        )
         self._service = Service(sessions=self._sessions, batcher=self._batcher, debug=options.debug)
         self._connections: set[ClientConnection] = set()
         self._numbers = itertools.count()
+        self._is_stopping = False
 
-    async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> None:
+    async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> bool:
         """Serve until `stop` is set; then finish the pass under way, and close all connections.
+
+        Returns:
+            Whether the policy has answered; if not, its thread still runs.
 
         Args:
             stop: set by the caller to end.
@@ -114,7 +145,8 @@ class PolicyServer:
         finally:
             for task in tasks:
                 task.cancel()
-            await self._close(server)
+            has_ended = await self._close(server)
+        return has_ended
 
     def _listen(self) -> Awaitable[Server]:
         return serve(
@@ -129,11 +161,17 @@ class PolicyServer:
             server_header=None,
         )
 
-    async def _close(self, server: Server) -> None:
-        await asyncio.get_running_loop().run_in_executor(None, self._batcher.close)
-        await asyncio.gather(*(connection.finish_replies(CLOSE_SECONDS) for connection in self._connections))
+    async def _close(self, server: Server) -> bool:
+        self._is_stopping = True
+        close = functools.partial(self._batcher.close, seconds=PASS_SECONDS)
+        has_ended = await asyncio.get_running_loop().run_in_executor(None, close)
+        if not has_ended:
+            logger.warning("the policy has not answered for %g s: ending without its reply", PASS_SECONDS)
+        await asyncio.gather(*(connection.finish_replies(REPLY_SECONDS) for connection in self._connections))
         server.close(code=GOING_AWAY, reason="the server is stopping")
-        await server.wait_closed()
+        with contextlib.suppress(TimeoutError):  # clients that read nothing are cut with the process
+            await asyncio.wait_for(server.wait_closed(), 2 * CLOSE_SECONDS)
+        return has_ended
 
     async def _serve_client(self, socket: ServerConnection) -> None:
         connection = ClientConnection(socket, next(self._numbers), self._service)
@@ -147,17 +185,16 @@ class PolicyServer:
         """Answer what is no WebSocket, refuse browsers and clients without the key; None: a WebSocket."""
         if request.path == "/healthz":
             return socket.respond(http.HTTPStatus.OK, "OK\n")
+        if self._is_stopping:
+            return socket.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "the server is stopping\n")
         # Browsers send it: any page that is open could talk to a server on the loopback address.
         if "Origin" in request.headers:
             return socket.respond(
                 http.HTTPStatus.FORBIDDEN, "expected a policy client, found a page in a browser (Origin)\n"
             )
-        key = self._options.api_key
-        given = request.headers.get("Authorization", "")
-        if key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {key}".encode()):
-            return socket.respond(
-                http.HTTPStatus.UNAUTHORIZED, "expected the header 'Authorization: Api-Key KEY'\n"
-            )
+        status = refused(request.headers.get_all(HEADER), self._options.api_key)
+        if status is not None:
+            return socket.respond(status, explanation(status))
         if request.path == "/metrics":
             body = self._metrics.prometheus(
                 n_sessions=len(self._sessions), n_connections=len(self._connections)
@@ -174,8 +211,7 @@ class PolicyServer:
     async def _drop_idle(self) -> None:
         while True:
             await asyncio.sleep(self._options.idle_seconds / IDLE_CHECKS)
-            for slot in self._sessions.drop_idle(self._options.idle_seconds):
-                self._batcher.forget(slot)
+            self._sessions.drop_idle(self._options.idle_seconds)
 
 
 def run_server(
@@ -188,6 +224,8 @@ def run_server(
 ) -> None:
     """Serve until SIGINT or SIGTERM; a second one ends the process at once.
 
+    Within `END_SECONDS` of the first one the process has ended, whatever the policy does.
+
     Args:
         hosted: the policy.
         options: where and how.
@@ -199,11 +237,13 @@ def run_server(
         ServeError: the address cannot be listened on.
     """
 
-    async def serve_until_stopped() -> None:
+    async def serve_until_stopped() -> bool:
         loop, stop = asyncio.get_running_loop(), asyncio.Event()
 
         def on_signal() -> None:
             stop.set()
+            # In C: ends the process even if a policy, or the end of a library, blocks Python.
+            faulthandler.dump_traceback_later(END_SECONDS, exit=True, file=STDERR_FD)
             for number in STOP_SIGNALS:
                 loop.remove_signal_handler(number)
 
@@ -218,6 +258,11 @@ def run_server(
                     loop.call_soon_threadsafe(stop.set)
 
             threading.Thread(target=watch, name="end of serving", daemon=True).start()
-        await PolicyServer(hosted, options, metrics).run(stop, ready)
+        return await PolicyServer(hosted, options, metrics).run(stop, ready)
 
-    asyncio.run(serve_until_stopped())
+    has_ended = asyncio.run(serve_until_stopped())
+    if not has_ended:  # Python would wait for its thread, or for threads that it has started
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(EXIT_UNANSWERED)

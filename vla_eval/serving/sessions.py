@@ -15,9 +15,14 @@ from vla_eval.strict_json import shown
 
 MAX_UNREAD_FRAMES = 1024  # 100 MB of two cameras of 128 px
 MAX_SESSIONS = 4096
+MAX_SESSIONS_OF_CONNECTION = 1024  # as of `mikasa_vla_client`: a worker has one for each of its slots
+MAX_SESSIONS_OF_ADDRESS = 3072  # of all connections of one machine: others always find room for 1024
+MAX_DROPPED_NAMES = 4096  # of a connection, that are remembered for a message
 MAX_TEXT = 200  # characters of an id
 MAX_NUMBER = 2**63 - 1
 UNKNOWN_HORIZON_STEPS = 1_000_000  # for a client that does not say how long its episode is
+
+_Key = tuple[int, str | None]  # number of the connection, name within it
 
 
 @dataclass(slots=True, kw_only=True)
@@ -26,6 +31,7 @@ class Session:
 
     Attributes:
         connection: number of the connection that it belongs to.
+        address: of the machine that the connection comes from.
         name: its id within the connection; None: the connection itself.
         slot: where the policy keeps what it remembers of it.
         row: its row of a pass.
@@ -38,6 +44,7 @@ class Session:
     """
 
     connection: int
+    address: str
     name: str | None
     slot: int
     row: int
@@ -57,6 +64,7 @@ class SessionTable:
         reads: whether the policy is given every frame or only the last one.
         n_rows: rows of a pass.
         task: the task of an episode whose client names none.
+        forget: called with the slot of each session that is dropped.
         clock: seconds; not of a calendar.
     """
 
@@ -67,36 +75,44 @@ class SessionTable:
         reads: Literal["last", "every"],
         n_rows: int,
         task: str,
+        forget: Callable[[int], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._reader, self._reads, self._n_rows, self._task = reader, reads, n_rows, task
-        self._clock = clock
-        self._sessions: dict[tuple[int, str | None], Session] = {}
-        self._dropped: set[tuple[int, str | None]] = set()  # for being idle; until their next reset
+        self._forget, self._clock = forget, clock
+        self._sessions: dict[_Key, Session] = {}
+        # Connection -> names that were dropped and why, until their next reset.
+        self._dropped: dict[int, dict[str | None, str]] = {}
 
     def __len__(self) -> int:
         return len(self._sessions)
 
-    def session(self, connection: int, request: Mapping[str, Any]) -> Session:
+    def session(self, connection: int, request: Mapping[str, Any], *, address: str) -> Session:
         """Return the session of a request; a new one for an id that is new.
 
+        Args:
+            connection: number of the connection.
+            request: what it sent.
+            address: of the machine that the connection comes from.
+
         Raises:
-            RequestError: the id is no text, there are too many, or it was dropped for being idle.
+            RequestError: the id is no text, its session was dropped, or there are too many.
         """
         name = _text(request, "session_id")
         key = (connection, name)
-        if key in self._dropped and request.get("endpoint") != "reset":
+        dropped = self._dropped.get(connection, {})
+        if name in dropped and request.get("endpoint") != "reset":
             raise RequestError(
-                f"session {name!r} was dropped, since no message came for too long (--idle-seconds): the "
-                "policy has forgotten its episode. Begin a new one with 'reset'."
+                f"session {shown(name)} was dropped, since {dropped[name]}: the policy has forgotten its "
+                "episode. Begin a new one with 'reset'."
             )
-        self._dropped.discard(key)
+        dropped.pop(name, None)
         found = self._sessions.get(key)
         if found is None:
-            if len(self._sessions) >= MAX_SESSIONS:
-                raise RequestError(f"expected at most {MAX_SESSIONS} sessions at a time.")
+            self._make_room(connection, address)
             found = Session(
                 connection=connection,
+                address=address,
                 name=name,
                 slot=self._free_slot(),
                 row=self._emptiest_row(),
@@ -112,6 +128,7 @@ class SessionTable:
         Raises:
             RequestError: no instruction, or a field of another type or out of range.
         """
+        _number(request, "step")  # of a reset, it is only repeated in the reply
         row = _number(request, "row", most=self._n_rows - 1)
         session.row = session.row if row is None else row
         start = EpisodeStart(
@@ -171,24 +188,51 @@ class SessionTable:
         frames, session.frames = (*session.frames, newest), []
         return ObservationWindow(slot=session.slot, frames=frames)
 
-    def drop_connection(self, connection: int) -> list[int]:
-        """Drop the sessions of a connection that has ended; return their slots."""
-        self._dropped = {key for key in self._dropped if key[0] != connection}
-        return self._drop(key for key in list(self._sessions) if key[0] == connection)
+    def drop_connection(self, connection: int) -> None:
+        """Drop the sessions of a connection that has ended."""
+        self._drop([key for key in self._sessions if key[0] == connection], "its connection has ended")
+        self._dropped.pop(connection, None)
 
-    def drop_idle(self, seconds: float) -> list[int]:
-        """Drop the sessions without a message for so long and without a request under way; return slots."""
+    def drop_idle(self, seconds: float) -> None:
+        """Drop the sessions without a message for so long and without a request under way."""
         now = self._clock()
         idle = [
             key
             for key, session in self._sessions.items()
             if not session.n_pending and now - session.used_at > seconds
         ]
-        self._dropped.update(idle)
-        return self._drop(idle)
+        self._drop(idle, "no message came for too long (--idle-seconds)")
 
-    def _drop(self, keys: Iterable[tuple[int, str | None]]) -> list[int]:
-        return [self._sessions.pop(key).slot for key in keys]
+    def _make_room(self, connection: int, address: str) -> None:
+        """Drop a session of the same connection if one more would be too many; never one of another.
+
+        It is the one without a message for longest, of those without a request under way.
+
+        Raises:
+            RequestError: none of the connection is idle.
+        """
+        own = [key for key in self._sessions if key[0] == connection]
+        n_of_address = sum(session.address == address for session in self._sessions.values())
+        for n_sessions, limit, whose in (
+            (len(own), MAX_SESSIONS_OF_CONNECTION, "of a connection"),
+            (n_of_address, MAX_SESSIONS_OF_ADDRESS, "of a machine"),
+            (len(self._sessions), MAX_SESSIONS, "of a server"),
+        ):
+            if n_sessions >= limit:
+                idle = [key for key in own if not self._sessions[key].n_pending]
+                if not idle:
+                    raise RequestError(f"expected at most {limit} sessions {whose} at a time.")
+                oldest = min(idle, key=lambda key: self._sessions[key].used_at)
+                self._drop([oldest], f"it was the idlest of more than {limit} sessions {whose}")
+                return
+
+    def _drop(self, keys: Iterable[_Key], reason: str) -> None:
+        for connection, name in keys:
+            self._forget(self._sessions.pop((connection, name)).slot)
+            dropped = self._dropped.setdefault(connection, {})
+            dropped[name] = reason
+            if len(dropped) > MAX_DROPPED_NAMES:
+                del dropped[next(iter(dropped))]  # the one that was dropped first
 
     def _next_step(self, session: Session, request: Mapping[str, Any]) -> int:
         """Return the step of a frame: as the client says, or else the number of frames so far."""

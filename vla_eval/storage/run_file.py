@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vla_eval.errors import RunChangedError, RunFolderError, one_line
+from vla_eval.errors import RunChangedError, RunFolderError
+from vla_eval.plain_text import printable
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.planned import PlannedEpisodes, planned_config
@@ -265,7 +266,7 @@ def _plain(value: object) -> dict[str, JsonValue]:
 
 def listed(changes: Sequence[Change]) -> str:
     """Return one line per change, whatever the values are."""
-    lines = [one_line(str(change)) for change in changes[:MAX_LISTED]]
+    lines = [printable(str(change)) for change in changes[:MAX_LISTED]]
     shown = [line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}…" for line in lines]
     more = [f"… and {len(changes) - MAX_LISTED} more"] if len(changes) > MAX_LISTED else []
     return "\n".join(f"  {line}" for line in (*shown, *more))

@@ -8,6 +8,7 @@ import numpy as np
 from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, Observation, ObservationWindow, Policy
 from vla_eval.specs import EnvSpec, PolicySpec, check_compatible
 from vla_eval.testing.claims import claim
+from vla_eval.wire.numbers import noise_state
 
 N_INFERENCES = 3
 HORIZON_STEPS = 60
@@ -186,7 +187,7 @@ def _noise(spec: PolicySpec, env: EnvSpec, seed: int, step: int) -> Observation:
     return Observation(
         step=step,
         images={c.name: rng.integers(0, 256, (c.height_px, c.width_px, 3), dtype=np.uint8) for c in cameras},
-        state={s.name: rng.uniform(-1, 1, len(s.dims)).astype(np.float32) for s in env.states},
+        state={s.name: noise_state(rng, s.dims) for s in env.states},
     )
 
 

@@ -159,7 +159,7 @@ def _metadata(server: Server) -> list[str]:
             for camera in said["cameras"].values()
         },
         state_key=said.get("state_key"),
-        layouts={name: len(names) for name, names in said["state_layouts"].items()},
+        layouts=dict(said["state_layouts"]),
         prompt_key=said["prompt_key"],
         needs_every_frame=said["needs_every_frame"],
         batch_max=said["batch_max"],
@@ -236,8 +236,13 @@ def _bad_messages(facts: Facts) -> dict[str, Any]:
     if facts.state_key in good:
         bad["a state with a number too many"] = {
             **good,
-            str(facts.state_key): np.zeros(max(facts.layouts.values()) + 1, dtype=np.float32),
+            str(facts.state_key): np.zeros(max(map(len, facts.layouts.values())) + 1, dtype=np.float32),
         }
+        for what, number in (("that is not a number", np.nan), ("that is infinite", np.inf)):
+            bad["a state with a number " + what] = {
+                **good,
+                str(facts.state_key): good[facts.state_key] * number,
+            }
     return bad
 
 

@@ -1,6 +1,6 @@
 """One connection to a policy server, and episodes of noise over it, for `check.py`.
 
-This file runs with Python 3.8, numpy 1.22 and websockets 13, and imports nothing else but the codec beside
+This file runs with Python 3.8, numpy 1.22 and websockets 13, and imports nothing else but what lies beside
 it: `mikasa_vla_client` ships it, too. It knows no policy and no simulator.
 """
 
@@ -16,6 +16,8 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
 from websockets.sync.client import connect
 
 from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
+from .keys import key_headers, key_problem
+from .numbers import noise_state
 
 N_INFERENCES = 3
 HORIZON_STEPS = 60
@@ -41,7 +43,7 @@ class Facts:
     n_dims: int
     cameras: Mapping[str, tuple[int, int]]  # key -> height, width
     state_key: str | None
-    layouts: Mapping[str, int]  # name -> how many numbers
+    layouts: Mapping[str, Sequence[str]]  # name -> names of its numbers
     prompt_key: str
     needs_every_frame: bool
     batch_max: int
@@ -53,8 +55,8 @@ class Facts:
         sizes = self.cameras.items()
         frame: Message = {key: rng.integers(0, 256, (*size, 3), dtype=np.uint8) for key, size in sizes}
         if self.state_key is not None and self.layouts:
-            n_numbers = self.layouts[layout or next(iter(self.layouts))]
-            frame[self.state_key] = rng.uniform(-1, 1, n_numbers).astype(np.float32)
+            names = self.layouts[layout or next(iter(self.layouts))]
+            frame[self.state_key] = noise_state(rng, names)
         return {**frame, self.prompt_key: PROMPT}
 
 
@@ -63,7 +65,10 @@ class Server:
 
     def __init__(self, url: str, api_key: str | None, timeout_seconds: float) -> None:
         self.url, self.timeout_seconds = url, timeout_seconds
-        self._headers = {} if api_key is None else {"Authorization": "Api-Key " + api_key}
+        problem = None if api_key is None else key_problem(api_key)
+        if problem is not None:
+            raise self.failed(f"the API key cannot be sent: {problem}.")
+        self._headers = key_headers(api_key)
         self.facts: Any = None
         self.alone: dict[int, Chunks] = {}
 

@@ -26,6 +26,7 @@ MAX_ARRAY_DIMS = 16
 
 ARRAY, SCALAR = "__ndarray__", "__npgeneric__"
 KINDS = "biufSU"  # bool, integers, floats, bytes, text: no objects, no records, no complex numbers, no times
+MAX_FLOAT_BYTES = 8  # longer ones ("float128") have other bytes on other machines
 _DTYPE = re.compile(r"[<>|=]?[a-zA-Z?][0-9]{0,9}")
 _MAX_CODE_POINT = 0x10FFFF
 
@@ -224,9 +225,11 @@ def _read_dtype(text: Any) -> np.dtype[Any]:
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:
-    if dtype.kind not in KINDS or dtype.hasobject:
+    is_too_long = dtype.kind == "f" and dtype.itemsize > MAX_FLOAT_BYTES
+    if dtype.kind not in KINDS or dtype.hasobject or is_too_long:
         raise CodecError(
-            f"arrays of dtype {dtype.str!s:.40} are refused; expected bool, integers, floats or text"
+            f"arrays of dtype {dtype.str!s:.40} are refused; expected bool, integers, floats of at most "
+            f"{8 * MAX_FLOAT_BYTES} bits or text"
         )
 
 

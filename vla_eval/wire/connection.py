@@ -17,6 +17,7 @@ from vla_eval.errors import RemoteConnectionError, RemotePolicyError, RemoteRepl
 from vla_eval.lock.switch import own_need
 from vla_eval.wire.addresses import is_loopback
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb
+from vla_eval.wire.keys import key_headers, key_problem
 
 logger = logging.getLogger(__name__)
 
@@ -55,9 +56,9 @@ class Connection:
         self._timeout_seconds = timeout_seconds
         self._text_markers = text_markers
         self._opened = ExitStack()  # leaving it closes the connection
-        self._socket = self._opened.enter_context(
-            _connect(url, connect_seconds=connect_seconds, api_key=api_key)
-        )
+        with own_need():  # the user named this server
+            opened = _connect(url, connect_seconds=connect_seconds, api_key=api_key)
+        self._socket = self._opened.enter_context(opened)
 
     def send(self, message: Any) -> None:
         """Send a message.
@@ -129,22 +130,25 @@ class Connection:
 
 
 def _connect(url: str, *, connect_seconds: float, api_key: str | None) -> ClientConnection:
-    headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+    problem = None if api_key is None else key_problem(api_key)
+    if problem is not None:
+        raise RemoteConnectionError(
+            f"{url}: the API key cannot be sent: {problem}. Correct the environment variable that holds it."
+        )
     deadline, pause = time.monotonic() + connect_seconds, FIRST_PAUSE_SECONDS
     while True:
         try:
-            with own_need():  # the user named this server
-                return connect(
-                    url,
-                    additional_headers=headers,
-                    compression=None,
-                    max_size=MAX_MESSAGE_BYTES,
-                    open_timeout=OPEN_SECONDS,
-                    close_timeout=CLOSE_SECONDS,
-                    # A server that computes for a minute answers no pings, and is healthy.
-                    ping_interval=None,
-                    proxy=None if is_loopback(url) else True,
-                )
+            return connect(
+                url,
+                additional_headers=key_headers(api_key),
+                compression=None,
+                max_size=MAX_MESSAGE_BYTES,
+                open_timeout=OPEN_SECONDS,
+                close_timeout=CLOSE_SECONDS,
+                # A server that computes for a minute answers no pings, and is healthy.
+                ping_interval=None,
+                proxy=None if is_loopback(url) else True,
+            )
         except ConnectionRefusedError as exc:
             if time.monotonic() + pause > deadline:
                 raise _no_server(url, exc) from exc

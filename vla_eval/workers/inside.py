@@ -13,9 +13,10 @@ import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO, cast
 
 from vla_eval.core import Stage
+from vla_eval.plain_text import PlainStream
 from vla_eval.records import EpisodeKey, EpisodeTiming
 from vla_eval.workers.framing import send_message
 
@@ -120,6 +121,14 @@ def detach(log: Path) -> None:
     os.dup2(descriptor, sys.__stdout__.fileno() if sys.__stdout__ else 1)
     os.dup2(descriptor, sys.__stderr__.fileno() if sys.__stderr__ else 2)
     os.close(descriptor)
+    # Logs are read on terminals, too.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is not None:  # as of a parent that closed it
+            setattr(sys, name, cast(TextIO, PlainStream(getattr(sys, name))))
     faulthandler.enable(file=2, all_threads=True)
     faulthandler.register(signal.SIGUSR1, file=2, all_threads=True)  # the watchdog asks where it is stuck
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logging.basicConfig(
+        level=logging.WARNING,
+        format="%(asctime)s %(name)s %(levelname)s %(message)s",
+        force=True,  # a library may have configured it in the fork server, for the stream before
+    )

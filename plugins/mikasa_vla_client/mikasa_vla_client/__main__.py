@@ -8,6 +8,7 @@ import sys
 from typing import Sequence
 
 from mikasa_vla_client.check import CheckFailedError, check_remote
+from mikasa_vla_client.plain_text import LINES, printable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -20,11 +21,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.api_key_env and not key:
         parser.error(f"--api-key-env: the variable {args.api_key_env} is not set")
     try:
-        check_remote(args.url, api_key=key, report=lambda claim: print("ok  " + claim, flush=True))
+        check_remote(args.url, api_key=key, report=_say_met)
     except CheckFailedError as exc:
-        print(exc, file=sys.stderr)
+        print(printable(str(exc), keep=LINES), file=sys.stderr)
         return 1
     return 0
+
+
+def _say_met(claim: str) -> None:
+    print("ok  " + printable(claim, keep=LINES), flush=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Knows nothing of simulators and of `vla_eval`.
 
 from __future__ import annotations
 
-import hmac
 import inspect
 import logging
 import threading
@@ -16,11 +15,13 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Callable, Mapping
 
+import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
 from websockets.sync.server import serve as listen
 
 from mikasa_vla_client.codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb
+from mikasa_vla_client.keys import HEADER, explanation, key_problem, refused
 from mikasa_vla_client.spec import PROMPT_KEY, PolicySpec, SpecError
 
 logger = logging.getLogger(__name__)
@@ -97,6 +98,9 @@ class PolicyServer:
                     f"reset(session, episode), infer(session, observation) and, if needs_every_frame is "
                     f"True, observe(session, observation)."
                 )
+        problem = None if api_key is None else key_problem(api_key)
+        if problem is not None:
+            raise SpecError(f"api_key: {problem}.")
         self._spec, self._api_key, self._debug = spec, api_key, debug
         self._metadata = spec.metadata()
         # Nothing is known of whether the policy may run in two threads.
@@ -127,12 +131,8 @@ class PolicyServer:
         """Answer what needs no WebSocket, and refuse who has no key."""
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
-        given = request.headers.get("Authorization", "").encode("utf-8", "replace")
-        if self._api_key is not None and not hmac.compare_digest(given, f"Api-Key {self._api_key}".encode()):
-            return connection.respond(
-                HTTPStatus.UNAUTHORIZED, "Expected the header Authorization: Api-Key KEY.\n"
-            )
-        return None
+        status = refused(request.headers.get_all(HEADER), self._api_key)
+        return None if status is None else connection.respond(status, explanation(status))
 
     def _answer(self, connection: ServerConnection) -> None:
         """Answer one client until it goes, or until one of its messages is refused."""
@@ -169,6 +169,9 @@ class PolicyServer:
             raise RequestError(f"there is no endpoint {endpoint!r:.80} (known: {', '.join(ENDPOINTS)}).")
         if not isinstance(session_id, str):
             raise RequestError(f"session_id: expected a text, found {session_id!r:.80}.")
+        step = request.get("step", 0)
+        if not isinstance(step, (int, np.integer)) or isinstance(step, bool):
+            raise RequestError(f"step: expected a whole number, found {step!r:.80}.")
         asked = time.perf_counter()
         with self._one_at_a_time:
             reply: dict[str, Any] = {"server_timing": {"queue_ms": _ms_since(asked)}}
@@ -256,7 +259,7 @@ def serve(
         debug: send a traceback to the client if the policy fails.
 
     Raises:
-        SpecError: the policy has not the methods that the spec asks for.
+        SpecError: the policy has not the methods that the spec asks for, or a key cannot be sent.
         OSError: the port is in use.
     """
     server = PolicyServer(policy, spec, host=host, port=port, api_key=api_key, debug=debug)

@@ -13,6 +13,8 @@ from typing import Any, Mapping
 
 import numpy as np
 
+from mikasa_vla_client.numbers import NumbersError, as_state
+
 __version__ = "0.1.0"
 PROTOCOL = "openpi+1"
 
@@ -147,21 +149,31 @@ class PolicySpec:
             observation: key -> (H, W, 3) uint8 image, or the state as float numbers.
 
         Raises:
-            ValueError: a key is not there, or its value has another shape or type.
+            ValueError: a key is not there, or its value has another shape or type; a state is not finite, or
+                its rotation is none.
         """
         for camera in self.cameras:
             expected = (*self.image_size_px, 3)
-            _check_array(observation, CAMERA_KEYS[camera], expected, np.uint8)
+            _check_image(observation, CAMERA_KEYS[camera], expected)
         if self.state is not None:
-            _check_array(observation, STATE_KEY, (len(STATE_LAYOUTS[self.state]),), np.floating)
+            try:
+                as_state(_required(observation, STATE_KEY), STATE_LAYOUTS[self.state])
+            except NumbersError as exc:
+                raise ValueError(f"'{STATE_KEY}': {exc}.") from exc
 
     def check_actions(self, actions: Any) -> np.ndarray[Any, Any]:
         """Return a policy's answer as a float32 array of its own.
 
         Raises:
-            ValueError: it has another shape, or values that are not finite.
+            ValueError: it has another shape or type, or values that are not finite.
         """
-        array = np.array(actions, dtype=np.float32)
+        given = np.array(actions)
+        if given.dtype.kind not in "fiu":
+            raise ValueError(
+                f"policy '{self.name}' returned actions of dtype {given.dtype}, expected real numbers."
+            )
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+            array = given.astype(np.float32)
         expected = (self.chunk_size, len(self.action_dims))
         if array.shape != expected:
             raise ValueError(
@@ -177,15 +189,19 @@ def _is_count(value: Any, maximum: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= maximum
 
 
-def _check_array(observation: Mapping[str, Any], key: str, shape: tuple[int, ...], kind: Any) -> None:
+def _required(observation: Mapping[str, Any], key: str) -> Any:
     if key not in observation:
         found = ", ".join(sorted(observation)) or "nothing"
         raise ValueError(f"the observation has no '{key}' (it has: {found}).")
-    value = observation[key]
+    return observation[key]
+
+
+def _check_image(observation: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> None:
+    value = _required(observation, key)
     is_array = isinstance(value, np.ndarray)
-    if not is_array or value.shape != shape or not np.issubdtype(value.dtype, kind):
+    if not is_array or value.shape != shape or value.dtype != np.uint8:
         found = f"{value.dtype} of shape {value.shape}" if is_array else type(value).__name__
-        raise ValueError(f"'{key}': expected {kind.__name__} of shape {shape}, found {found}.")
+        raise ValueError(f"'{key}': expected uint8 of shape {shape}, found {found}.")
 
 
 def _sha256(path: Path) -> str:

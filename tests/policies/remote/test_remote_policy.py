@@ -121,6 +121,7 @@ def test_what_is_executed_is_what_the_server_answered() -> None:
 def window(step: int, *, slot: int = 0, n_frames: int = 1) -> ObservationWindow:
     sizes = {"tcp_pose": 7, "qpos": 9, "qvel": 9}
     state = {name: np.ones(size, dtype=np.float32) for name, size in sizes.items()}
+    state["tcp_pose"][3:] = 0.5  # a quaternion of length 1
     frames = tuple(Observation(step=step - n_frames + 1 + i, images={}, state=state) for i in range(n_frames))
     return ObservationWindow(slot=slot, frames=frames)
 

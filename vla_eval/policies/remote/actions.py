@@ -28,9 +28,11 @@ def as_rows(actions: Any) -> Any:
     """
     if isinstance(actions, list):
         try:
-            actions = np.array(actions, dtype=np.float32)
+            actions = np.array(actions)
         except (ValueError, TypeError):
             return actions
+        if actions.dtype.kind in "iu":  # JSON and msgpack write 1.0 as 1
+            actions = actions.astype(np.float32)
     if not isinstance(actions, np.ndarray):
         return actions
     rows = actions[None] if actions.ndim == 1 else actions

@@ -10,13 +10,14 @@ from typing import Any, Literal  # Any: a request holds arrays and text
 import numpy as np
 
 from vla_eval.core import Observation
-from vla_eval.errors import SpecMismatchError, did_you_mean, some_of
+from vla_eval.errors import SimulationError, SpecMismatchError, did_you_mean, some_of
 from vla_eval.policies.remote.actions import DELTA_POSE, N_DELTA_POSE
 from vla_eval.policies.remote.images import resized
 from vla_eval.policies.remote.settings import CameraSettings, RemoteSettings
 from vla_eval.policies.remote.state_layouts import StateLayout, layout_names, state_layout
 from vla_eval.specs import EnvSpec
 from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.numbers import NumbersError, as_state
 
 DEFAULT_PROMPT_KEY = "prompt"
 MAX_HZ_DIFFERENCE = 1e-3
@@ -29,6 +30,7 @@ class Fit:
     Attributes:
         cameras: camera of the environment -> how it is sent, with its size.
         state: key -> layout.
+        state_dims: state of the environment -> names of its numbers.
         prompt_key: key of the instruction.
         chunk_size: actions of one reply.
         reads: which frames the server must see.
@@ -36,6 +38,7 @@ class Fit:
 
     cameras: Mapping[str, CameraSettings]
     state: Mapping[str, StateLayout]
+    state_dims: Mapping[str, tuple[str, ...]]
     prompt_key: str
     chunk_size: int
     reads: Literal["last", "every"]
@@ -46,7 +49,19 @@ class Fit:
         return tuple(dict.fromkeys(name for layout in self.state.values() for name in layout.states))
 
     def request(self, observation: Observation, instruction: str) -> dict[str, Any]:
-        """Return what is sent of an observation."""
+        """Return what is sent of an observation.
+
+        Raises:
+            SimulationError: a state is not finite, or its rotation is none.
+        """
+        for name in self.states:
+            try:
+                as_state(observation.state[name], self.state_dims[name])
+            except NumbersError as exc:
+                raise SimulationError(
+                    f"step {observation.step}, state '{name}', which a policy server is sent: {exc}. The "
+                    "simulation diverged, or the environment is not what its spec says."
+                ) from exc
         fields: dict[str, Any] = {self.prompt_key: instruction}
         for name, camera in self.cameras.items():
             image = observation.images[name]
@@ -81,6 +96,7 @@ def fit(settings: RemoteSettings, server: ServerMetadata, env: EnvSpec, *, where
     return Fit(
         cameras=_cameras(settings, server, env, where=where),
         state=_state(settings, server, env, where=where),
+        state_dims={state.name: state.dims for state in env.states},
         prompt_key=settings.prompt_key or server.prompt_key or DEFAULT_PROMPT_KEY,
         chunk_size=chunk_size,
         reads="every" if reads == "every" else "last",

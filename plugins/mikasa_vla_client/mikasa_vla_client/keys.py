@@ -1,0 +1,1 @@
+../../../vla_eval/wire/keys.py

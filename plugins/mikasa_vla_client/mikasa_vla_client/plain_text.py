@@ -1,0 +1,1 @@
+../../../vla_eval/plain_text.py
