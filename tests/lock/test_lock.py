@@ -173,6 +173,9 @@ def test_what_the_user_named_is_written(tmp_path: Path) -> None:
         shutil.rmtree(tmp_path / "a" / "out")
         with tempfile.TemporaryDirectory() as folder, open(Path(folder) / "x", "w") as file:
             file.write("1")
+        with tempfile.TemporaryFile() as unnamed, tempfile.NamedTemporaryFile() as named:
+            unnamed.write(b"1")
+            named.write(b"1")
         with open(os.devnull, "w") as file:
             file.write("1")
 

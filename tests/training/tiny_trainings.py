@@ -1,5 +1,6 @@
 """Trainings of some steps of a tiny ACT and a tiny π0, offline, with a cache of their own."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,6 +68,13 @@ def pi0(dataset: Path, out: Path, tokenizer: Path, **changes: Any) -> FinetuneCo
         device="cpu",
         allow_unreplayed=True,
     )
+
+
+def finetune_losses(config: FinetuneConfig) -> list[float]:
+    """Train, and return the loss of each step."""
+    finetune_module.finetune(config)
+    lines = (Path(str(config.out)) / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line)["loss"] for line in lines]
 
 
 @pytest.fixture

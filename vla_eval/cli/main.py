@@ -143,11 +143,10 @@ def _add_no_lock(parser: argparse.ArgumentParser) -> None:
 
 
 def _paths(args: argparse.Namespace) -> list[Path]:
-    """Return the files and folders that the user named: what may be written to."""
-    values = [
-        each for value in vars(args).values() for each in (value if isinstance(value, list) else [value])
-    ]
-    return [value for value in values if isinstance(value, Path)]
+    """Return what may be a file or a folder that the user named: it may be written to."""
+    values = vars(args).values()
+    each = [one for value in values for one in (value if isinstance(value, list) else [value])]
+    return [Path(one) for one in each if isinstance(one, str | Path) and str(one) and "\0" not in str(one)]
 
 
 def _verb(name: str) -> Verb:

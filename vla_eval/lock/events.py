@@ -80,7 +80,10 @@ def _resolve(host: Any, *_: object) -> None:
 
 
 def _open(path: Any, _mode: Any, flags: Any) -> None:
-    if isinstance(flags, int) and flags & WRITING:
+    if not isinstance(flags, int) or not flags & WRITING:
+        return
+    # A folder cannot be written; `tempfile` names it where it makes a file without a name, or with its own.
+    if isinstance(path, int) or not os.path.isdir(path):
         _write(path)
 
 

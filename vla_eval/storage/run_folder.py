@@ -16,7 +16,6 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
-from vla_eval.lock.switch import let_write
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.continuing import check_allowed, continued
 from vla_eval.storage.durable import LineFile, sync_folder
@@ -124,7 +123,6 @@ class RunFolder:
                 not planned, or it is somebody else's.
             StorageFullError: the disk is full.
         """
-        let_write(path)
         with starting(
             path, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="a run folder", make=make_folder
         ) as started:

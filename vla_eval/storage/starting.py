@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.errors import RunFolderError
+from vla_eval.lock.switch import let_write
 from vla_eval.storage.durable import FolderLock, storage_full
 
 logger = logging.getLogger(__name__)
@@ -87,6 +88,7 @@ def starting(
         StorageFullError: the disk is full.
         RunFolderError: the folder cannot be used.
     """
+    let_write(path)
     try:
         start = FolderStart(path, own=own)
         make(path)

@@ -28,12 +28,12 @@ from lerobot.common.train_utils import (
     load_training_num_processes,
 )
 from lerobot.common.wandb_utils import WandBLogger
-from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
+from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.factory import make_dataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.random_utils import set_seed
-from lerobot.utils.utils import cycle, has_method, init_logging
+from lerobot.utils.utils import has_method, init_logging
 from tqdm import tqdm
 
 from vla_eval.data.decoded_frames import DecodedFramesDataset
@@ -43,6 +43,7 @@ from vla_eval.errors import TrainingError
 from vla_eval.lock.switch import let_connect
 from vla_eval.policies.lerobot_device import amp_dtype
 from vla_eval.policies.steps.levels import in_numbers
+from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
@@ -144,11 +145,10 @@ class _Training:
         if job.resume_from is not None:
             load_state(job.resume_from, optimizer, scheduler, load_optimizer=not is_sharded)
         loader = _loader(job, self.config, dataset, accelerator)
-        prepared = accelerator.prepare(model, optimizer, loader, scheduler)
-        self.policy, self.optimizer, loader, self.scheduler = prepared
+        self.policy, self.optimizer, self.scheduler = accelerator.prepare(model, optimizer, scheduler)
         if job.resume_from is not None and is_sharded:
             load_fsdp_optimizer_state(self.policy, self.optimizer, job.resume_from)
-        self.batches = cycle(loader)
+        self.batches = on_device(loader, accelerator.device)
         self.autocast = autocast_dtype(job.policy, job.device)
         half = self.autocast == torch.float16  # whose small gradients would be 0
         self.scaler = torch.GradScaler(accelerator.device.type, enabled=half)
@@ -248,7 +248,7 @@ def _dataset(job: TrainingJob, config: Any) -> Any:
 
 
 def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:
-    """Return batches in an order that is a function of run seed and epoch, from the job's first step on."""
+    """Return an endless loader of this process's batches, from the job's first step on."""
     episodes = dataset.meta.episodes
     sampler = EpisodeAwareSampler(
         episodes["dataset_from_index"],
@@ -259,19 +259,23 @@ def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerato
         seed=job.run_seed,
         absolute_to_relative_idx=dataset.absolute_to_relative_idx,
     )
+    size, n_processes = job.recipe.batch_size, accelerator.num_processes
+    sharing = Sharing(batch_size=size, n_processes=n_processes, process=accelerator.process_index)
+    before = sharing
     if job.resume_from is not None:
-        n_processes = load_training_num_processes(job.resume_from) or accelerator.num_processes
-        size = load_training_batch_size(job.resume_from) or job.recipe.batch_size
-        sampler.load_state_dict(compute_sampler_state(job.first_step, len(sampler), size, n_processes))
+        n_before = load_training_num_processes(job.resume_from) or n_processes
+        size_before = load_training_batch_size(job.resume_from) or size
+        before = Sharing(batch_size=size_before, n_processes=n_before)
+    is_random = job.recipe.image_transforms is not None
+    start = before.position(job.first_step, len(sampler))
     in_workers = {
         "prefetch_factor": config.prefetch_factor,
         "persistent_workers": config.persistent_workers,
         "multiprocessing_context": config.dataloader_multiprocessing_context,
     }
     return torch.utils.data.DataLoader(
-        dataset,
-        batch_size=job.recipe.batch_size,
-        sampler=sampler,
+        SeededSamples(dataset, job.run_seed) if is_random else dataset,
+        batch_sampler=StepBatches(sampler, start, sharing, numbered=is_random),
         num_workers=config.num_workers,
         pin_memory=accelerator.device.type == "cuda",
         worker_init_fn=_leave_signals_to_the_parent,

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.errors import TrainingError
-from vla_eval.lock.switch import let_write
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.run_file import JsonValue, find_changes
 from vla_eval.strict_json import Source, read_file, read_json, read_version, shown
@@ -51,7 +50,6 @@ def open_folder(
         TrainingError: the folder holds other files, or a run with other settings.
     """
     file = path / RUN_FILE
-    let_write(path)
     path.mkdir(parents=True, exist_ok=True)
     if {entry.name for entry in path.iterdir()} <= ignore:
         data = {"format_version": FORMAT_VERSION, COMPARED: settings, **record}

@@ -1,0 +1,103 @@
+"""Which samples a training step gets: a function of run seed, step and process, wherever the training began.
+
+The order is that of lerobot's `EpisodeAwareSampler` (a permutation for each epoch), shared among processes as
+accelerate's `BatchSamplerShard` does. Neither can begin in the middle: accelerate sets the sampler's epoch
+back to 0, and completes an epoch's last batches with samples from wherever the sampler began.
+"""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple  # Any: lerobot, accelerate and datasets are untyped
+
+import numpy as np
+import torch
+from accelerate.data_loader import BatchSamplerShard
+from accelerate.utils import send_to_device, set_seed
+from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
+from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
+
+
+class Position(NamedTuple):
+    """Where a training goes on: so many samples of an epoch have been taken, by all processes together."""
+
+    epoch: int
+    n_taken: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sharing:
+    """How an epoch is shared: in batches of `batch_size`, one after the other to each of the processes."""
+
+    batch_size: int
+    n_processes: int = 1
+    process: int = 0
+
+    def position(self, step: int, n_samples: int) -> Position:
+        """Return where a training goes on after so many steps.
+
+        Args:
+            step: steps done, by as many processes.
+            n_samples: samples of an epoch.
+        """
+        state = compute_sampler_state(step, n_samples, self.batch_size, self.n_processes)
+        return Position(epoch=state["epoch"], n_taken=state["start_index"])
+
+
+class StepBatches(Sampler[list[Any]]):
+    """Yields this process's indices for each step, without end.
+
+    Args:
+        sampler: the order of an epoch.
+        start: where to begin.
+        sharing: which batches are this process's.
+        numbered: yield (index, epoch, number in the epoch) for each sample, see `SeededSamples`.
+    """
+
+    def __init__(
+        self, sampler: EpisodeAwareSampler, start: Position, sharing: Sharing, *, numbered: bool = False
+    ) -> None:
+        self._sampler, self._start, self._sharing, self._numbered = sampler, start, sharing, numbered
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        """Yield batches."""
+        sharing, skipped = self._sharing, self._start.n_taken // self._per_step
+        for epoch in itertools.count(self._start.epoch):
+            yield from itertools.islice(self._epoch(epoch, sharing), skipped, None)
+            skipped = 0
+
+    @property
+    def _per_step(self) -> int:
+        return self._sharing.batch_size * self._sharing.n_processes
+
+    def _epoch(self, epoch: int, sharing: Sharing) -> Iterator[list[Any]]:
+        self._sampler.load_state_dict({"epoch": epoch, "start_index": 0})
+        samples: Any = self._sampler
+        if self._numbered:
+            samples = [(index, epoch, number) for number, index in enumerate(self._sampler)]
+        whole = BatchSampler(samples, sharing.batch_size, drop_last=False)
+        shard = BatchSamplerShard(whole, num_processes=sharing.n_processes, process_index=sharing.process)
+        return iter(shard)
+
+
+class SeededSamples(Dataset[Any]):
+    """Seeds each sample's random augmentation by run seed, epoch and number, whoever makes it."""
+
+    def __init__(self, dataset: Any, run_seed: int) -> None:
+        self._dataset, self._run_seed = dataset, run_seed
+
+    def __getitem__(self, sample: tuple[int, int, int]) -> Any:
+        """Return the sample of an index."""
+        index, *place = sample
+        drawn = np.random.SeedSequence(self._run_seed, spawn_key=(AUGMENTATION, *place)).generate_state(1)
+        set_seed(int(drawn[0]))
+        return self._dataset[index]
+
+
+AUGMENTATION = 0x61756720  # apart from the seeds of steps, which have two numbers
+
+
+def on_device(loader: "DataLoader[Any]", device: torch.device) -> Iterator[Any]:
+    """Yield the loader's batches, moved to a device."""
+    for batch in loader:
+        yield send_to_device(batch, device, non_blocking=loader.pin_memory)
