@@ -12,6 +12,7 @@ from typing import NoReturn, Protocol, cast
 from vla_eval import __version__
 from vla_eval.cli.streams import standard_streams
 from vla_eval.errors import VlaEvalError, did_you_mean
+from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
 VERBS = (
@@ -73,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the arguments without the program's name; by default those of the process.
     """
+    leave_working_directory()
     with standard_streams():
         return _run(list(sys.argv[1:] if argv is None else argv))
 

@@ -3,10 +3,11 @@
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from vla_eval.workers.children import python_command
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -43,7 +44,7 @@ def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
     Raises:
         ProbeFailure: it failed, crashed or hung.
     """
-    command = (sys.executable, "-m", "vla_eval.doctor.probe", name)
+    command = python_command("-m", "vla_eval.doctor.probe", name)
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_SECONDS
