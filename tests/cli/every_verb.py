@@ -53,7 +53,7 @@ COMMANDS = {
     "checkpoint convert-openvla": "checkpoint convert-openvla {W}/trained --out {W}/openvla",
     "checkpoint convert-spatialvla": "checkpoint convert-spatialvla {W}/trained --out {W}/spatialvla",
     "checkpoint merge": "checkpoint merge {W}/trained --out {W}/whole",
-    "serve": "serve --policy oracle --task RememberColor3-v0 --port 0",
+    "serve": "serve --policy {W}/trained --port 0",
     "list": "list",
     "show": f"show {TASK}",
     "doctor": "doctor --json",
