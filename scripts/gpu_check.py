@@ -7,7 +7,6 @@ here says why. `--device cpu --tiny` tries the script itself, in minutes, on tin
 import argparse
 import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import subprocess
@@ -130,8 +129,10 @@ def gpu_simulator(check: Check) -> dict[str, Any]:
     """Run the tests of the GPU simulator."""
     if check.device != "cuda":
         raise CannotRunError("no GPU was asked for (--device cpu)")
-    arguments = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-m", "gpu", "tests/gpu"]
-    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
+    from vla_eval.workers.children import python_command
+
+    command = python_command("-m", "pytest", "-n", "0", "-q", "-m", "gpu", "tests/gpu")
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return {"exit_code": done.returncode, "lines": done.stdout.splitlines()[-5:]}
 
 
@@ -243,8 +244,9 @@ def _small(check: Check, name: str) -> Iterator[tuple[str, bool]]:
 def _in_its_own_process(renderer: str) -> Any:
     """Return `_frames(renderer)`: the first to render in a process chooses its device."""
     from vla_eval.errors import RenderingError
+    from vla_eval.workers.start import child_context
 
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
+    with child_context().Pool(1) as pool:
         try:
             return pool.apply(_frames, (renderer,))
         except RenderingError as exc:
@@ -273,7 +275,9 @@ def _frames(renderer: Any) -> Any:
 
 
 def _command(*arguments: str, may_fail: bool = False) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "vla_eval.cli", *arguments]
+    from vla_eval.workers.children import python_command
+
+    command = python_command("-m", "vla_eval.cli", *arguments)
     done = subprocess.run(command, cwd=Path.cwd(), capture_output=True, text=True, check=False)
     if done.returncode != 0 and not may_fail:
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-1500:]}")

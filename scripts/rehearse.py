@@ -8,7 +8,6 @@ docs/hardware.md are printed at the end. `--tiny` tries the script itself, in mi
 import argparse
 import functools
 import json
-import multiprocessing
 import os
 import shutil
 import subprocess
@@ -21,6 +20,8 @@ from pathlib import Path
 from typing import Any  # results as JSON holds them
 
 from vla_eval.storage.provenance import PACKAGE_FOLDER, checkout_state, cpu_model
+from vla_eval.workers.children import python_command
+from vla_eval.workers.start import child_context
 
 GEMMA_EMBEDDINGS = 257_152 * 2_048  # lerobot's π0 family has them twice, a published file once
 PALIGEMMA = 2_923_466_480 - (257_216 - 257_152) * 2_048  # of the published one, whose embeddings are padded
@@ -107,7 +108,7 @@ def convert_original(name: str, options: Options) -> Result:
     }
     writers[name](source)
     action, *flags = ORIGINALS[name]
-    command = [sys.executable, "-c", MEASURED, action, str(source), "--out", str(out), *flags]
+    command = python_command("-c", MEASURED, action, str(source), "--out", str(out), *flags)
     started = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -169,10 +170,9 @@ def run_part(name: str, options: Options) -> dict[str, Any]:
     shutil.rmtree(options.folder, ignore_errors=True)  # of a call that was killed
     started = time.perf_counter()
     try:
-        context = multiprocessing.get_context("spawn")
         # What libraries print goes to standard error: standard output is the tables.
         to_stderr = {"initializer": os.dup2, "initargs": (2, 1)}
-        with ProcessPoolExecutor(max_workers=1, mp_context=context, **to_stderr) as executor:
+        with ProcessPoolExecutor(max_workers=1, mp_context=child_context(), **to_stderr) as executor:
             result = executor.submit(PARTS[name], options).result()
         wrong = problem(name, result, tiny=options.tiny)
         found: dict[str, Any] = {"state": "failed" if wrong else "done", "result": result}

@@ -16,6 +16,9 @@
 #SBATCH --signal=B:TERM@120
 set -euo pipefail
 
+# The folder of a dataset or a checkpoint may hold modules: Python must not search where the job is submitted.
+export PYTHONSAFEPATH=1
+
 if [ "$#" -lt 1 ]; then
   echo "usage: sbatch job.sh finetune|eval|record … --out DIR" >&2
   exit 1

@@ -28,6 +28,9 @@ address="$(srun --nodes=1 --ntasks=1 --nodelist="$head" hostname --ip-address | 
 RAY_AUTH_TOKEN="$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')"
 export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
 
+# Ray's own helpers are started by `python -c` and `-m`: they must not search the working directory for modules.
+export PYTHONSAFEPATH=1
+
 # Starts Ray on each node, runs the command on the first one, and stops Ray everywhere.
 exec srun --nodes="$nodes" --ntasks="$nodes" --ntasks-per-node=1 \
   "$bin/ray" symmetric-run --address "$address:6379" --min-nodes "$nodes" \

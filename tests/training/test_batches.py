@@ -1,9 +1,10 @@
-"""A resumed training gets the samples of the uninterrupted one, beyond the first epoch and in every process."""
+"""A resumed training gets the samples of the uninterrupted one, in later epochs and in every process."""
 
-import random
+import itertools
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from accelerate.data_loader import prepare_data_loader
@@ -73,12 +74,12 @@ def test_each_epoch_holds_each_frame_once() -> None:
     """46 frames in batches of 4 are 12 batches: the last has 2."""
     found = steps([20, 26], Sharing(batch_size=4), 0, 24)
     first, second = found[:12], found[12:]
-    assert sorted(sum(first, [])) == sorted(sum(second, [])) == list(range(46))
+    assert sorted(itertools.chain(*first)) == sorted(itertools.chain(*second)) == list(range(46))
     assert first != second and len(first[11]) == 2
 
 
 def test_other_processes_go_on_where_the_first_ones_stopped() -> None:
-    """After 3 steps of two processes with batches of 4, 24 frames are taken: one process is at its 7th batch."""
+    """After 3 steps of two processes with batches of 4, 24 frames are taken: one process is at its 7th."""
     before = Sharing(batch_size=4, n_processes=2)
     assert before.position(3, 46) == Position(epoch=0, n_taken=24)
     order = sampler([20, 26])
@@ -90,7 +91,7 @@ class Noisy(torch.utils.data.Dataset[Any]):
     """Its samples are random, as augmented images are."""
 
     def __getitem__(self, index: int) -> Any:
-        return torch.tensor([index, float(torch.rand(())), random.random()])
+        return torch.tensor([index, float(torch.rand(())), float(np.random.rand())])  # noqa: TID251  # the global one
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])

@@ -9,8 +9,8 @@ import json
 import math
 import os
 import resource
+import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -28,6 +28,7 @@ from vla_eval.errors import ConformanceError, MissingDependencyError
 from vla_eval.lock.switch import own_need
 from vla_eval.storage.folders import EPISODES_FILE
 from vla_eval.testing.looking_policy import CAMERAS, write_looking
+from vla_eval.workers.children import bound_command, python_command
 from vla_eval.workers.guard import become_subreaper
 from vla_eval.workers.start import available_cores
 
@@ -192,7 +193,7 @@ def _evaluation(task: str, folder: Path, name: str, k: int, n_episodes: int, *fl
     """Run an evaluation of the policy that reads both cameras, in a run folder of its own."""
     out = folder / name
     policy = write_looking(folder / "looking.yaml")
-    command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", task, "--policy", policy]
+    command = python_command("-m", "vla_eval.cli", "eval", "--task", task, "--policy", policy)
     command += ["--n-action-steps", str(k), "--episodes", str(n_episodes), "--out", str(out), *flags]
     become_subreaper()  # so that the CPU time of processes that outlive the command is counted
     records = out / EPISODES_FILE
@@ -235,18 +236,18 @@ def _eager(task: str, folder: Path, n_episodes: int, horizon_steps: int) -> Base
 
 def _official(task: str, python: Path, n_episodes: int, horizon_steps: int) -> Baseline:
     script = Path(official_script.__file__)
-    command = [str(python), str(script), task.replace("-v0", "-VLA-v0"), str(horizon_steps), str(n_episodes)]
+    arguments = (str(script), task.replace("-v0", "-VLA-v0"), str(horizon_steps), str(n_episodes))
     # Without our own path: the other environment has its own packages.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    begun = time.perf_counter()
-    try:
-        with own_need():
-            done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    except OSError as exc:
+    if shutil.which(python) is None:
         raise MissingDependencyError(
-            f"bench: expected a Python interpreter that has mikasa-robo-suite at {python}, found none "
-            f"({exc}). docs/speed.md says how to install it."
-        ) from exc
+            f"bench: expected a Python interpreter that has mikasa-robo-suite at {python}, found none. "
+            "docs/speed.md says how to install it."
+        )
+    begun = time.perf_counter()
+    command = bound_command(str(python), *arguments)
+    with own_need():
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
     seconds = time.perf_counter() - begun
     if done.returncode:
         raise ConformanceError(

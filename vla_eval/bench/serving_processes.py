@@ -1,9 +1,7 @@
 """Start what is measured: a policy server, or copies of the policy, each in processes of its own."""
 
-import multiprocessing
 import re
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,6 +24,8 @@ from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.policies.remote.policy import RemotePolicy, make_remote
 from vla_eval.tasks.interface import env_spec
+from vla_eval.workers.children import python_command
+from vla_eval.workers.start import child_context
 
 INSTRUCTION = "look and move"
 N_OBSERVATIONS = 16  # drawn once; a policy is shown them in turn
@@ -122,7 +122,7 @@ def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
     Raises:
         RemotePolicyError: it does not start.
     """
-    command = [sys.executable, "-m", "vla_eval.cli", "serve", "--policy", policy]
+    command = python_command("-m", "vla_eval.cli", "serve", "--policy", policy)
     command += ["--port", "0", "--max-batch", str(n_rows)]
     with tempfile.TemporaryFile("w+") as errors:
         with own_need():
@@ -170,7 +170,7 @@ def measure_copies(policy: str, *, n_copies: int, seconds: float) -> Load:
     Raises:
         RemotePolicyError: a copy could not be made, or ended.
     """
-    spawn = multiprocessing.get_context("spawn")
+    spawn = child_context()
     free_before = free_device_bytes()
     barrier, results = spawn.Barrier(n_copies), spawn.Queue()
     processes = [

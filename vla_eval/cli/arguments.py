@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.bounds import check_seeds
+from vla_eval.bounds import MAX_EPISODES, check_seeds
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import Shard
@@ -77,13 +77,16 @@ def seeds_argument(text: str) -> range:
     """Read the value of `--seeds`: `1-100`, or one seed."""
     first, _, last = text.partition("-")
     try:
-        seeds = range(int(first), int(last or first) + 1)
-        check_seeds(int(first), max(1, len(seeds)), name="--seeds")
+        lowest, highest = int(first), int(last or first)
+        check_seeds(lowest, name="--seeds")
+        check_seeds(highest, name="--seeds")
     except (ValueError, RecipeError) as exc:
         raise argparse.ArgumentTypeError(f"expected seeds such as 1-100, found '{text}'") from exc
-    if not seeds:
+    if highest < lowest:
         raise argparse.ArgumentTypeError(f"expected the lower seed first, found '{text}'")
-    return seeds
+    if highest - lowest >= MAX_EPISODES:
+        raise argparse.ArgumentTypeError(f"expected at most {MAX_EPISODES:,} seeds, found '{text}'")
+    return range(lowest, highest + 1)
 
 
 def shard_argument(text: str) -> Shard:

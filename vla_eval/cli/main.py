@@ -4,8 +4,10 @@ Each verb is a module with `add_parser(subparsers)` and `run(args) -> int`, impo
 """
 
 import argparse
+import errno
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,8 +15,9 @@ from typing import NoReturn, Protocol, cast
 
 from vla_eval import __version__
 from vla_eval.cli.streams import standard_streams
-from vla_eval.errors import VlaEvalError, did_you_mean
+from vla_eval.errors import MAX_SHOWN, VlaEvalError, did_you_mean
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
+from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
 VERBS = (
@@ -48,6 +51,12 @@ FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
       your policy beside chance and ceiling, on the same episodes
 
 `{PROGRAM} list` shows tasks and policies, `{PROGRAM} --help` every verb."""
+PATHS_FAULT = {
+    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.ENOSPC, errno.EDQUOT),
+}
+"""What the system says of a path that a user named, and not of a mistake of ours."""
+_LONG_WORD = re.compile(rf"(\S{{{MAX_SHOWN}}})\S{{{MAX_SHOWN},}}")
 EXIT_USER_MISTAKE = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
 
@@ -67,7 +76,8 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message and where to find help."""
-        self.exit(EXIT_USER_MISTAKE, f"{self.prog}: error: {message}\nSee `{self.prog} --help`.\n")
+        text = _with_short_words(message)
+        self.exit(EXIT_USER_MISTAKE, f"{self.prog}: error: {text}\nSee `{self.prog} --help`.\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -76,11 +86,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the arguments without the program's name; by default those of the process.
     """
+    leave_working_directory()
     with standard_streams():
         return _run(list(sys.argv[1:] if argv is None else argv))
 
 
 def _run(arguments: list[str]) -> int:
+    for number, argument in enumerate(arguments, start=1):
+        if not _is_text(argument):
+            return _fail(
+                f"argument {number}: expected text in UTF-8, found {argument!a:.{MAX_SHOWN}}. Rename the "
+                "file or correct the argument."
+            )
     first = arguments[0] if arguments else ""
     if not arguments:
         print(FIRST_STEPS)
@@ -99,12 +116,16 @@ def _run(arguments: list[str]) -> int:
             let_write(Path("runs"), *_paths(args))
             code = _verb(args.verb).run(args)
         sys.stdout.flush()
-    except VlaEvalError as exc:
-        return _fail(str(exc))
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone (`| head`)
         return 0
+    except VlaEvalError as exc:
+        return _fail(str(exc))
+    except OSError as exc:
+        if exc.filename is None or exc.errno not in PATHS_FAULT:
+            raise
+        return _fail(f"{exc.filename}: cannot be used: {exc.strerror}. Name another file or folder.")
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
     return code
 
 
@@ -176,5 +197,15 @@ def flags_of(parser: argparse.ArgumentParser) -> list[str]:
 
 
 def _fail(message: str) -> int:
-    print(f"{PROGRAM}: error: {message}", file=sys.stderr)
+    print(f"{PROGRAM}: error: {_with_short_words(message)}", file=sys.stderr)
     return EXIT_USER_MISTAKE
+
+
+def _is_text(argument: str) -> bool:
+    """Whether it is what a file name and a record can hold: no zero byte, and no byte that is not UTF-8."""
+    return "\0" not in argument and not any("\ud800" <= character <= "\udfff" for character in argument)
+
+
+def _with_short_words(message: str) -> str:
+    """Return the message without the ends of words that fill a screen: what a user wrote, repeated."""
+    return _LONG_WORD.sub(r"\1…", message)

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import Any
 
-from vla_eval.errors import RecipeError
+from vla_eval.errors import MAX_SHOWN, RecipeError
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if options.api_key is None and not _is_loopback(args.host):
         print(
-            f"warning: {args.host} can be reached from other machines, and no key is asked for "
+            f"warning: {args.host:.{MAX_SHOWN}} can be reached from other machines, and no key is asked for "
             "(--api-key-env).",
             file=sys.stderr,
         )

@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     """
     # Here and not above: `mikasa-vla --help` need not wait for them.
     from vla_eval.viz.picking import MOST_OPENED
+    from vla_eval.workers.children import bound_command
 
     if (args.run / DATASET_FILE).is_file():
         _check_screen(args)  # before episodes are decoded and written
@@ -64,9 +65,27 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"{len(found)} rerun files; opening the first {MOST_OPENED}. --seed picks one.", file=sys.stderr
         )
-    command = [sys.executable, "-m", "rerun", *map(str, found[:MOST_OPENED])]
+    command = bound_command(_viewer(), *map(str, found[:MOST_OPENED]))
     with own_need():
         return subprocess.run([*command, "--web-viewer"] if args.web else command, check=False).returncode
+
+
+def _viewer() -> str:
+    """Return the viewer's program, which `python -m rerun` starts: a child of it would outlive us.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    from importlib.util import find_spec
+
+    from vla_eval.errors import MissingDependencyError
+
+    if named := os.environ.get("RERUN_CLI_PATH"):  # rerun's own variable
+        return named
+    package = find_spec("rerun_cli")
+    if package is None or package.origin is None:
+        raise MissingDependencyError("expected the viewer of rerun-sdk, found none. Run `make setup` again.")
+    return str(Path(package.origin).with_name("rerun"))
 
 
 def _of_run(args: argparse.Namespace) -> list[Path]:

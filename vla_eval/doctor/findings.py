@@ -3,12 +3,12 @@
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from vla_eval.lock.switch import own_need
+from vla_eval.workers.children import python_command
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -45,7 +45,7 @@ def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
     Raises:
         ProbeFailure: it failed, crashed or hung.
     """
-    command = (sys.executable, "-m", "vla_eval.doctor.probe", name)
+    command = python_command("-m", "vla_eval.doctor.probe", name)
     try:
         with own_need():
             done = subprocess.run(

@@ -132,7 +132,7 @@ class PolicyServer:
         """
         try:
             server = await self._listen()
-        except OSError as exc:
+        except (OSError, UnicodeError) as exc:
             self._batcher.close()
             raise ServeError(
                 f"cannot listen on {self._options.host}:{self._options.port}: {exc}. Choose another --port "

@@ -76,8 +76,9 @@ class StepBatches(Sampler[list[Any]]):
         if self._numbered:
             samples = [(index, epoch, number) for number, index in enumerate(self._sampler)]
         whole = BatchSampler(samples, sharing.batch_size, drop_last=False)
-        shard = BatchSamplerShard(whole, num_processes=sharing.n_processes, process_index=sharing.process)
-        return iter(shard)
+        if sharing.n_processes == 1:  # the last batch of an epoch stays as short as it is
+            return iter(whole)
+        return iter(BatchSamplerShard(whole, sharing.n_processes, sharing.process))
 
 
 class SeededSamples(Dataset[Any]):

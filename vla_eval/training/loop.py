@@ -51,6 +51,7 @@ from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.model import local_files_only, make_model, make_processors
 from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, drop_extra_checkpoints
 from vla_eval.training.segments import preprocessed
+from vla_eval.workers.start import child_context
 
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
 LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
@@ -271,7 +272,7 @@ def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerato
     in_workers = {
         "prefetch_factor": config.prefetch_factor,
         "persistent_workers": config.persistent_workers,
-        "multiprocessing_context": config.dataloader_multiprocessing_context,
+        "multiprocessing_context": child_context(),
     }
     return torch.utils.data.DataLoader(
         SeededSamples(dataset, job.run_seed) if is_random else dataset,

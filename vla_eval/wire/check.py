@@ -91,7 +91,7 @@ def _healthz(server: Server) -> list[str]:
     try:
         request.request("GET", "/healthz")
         found = str(request.getresponse().status)
-    except (OSError, http.client.HTTPException) as exc:
+    except (OSError, UnicodeError, http.client.HTTPException) as exc:
         found = repr(exc)
     finally:
         request.close()

@@ -155,7 +155,7 @@ def _connect(url: str, *, connect_seconds: float, api_key: str | None) -> Client
             logger.info("%s: nobody listens yet; trying again in %.1f s", url, pause)
         except InvalidStatus as exc:
             raise _refused(url, exc) from exc
-        except (InvalidHandshake, OSError, TimeoutError) as exc:
+        except (InvalidHandshake, OSError, UnicodeError, TimeoutError) as exc:
             raise _no_server(url, exc) from exc
         time.sleep(pause)
         pause = min(2 * pause, LAST_PAUSE_SECONDS)

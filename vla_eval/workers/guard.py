@@ -50,8 +50,17 @@ def fork_guarded(lifeline: Connection) -> None:
     os.close(woken)
     os.close(wake)
     lifeline.close()
+    end_with_parent(guard)
+
+
+def end_with_parent(parent: int) -> None:
+    """Have the kernel kill this process when its parent ends, or the thread of the parent that started it.
+
+    Args:
+        parent: the parent's process id.
+    """
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != guard:  # it died before the line above
+    if os.getppid() != parent:  # it died before the line above
         os._exit(1)
 
 

@@ -20,7 +20,7 @@ from vla_eval.workers.framing import BrokenMessageError, Inbox
 from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
 from vla_eval.workers.inside import SHARED_SIZE, STAGES, SharedStage, write_stage
 from vla_eval.workers.messages import MAX_DETAILS
-from vla_eval.workers.start import begin, end_server, worker_environment
+from vla_eval.workers.start import begin, end_server, start_by_lasting_thread, worker_environment
 
 CLOSE_SECONDS = 5.0  # for closing a simulator; then it is killed
 END_SECONDS = REAP_SECONDS + 1  # the guard gives up earlier
@@ -193,7 +193,7 @@ class WorkerProcess:
         try:
             for attempt in range(START_ATTEMPTS):
                 try:
-                    self._start_once()
+                    start_by_lasting_thread(self._start_once)
                     break
                 except (EOFError, ConnectionError):
                     if self._is_abandoned or attempt + 1 == START_ATTEMPTS:

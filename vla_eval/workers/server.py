@@ -5,8 +5,12 @@ import gc
 import importlib
 import os
 
+from vla_eval.workers.guard import end_with_parent
+
 IMPORTS_VARIABLE = "MIKASA_VLA_WORKER_IMPORTS"
 """Environment variable: names of further modules to import, separated by colons."""
+PARENT_VARIABLE = "MIKASA_VLA_WORKER_PARENT"
+"""Environment variable: process id of the command, whose end would be noticed only after the imports."""
 
 
 def import_for_workers() -> None:
@@ -24,5 +28,6 @@ def import_for_workers() -> None:
 
 
 if IMPORTS_VARIABLE in os.environ:  # else this module is imported for its names
+    end_with_parent(int(os.environ[PARENT_VARIABLE]))
     os.setsid()  # signals to the command's group are for the command, which then ends its workers
     import_for_workers()

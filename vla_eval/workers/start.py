@@ -8,20 +8,23 @@ worker starts from nothing: a CUDA context does not survive a fork, and an impor
 import contextlib
 import multiprocessing
 import os
+import queue
 import re
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.context import ForkServerContext, SpawnContext, SpawnProcess
 from typing import Any  # private parts of multiprocessing
 
 from vla_eval.config.environment import Simulator
 from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers, lock
 from vla_eval.storage.provenance import nvidia_driver_version
-from vla_eval.workers.guard import fork_guarded
-from vla_eval.workers.server import IMPORTS_VARIABLE
+from vla_eval.workers.children import SAFE_PATH
+from vla_eval.workers.guard import end_with_parent, fork_guarded
+from vla_eval.workers.server import IMPORTS_VARIABLE, PARENT_VARIABLE
 
 SERVER_MODULE = "vla_eval.workers.server"
 
@@ -32,10 +35,12 @@ _GPU_DEVICE = re.compile(r"nvidia\d+")
 
 # One thread per worker: several workers share the cores. A server has one, too: the sums of a pass of several
 # rows depend on the number of threads.
-WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0", SAFE_PATH: "1"}
 
 _preloaded: dict[str, None] = {}
 _environment_lock = threading.Lock()  # several workers may be starting at once
+_starts: "queue.SimpleQueue[tuple[Future[None], Callable[[], None]]]" = queue.SimpleQueue()
+_starter: threading.Thread | None = None
 
 
 def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
@@ -119,6 +124,52 @@ def _server_pid() -> int | None:
     return pid
 
 
+class _BoundProcess(SpawnProcess):
+    """Bound to its parent before it imports what it is to run, which takes seconds."""
+
+    def __reduce__(self) -> tuple[Callable[[int], "_BoundProcess"], tuple[int], dict[str, Any]]:
+        return _arrive, (os.getpid(),), self.__dict__
+
+
+def _arrive(parent: int) -> _BoundProcess:
+    end_with_parent(parent)
+    return _BoundProcess.__new__(_BoundProcess)
+
+
+class _BoundContext(SpawnContext):
+    Process = _BoundProcess
+
+
+def child_context() -> SpawnContext:
+    """Return what makes processes that end with the thread that starts them."""
+    return _BoundContext()
+
+
+def start_by_lasting_thread(start: Callable[[], None]) -> None:
+    """Start a process by a thread that lives as long as this process, and wait for that.
+
+    The kernel counts a process's parent as gone when the thread that started it has ended.
+    """
+    global _starter
+    with _environment_lock:
+        if _starter is None or not _starter.is_alive():  # as in a fork of this process
+            _starter = threading.Thread(target=_start_all, name="mikasa-vla starter", daemon=True)
+            _starter.start()
+    done: Future[None] = Future()
+    _starts.put((done, start))
+    done.result()
+
+
+def _start_all() -> None:
+    while True:
+        done, start = _starts.get()
+        try:
+            start()
+            done.set_result(None)
+        except BaseException as exc:  # whoever waits raises it
+            done.set_exception(exc)
+
+
 @contextlib.contextmanager
 def worker_environment() -> Iterator[Mapping[str, str]]:
     """Set the environment variables that a new process reads when it starts, unless the user has set them."""
@@ -128,9 +179,10 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
         try:
             environment = {**os.environ, WRITING_VARIABLE: folders_for_workers()}
             os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
+            os.environ[PARENT_VARIABLE] = str(os.getpid())
             yield environment
         finally:
-            for name in (*added, IMPORTS_VARIABLE):
+            for name in (*added, IMPORTS_VARIABLE, PARENT_VARIABLE):
                 os.environ.pop(name, None)
 
 

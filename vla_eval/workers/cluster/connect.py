@@ -68,6 +68,8 @@ def connected(address: str) -> Iterator[Any]:
             "num_cpus": available_cores(),
             "num_gpus": len(visible_gpus()),
         }
+    if not address.startswith("ray://"):
+        quiet["job_config"] = _without_working_directory(ray)
     try:
         let_connect(f"--cluster {address}")
         _check_listening(address)
@@ -84,6 +86,17 @@ def connected(address: str) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _without_working_directory(ray: Any) -> Any:
+    """Return Ray's settings of a job that does not import from the driver's working directory.
+
+    Ray searches it first for modules, unless the job has a folder of its own, which would be copied to each
+    machine. There is no public switch.
+    """
+    config = ray.job_config.JobConfig()
+    config._runtime_env_has_working_dir = lambda: True
+    return config
 
 
 def _check_listening(address: str) -> None:

@@ -1,0 +1,148 @@
+"""A folder that holds a module of every name: no process that a verb starts may import one of them."""
+
+import argparse
+import importlib.metadata
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.cli.every_verb import (
+    COMMANDS,
+    ENDLESS,
+    FAKE,
+    REFUSED,
+    ROOT,
+    TASK,
+    command_line,
+    environment_of,
+    verb_of,
+)
+from vla_eval.cli.main import build_parser
+
+TRAP = """
+import os, sys
+with open({mark!r}, "a") as file:
+    file.write(f"{{os.getpid()}} {name} " + " ".join(sys.orig_argv)[:120].replace("\\n", " ") + "\\n")
+before, here = sys.path[:], os.path.dirname(os.path.abspath(__file__))
+sys.path[:] = [entry for entry in before if os.path.abspath(entry or ".") != here]
+sys.modules.pop(__name__, None)
+__import__(__name__)  # the real one: what is started lives on, to be caught again
+sys.path[:] = before
+"""
+HANGS_AFTER_S = 600.0
+
+
+class Traps:
+    """The folder, and what was caught in it."""
+
+    def __init__(self, folder: Path, *, with_standard_library: bool = True) -> None:
+        self.work, self.folder, self._mark = folder / "work", folder / "traps", folder / "mark"
+        self.work.mkdir()
+        self.folder.mkdir()
+        installed = set(importlib.metadata.packages_distributions())
+        own = {"sitecustomize", "usercustomize", "vla_eval"} | sys.stdlib_module_names
+        for name in installed | (own if with_standard_library else {"multiprocessing", "selectors"}):
+            if name.isidentifier():
+                (self.folder / f"{name}.py").write_text(TRAP.format(mark=str(self._mark), name=name))
+
+    def caught(self) -> dict[int, str]:
+        """Return process id -> the first module that it imported from here, and what it was started as."""
+        lines = self._mark.read_text().splitlines() if self._mark.exists() else []
+        self._mark.unlink(missing_ok=True)
+        return {int(pid): what for pid, _, what in (line.partition(" ") for line in reversed(lines))}
+
+    def run(self, command: str, *, until: str | None = None, **environment: str) -> tuple[int, int, str]:
+        """Return process id, exit code and output of a command; one that does not end is stopped."""
+        with subprocess.Popen(
+            command_line(command, self.work),
+            cwd=self.folder,
+            env=environment_of(self.work, **environment),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        ) as process:
+            assert process.stdout is not None
+            alarm = threading.Timer(HANGS_AFTER_S, process.kill)
+            alarm.start()
+            said = ""
+            for line in process.stdout:
+                said += line
+                if until is not None and until in line:
+                    process.terminate()
+            alarm.cancel()
+            return process.pid, process.wait(), said
+
+
+@pytest.fixture(scope="module")
+def traps(tmp_path_factory: pytest.TempPathFactory) -> Traps:
+    return Traps(tmp_path_factory.mktemp("trapped"))
+
+
+def verbs(parser: argparse.ArgumentParser, above: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
+    """Return every verb, and every action of those that have some."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return set().union(*(verbs(below, (*above, name)) for name, below in action.choices.items()))
+    return {above}
+
+
+def test_there_is_a_command_of_every_verb() -> None:
+    assert {verb_of(name) for name in COMMANDS} == verbs(build_parser())
+
+
+def test_no_process_of_any_verb_imports_from_the_working_directory(traps: Traps) -> None:
+    caught = {}
+    for name, command in COMMANDS.items():
+        _, code, said = traps.run(command, until=ENDLESS.get(name))
+        if name in ENDLESS:
+            assert ENDLESS[name] in said, f"{name}: {said}"
+        else:
+            assert code == (1 if name in REFUSED else 0), f"{name}: {said}"
+        if found := traps.caught():
+            caught[name] = sorted(found.values())
+    assert caught == {}
+
+
+@pytest.mark.parametrize(
+    "search_path",
+    [f"{ROOT}:", f":{ROOT}", f"{ROOT}::{ROOT}", f":{ROOT}:"],
+    ids=["last", "first", "mid", "both"],
+)
+def test_an_empty_entry_of_pythonpath_is_not_the_working_directory_of_children(
+    search_path: str, tmp_path: Path
+) -> None:
+    """Of the command itself it is: a trapped standard library ends the interpreter before we are asked."""
+    traps = Traps(tmp_path, with_standard_library=False)
+    pid, code, said = traps.run(COMMANDS["eval"], PYTHONPATH=search_path)
+    assert code == 0, said
+    caught = traps.caught()
+    caught.pop(pid, None)
+    assert caught == {}
+
+
+def test_a_folder_that_pythonpath_names_is_searched_also_if_it_is_the_working_directory(
+    tmp_path: Path,
+) -> None:
+    """As docs/policies.md has it: by the command, and by the worker process."""
+    (tmp_path / "my_policy.py").write_text(
+        "import os\nfrom pathlib import Path\n"
+        "from vla_eval.policies.scripted import make_cue_blind\n"
+        "def make(context):\n"
+        "    Path(__file__).with_name(f'made-by-{os.getpid()}').touch()\n"
+        "    return make_cue_blind(context)\n"
+    )
+    (tmp_path / "my_policy.yaml").write_text("version: 1\ndescription: mine\nadapter: my_policy:make\n")
+    for search_path in (".", f".{os.pathsep}{ROOT}", f"{ROOT}{os.pathsep}{tmp_path}"):
+        out = tmp_path / f"run-{len(search_path)}"
+        command = f"eval --task {TASK} --policy my_policy.yaml --episodes 1 {FAKE} --out {out}"
+        environment = environment_of(tmp_path, PYTHONPATH=f"{search_path}{os.pathsep}{ROOT}")
+        process = subprocess.run(
+            command_line(command, tmp_path), cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert process.returncode == 0, process.stderr
+    assert len(list(tmp_path.glob("made-by-*"))) >= 3
