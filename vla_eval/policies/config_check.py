@@ -6,6 +6,7 @@ machine's memory before anything could be said about it.
 
 import dataclasses
 import math
+import re
 import types
 from collections.abc import Mapping
 from typing import Any, Union, get_args, get_origin, get_type_hints  # Any: JSON, and types of lerobot's
@@ -15,6 +16,8 @@ from vla_eval.policies.checkpoint_json import FETCH_AGAIN, WORDS, get_count, wro
 
 MAX_ACTIONS = 10_000  # of a chunk or a history, in control steps: many times the longest episode
 MAX_VALUES = 1 << 28  # of one field of an observation: a gigabyte in float32
+REVISION = re.compile(r"(?!.*\.\.)\w[\w.+-]*(/[\w.+-]+)*", re.ASCII)
+"""A branch, tag or commit of the Hub. Its client opens a file of that name in its cache."""
 COUNTS = ("chunk_size", "n_action_steps", "horizon", "n_obs_steps", "window_steps")
 
 
@@ -37,6 +40,8 @@ def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
         # lerobot writes `int = False` of a switch, and `str = None` of what may be left out.
         if not _fits(hint, value) and type(value) is not type(field.default):
             raise wrong_type(where, field.name, _described(hint), value)
+        if "revision" in field.name and isinstance(value, str) and not REVISION.fullmatch(value):
+            raise wrong_type(where, field.name, "a branch, tag or commit", value)
     for name in COUNTS:
         get_count(data, name, maximum=MAX_ACTIONS, where=where)
 

@@ -34,6 +34,7 @@ from vla_eval.features import PROPRIO_STATES, StateKind
 from vla_eval.policies.bases import first_fetch
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_device import autocast, choose_device, cuda_devices
 from vla_eval.policies.lerobot_episodes import (
     Episode,
@@ -178,7 +179,7 @@ class LeRobotPolicy:
     def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
         policy, config = self._loaded.policy, self._loaded.config
         seeds = [episode.seed() for episode in rows]
-        with torch.random.fork_rng(devices=cuda_devices(config.device)), autocast(config):
+        with torch.random.fork_rng(devices=cuda_devices(config.device)), autocast(config), only_data():
             torch.manual_seed(seeds[0])
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}

@@ -46,7 +46,7 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
-from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.policies.weight_file import WeightFile
@@ -129,10 +129,15 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
                 "recipe."
             )
         data["dtype"] = options.dtype
-    data = with_local_files(data, folder, tokenizer=options.tokenizer)
+    # Also where the file does not have the field: its default may be weights that would be downloaded.
+    closed = {name: value for name, value in NO_DOWNLOADS.items() if name in cls.__dataclass_fields__}
+    data = with_local_files({**closed, **data}, folder, tokenizer=options.tokenizer)
     check_config(cls, data, where=where)
     try:
-        config = draccus.decode(cls, data)
+        with only_data():  # some configurations open the backbone that they name
+            config = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
         raise CheckpointError(
             f"{where}: not the configuration of a '{kind}' policy of the installed lerobot: {exc!s:.1000}"
@@ -196,10 +201,10 @@ def make_empty_policy(config: Any, **kwargs: Any) -> Any:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
         ) from exc
-    except OSError as exc:
-        raise_plainly(exc, config.type)
-    except (RuntimeError, ValueError, OverflowError, MemoryError) as exc:
-        if isinstance(exc, RuntimeError) and exc.__cause__ is not None:
+    except VlaEvalError:
+        raise
+    except Exception as exc:  # the constructors raise what they like of a configuration that does not fit
+        if isinstance(exc, OSError | RuntimeError) and _is_missing_file(exc):
             raise_plainly(exc, config.type)
         raise CheckpointError(
             f"a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
@@ -215,17 +220,21 @@ def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
         CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
         OSError, RuntimeError: as given, if it was something else.
     """
-    cause = exc.__cause__  # lerobot's π0-FAST wraps whatever went wrong
-    if isinstance(cause, VlaEvalError):
-        raise cause
-    if not isinstance(exc, OSError) and not isinstance(cause, OSError):
+    if isinstance(exc.__cause__, VlaEvalError):
+        raise exc.__cause__
+    if not _is_missing_file(exc):
         raise exc
-    missing = exc if isinstance(exc, OSError) else cause
+    missing = exc if isinstance(exc, OSError) else exc.__cause__
     raise CheckpointError(
         f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
         "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
         "fetch the file."
     ) from exc
+
+
+def _is_missing_file(exc: BaseException) -> bool:
+    """Whether a file is missing; lerobot's π0-FAST wraps whatever went wrong."""
+    return isinstance(exc, OSError) or isinstance(exc.__cause__, OSError)
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.policies.checkpoint import WEIGHTS_FILE, checkpoint_sha256, weights_file
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import (
     LoadedPolicy,
     LoadOptions,
@@ -116,7 +117,8 @@ def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
         InvalidActionError: the actions have another shape than declared, or are not finite.
     """
     loaded = load_checkpoint(path, options)
-    actions = _act(loaded)
+    with only_data():
+        actions = _act(loaded)
     expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
     if tuple(actions.shape) != expected or not torch.isfinite(actions).all():
         raise InvalidActionError(

@@ -14,6 +14,7 @@ from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
 from vla_eval.policies.bases import how_to_get
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.conversion.octo import SIZES
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
 from vla_eval.training.dataset import TrainingDataset, training_dataset
@@ -43,7 +44,10 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     if "action_grid" in known:
         data["action_grid"] = "uniform"
     try:
-        policy: Any = draccus.decode(cls, data)
+        with only_data():
+            policy: Any = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
     height, width, n_colors = IMAGE_SHAPE

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.frame_table import read_columns
 from vla_eval.errors import (
+    CheckpointError,
     RecipeError,
     SpecMismatchError,
     VlaEvalError,
@@ -26,6 +27,7 @@ from vla_eval.errors import (
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.config_check import check_config
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.training.dataset import TrainingDataset
 
@@ -59,7 +61,10 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
     try:
-        config = draccus.decode(cls, data)
+        with only_data():  # some configurations open the backbone that they name
+            config = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
     _set_features(config, recipe, dataset)

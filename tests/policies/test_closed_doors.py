@@ -1,0 +1,414 @@
+"""While a checkpoint is open no library imports, copies, unpickles or opens anything but data.
+
+The payloads are those of `hostile_folders`. Each is given to every loader of transformers, and every field of
+every policy of lerobot's that holds text names one.
+"""
+
+import contextlib
+import importlib
+import json
+import pickle
+import re
+import sys
+import threading
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torchvision
+import transformers
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+
+from tests.policies.hostile_folders import PAYLOADS, write_hostile
+from vla_eval.errors import CheckpointError, VlaEvalError
+from vla_eval.policies.backbones import fetched_backbones
+from vla_eval.policies.closed_doors import functions_of, refuse
+from vla_eval.policies.empty_weights import empty_weights
+from vla_eval.policies.foreign_code import (
+    ADAPTERS,
+    COPY_AND_IMPORT,
+    DATA,
+    LEFT_OPEN,
+    no_foreign_code,
+    only_data,
+)
+from vla_eval.policies.lerobot import LeRobotPolicy
+from vla_eval.policies.lerobot_loading import LoadOptions, config_class, make_empty_policy, read_config
+
+LOADERS = (
+    *("AutoConfig", "AutoTokenizer", "AutoProcessor", "AutoImageProcessor", "AutoVideoProcessor"),
+    *("AutoFeatureExtractor", "AutoModel", "AutoModelForCausalLM", "GenerationConfig", "GPT2Model"),
+    *("GPT2Tokenizer", "PreTrainedTokenizerFast", "BarkProcessor"),
+)
+FIELDS = {
+    "input_features": {
+        "observation.images.base": {"type": "VISUAL", "shape": [3, 64, 64]},
+        "observation.state": {"type": "STATE", "shape": [10]},
+    },
+    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+}
+with contextlib.suppress(VlaEvalError):
+    config_class("none", where="")  # registers all
+LEROBOTS = sorted(
+    kind
+    for kind in PreTrainedConfig.get_known_choices()
+    if PreTrainedConfig.get_choice_class(kind).__module__.startswith("lerobot.policies.")
+)
+NAMES_FILES = re.compile("name|path|model|base|tokenizer|encoder|repo")
+BACKBONES = ("auto_map", "imports_are_copied_first", "pickled_weights", "adapter")
+KNOWN: dict[str, set[str]] = {
+    "transformers.dynamic_module_utils": {
+        *("_sanitize_module_name", "init_hf_modules", "create_dynamic_module", "get_relative_imports"),
+        *("get_relative_import_files", "get_imports", "check_imports", "get_class_in_module"),
+        *("get_cached_module_file", "get_class_from_dynamic_module", "custom_object_save"),
+        *("_raise_timeout_error", "resolve_trust_remote_code", "check_python_requirements"),
+    },
+    "diffusers.utils.dynamic_modules_utils": {
+        *("get_diffusers_versions", "init_hf_modules", "create_dynamic_module", "get_relative_imports"),
+        *("get_relative_import_files", "check_imports", "resolve_trust_remote_code", "get_class_in_module"),
+        *("find_pipeline_class", "get_cached_module_file", "get_class_from_dynamic_module"),
+    },
+}
+"""Functions that were looked at, in transformers 5.5 and diffusers 0.39."""
+
+_watched: list[list[Path]] = []
+
+
+def _note(event: str, args: tuple[Any, ...]) -> None:
+    if event == "open" and _watched and isinstance(args[0], str | Path):
+        _watched[-1].append(Path(args[0]))
+
+
+sys.addaudithook(_note)  # of Python's own calls; what opens files natively is given data alone
+
+
+@contextlib.contextmanager
+def files_opened() -> Iterator[list[Path]]:
+    """Give the list of the files that Python opens within the context."""
+    opened: list[Path] = []
+    _watched.append(opened)
+    try:
+        yield opened
+    finally:
+        _watched.remove(opened)
+
+
+def other_than_data(opened: list[Path], folder: Path) -> list[Path]:
+    return [file for file in opened if file.is_relative_to(folder) and file.suffix not in DATA]
+
+
+@pytest.fixture
+def trace(tmp_path: Path) -> Path:
+    """What a payload writes if it runs."""
+    return tmp_path / "it-ran"
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's cache of modules, where an earlier program has left some and which Python searches."""
+    modules = tmp_path / "cache-of-modules"
+    modules.mkdir()
+    for module in COPY_AND_IMPORT:
+        monkeypatch.setattr(f"{module}.HF_MODULES_CACHE", str(modules))
+    monkeypatch.syspath_prepend(str(modules))
+    return modules
+
+
+class TestEveryLoader:
+    @pytest.mark.parametrize("payload", PAYLOADS)
+    def test_a_payload_leaves_no_trace_and_opens_only_data(
+        self, tmp_path: Path, trace: Path, cache: Path, payload: str
+    ) -> None:
+        hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
+        before = list(sys.path)
+        with files_opened() as opened:
+            for name in LOADERS:
+                for trusted in (None, True):
+                    # transformers raises what it likes of a damaged folder; ours comes out where we refuse
+                    with contextlib.suppress(Exception), no_foreign_code("smolvla"):
+                        getattr(transformers, name).from_pretrained(str(hostile), trust_remote_code=trusted)
+        assert opened
+        assert not trace.exists()
+        assert other_than_data(opened, tmp_path / "all") == []
+        assert sys.path == before
+        assert list(cache.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("payload", "loader", "says"),
+        [
+            ("auto_map", "AutoConfig", r"hostile names code of its own \(auto_map\).*not run"),
+            ("auto_map", "AutoModel", r"hostile names code of its own"),
+            ("imports_are_copied_first", "AutoTokenizer", r"hostile names code of its own"),
+            (
+                "pickled_weights",
+                "AutoModel",
+                r"hostile: expected the weights .* as \.safetensors, found none",
+            ),
+            ("pickled_shards", "GPT2Model", r"hostile: expected the weights .* as \.safetensors, found none"),
+            ("shards_that_are_none", "AutoModel", r"part\.bin: expected a file whose name ends in \.safe"),
+            ("shards_elsewhere", "AutoModel", r"above\.bin: expected a file whose name ends in \.safe"),
+            (
+                "adapter",
+                "AutoModel",
+                r"adapter_config\.json: expected a whole model as a backbone, found an ad",
+            ),
+            (
+                "adapter",
+                "GPT2Model",
+                r"adapter_config\.json: expected a whole model as a backbone, found an ad",
+            ),
+            (
+                "adapter_of_another",
+                "AutoModel",
+                r"adapter_config\.json: expected a whole model as a backbone",
+            ),
+            ("class_that_unpickles", "AutoTokenizer", r"names 'RagRetriever' of transformers"),
+        ],
+    )
+    def test_the_refusal_is_what_the_user_sees(
+        self, tmp_path: Path, trace: Path, payload: str, loader: str, says: str
+    ) -> None:
+        hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
+        with pytest.raises(CheckpointError, match=says), no_foreign_code("smolvla"):
+            getattr(transformers, loader).from_pretrained(str(hostile), trust_remote_code=True)
+
+    @pytest.mark.parametrize(
+        "payload", ["auto_map", "imports_are_copied_first", "auto_map_of_another_repository"]
+    )
+    def test_the_payloads_do_run_where_nothing_is_closed(
+        self, tmp_path: Path, trace: Path, cache: Path, payload: str
+    ) -> None:
+        hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
+        for name in ("AutoConfig", "AutoTokenizer"):
+            with contextlib.suppress(Exception):
+                getattr(transformers, name).from_pretrained(str(hostile), trust_remote_code=True)
+        assert trace.exists()
+
+    def test_an_honest_backbone_is_loaded_as_ever(self, tmp_path: Path) -> None:
+        """With `auto_map` for a type that transformers has, and pickles beside it that nothing names."""
+        from transformers import GPT2Config, GPT2Model
+
+        config = GPT2Config(n_embd=4, n_layer=1, n_head=1, vocab_size=8, n_positions=8)
+        config.auto_map = {"AutoConfig": "theirs.Theirs", "AutoModel": "theirs.Theirs"}
+        made: Any = GPT2Model(config)
+        made.save_pretrained(tmp_path)
+        (tmp_path / "pytorch_model.bin").write_bytes(pickle.dumps({}))
+        (tmp_path / "theirs.py").write_text("raise AssertionError")
+        with no_foreign_code("smolvla"):
+            found = transformers.AutoModel.from_pretrained(str(tmp_path), trust_remote_code=True)
+        for key, tensor in made.state_dict().items():
+            torch.testing.assert_close(found.state_dict()[key], tensor)
+
+
+class TestEveryField:
+    """A backbone is a checkpoint of its own, whichever field of a configuration names it."""
+
+    @pytest.mark.parametrize("kind", LEROBOTS)
+    def test_a_payload_that_a_field_names_leaves_no_trace(
+        self, tmp_path: Path, trace: Path, cache: Path, kind: str
+    ) -> None:
+        hints = typing.get_type_hints(PreTrainedConfig.get_choice_class(kind))
+        fields = [name for name, hint in hints.items() if _is_text(hint) and name != "device"]
+        assert "pretrained_path" in fields
+        for field in fields:
+            for payload in BACKBONES if NAMES_FILES.search(field) else ("auto_map",):
+                folder = tmp_path / "all" / field / payload
+                hostile = write_hostile(folder / "hostile", payload, trace)
+                for part in ("vae", "text_encoder", "tokenizer", "processor"):
+                    write_hostile(hostile / part, payload, trace)
+                data = {"type": kind, **FIELDS, field: str(hostile)}
+                (folder / "config.json").write_text(json.dumps(data))
+                with files_opened() as opened:
+                    build(folder)
+                assert not trace.exists(), (field, payload)
+                assert other_than_data(opened, folder) == []
+        assert list(cache.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("kind", "field"),
+        [
+            ("gaussian_actor", "vision_encoder_name"),
+            ("eo1", "vlm_base"),
+            ("groot", "base_model_path"),
+            ("vla_jepa", "qwen_model_name"),
+            ("evo1", "vlm_model_name"),
+        ],
+    )
+    @pytest.mark.parametrize(
+        ("payload", "says"),
+        [
+            ("pickled_weights", r"expected the weights of a backbone as \.safetensors"),
+            ("adapter", r"expected a whole model as a backbone, found an adapter"),
+        ],
+    )
+    def test_what_was_opened_once_is_refused_with_a_message(
+        self, tmp_path: Path, trace: Path, kind: str, field: str, payload: str, says: str
+    ) -> None:
+        hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
+        data = {"type": kind, **FIELDS, field: str(hostile)}
+        (tmp_path / "config.json").write_text(json.dumps(data))
+        config = read_config(tmp_path, LoadOptions(device="cpu"))
+        with pytest.raises(CheckpointError, match=says), empty_weights():
+            make_empty_policy(config)
+
+    def test_a_tokenizer_that_is_opened_in_the_first_forward_pass_goes_through_the_door(
+        self, tmp_path: Path
+    ) -> None:
+        torch.save({}, tmp_path / "x.pt")
+
+        class Lazy(LeRobotPolicy):
+            def __init__(self) -> None:
+                def lazy(*_: Any) -> Any:
+                    return torch.load(tmp_path / "x.pt")
+
+                config = types.SimpleNamespace(device="cpu", type="act", use_amp=False, dtype="float32")
+                policy: Any = types.SimpleNamespace(reset=lazy)
+                self._loaded = types.SimpleNamespace(policy=policy, config=config)  # type: ignore[assignment]
+
+        episode: Any = types.SimpleNamespace(seed=lambda: 0)
+        with pytest.raises(CheckpointError, match="would be unpickled"):
+            Lazy()._infer([episode])
+
+
+def _is_text(hint: Any) -> bool:
+    return bool({str, Path} & {hint, *typing.get_args(hint)}) and typing.get_origin(hint) not in (list, dict)
+
+
+def build(folder: Path) -> None:
+    """Read a configuration, and make the policy and its processors of it, as far as it goes."""
+    try:
+        config = read_config(folder, LoadOptions(device="cpu"))
+    except VlaEvalError:
+        return
+    with contextlib.suppress(VlaEvalError), empty_weights():
+        make_empty_policy(config)
+    with contextlib.suppress(Exception), no_foreign_code(config.type):  # lerobot's own raise what they like
+        make_pre_post_processors(config)
+
+
+class TestDoors:
+    @pytest.mark.parametrize("module", COPY_AND_IMPORT)
+    def test_the_functions_of_the_installed_version_are_those_that_were_looked_at(self, module: str) -> None:
+        """If this fails, there is a new one: say in foreign_code.py what becomes of it."""
+        assert set(functions_of(module)) == KNOWN[module]
+
+    @pytest.mark.parametrize(
+        ("module", "name"),
+        [(module, name) for module, names in KNOWN.items() for name in sorted(names - LEFT_OPEN)],
+    )
+    def test_each_refuses_wherever_it_was_imported(self, module: str, name: str) -> None:
+        arguments = {
+            ("transformers.dynamic_module_utils", "resolve_trust_remote_code"): (
+                True,
+                "hostile",
+                False,
+                True,
+            ),
+            ("diffusers.utils.dynamic_modules_utils", "resolve_trust_remote_code"): (True, "hostile", True),
+        }.get((module, name), ("a.B", "hostile"))
+        with only_data_once():
+            pass
+        function = getattr(importlib.import_module(module), name)
+        places = [
+            getattr(found, name)
+            for found in list(sys.modules.values())
+            if isinstance(vars(found).get(name) if hasattr(found, "__dict__") else None, type(function))
+            and vars(found)[name].__module__ == module
+        ]
+        assert places
+        for place in places:
+            with pytest.raises(CheckpointError, match="not run"), only_data():
+                place(*arguments)
+
+    def test_a_refusal_that_is_swallowed_is_raised_in_the_end(self) -> None:
+        def swallowing() -> None:
+            with only_data(), contextlib.suppress(Exception):
+                refuse("this one")
+
+        with pytest.raises(CheckpointError, match="this one"):
+            swallowing()
+        with pytest.raises(CheckpointError, match="this one"), only_data():
+            try:
+                refuse("this one")
+            except CheckpointError as exc:
+                raise ImportError("another") from exc
+
+    def test_other_threads_are_refused_too_and_nobody_is_afterwards(self, tmp_path: Path) -> None:
+        file = tmp_path / "x.pt"
+        torch.save({"a": torch.zeros(1)}, file)
+        errors: list[BaseException] = []
+
+        def load() -> None:
+            try:
+                torch.load(file)
+            except CheckpointError as exc:
+                errors.append(exc)
+
+        with pytest.raises(CheckpointError, match=r"x\.pt: expected \.safetensors"), only_data():
+            thread = threading.Thread(target=load)
+            thread.start()
+            thread.join()
+        assert len(errors) == 1
+        assert torch.load(file)["a"].shape == (1,)
+
+    @pytest.mark.parametrize("load", [torch.load, torch.jit.load, torch.export.load, torch.hub.load])
+    def test_nothing_is_unpickled(self, tmp_path: Path, load: Any) -> None:
+        file = tmp_path / "x.pt"
+        torch.save({"a": torch.zeros(1)}, file)
+        with only_data_once():
+            pass
+        current: Any = importlib.import_module(load.__module__.removesuffix("._serialization"))
+        with pytest.raises(CheckpointError, match="would be unpickled"), only_data():
+            current.load(str(file))
+
+    def test_a_module_that_is_imported_later_is_closed_too(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "imported_later.py").write_text("from torch import load as renamed\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        with pytest.raises(CheckpointError, match="would be unpickled"), only_data():
+            importlib.import_module("imported_later").renamed("x.pt")
+
+    @pytest.mark.parametrize("name", ["../x.json", "/x.json", "x.py", "x.bin", "x.gguf", "x.npy", "x"])
+    def test_transformers_finds_no_other_file_by_name(self, tmp_path: Path, name: str) -> None:
+        folder = tmp_path / "folder"
+        folder.mkdir()
+        (folder / name).write_text("") if not name.startswith("/") else None
+        with (
+            pytest.raises(CheckpointError, match=r"expected (a file whose name|names of files)"),
+            only_data(),
+        ):
+            transformers.utils.hub.cached_file(str(folder), name)
+
+    @pytest.mark.parametrize(("module", "name"), ADAPTERS)
+    def test_peft_opens_no_adapter(self, module: str, name: str) -> None:
+        with only_data_once():
+            pass
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        with pytest.raises(CheckpointError, match="found an adapter, which peft would load"), only_data():
+            found("a/folder")
+
+    def test_torchvisions_own_weights_are_still_read(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        weights = torchvision.models.ResNet34_Weights.IMAGENET1K_V1
+        checkpoints = tmp_path / "checkpoints"
+        checkpoints.mkdir()
+        monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
+        torch.save({"a": torch.zeros(1)}, checkpoints / weights.url.rpartition("/")[2])
+        with no_foreign_code("act"), fetched_backbones():
+            assert list(weights.get_state_dict(progress=False)) == ["a"]
+
+
+@contextlib.contextmanager
+def only_data_once() -> Iterator[None]:
+    """Put the doors in their places."""
+    with only_data():
+        yield
