@@ -15,6 +15,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint_json import FETCH_AGAIN, WORDS, get_count, wrong_type
 
 MAX_ACTIONS = 10_000  # of a chunk or a history, in control steps: many times the longest episode
+MAX_LAYERS = 1_000  # the largest language models have some 100
 MAX_VALUES = 1 << 28  # of one field of an observation: a gigabyte in float32
 REVISION = re.compile(r"(?!.*\.\.)\w[\w.+-]*(/[\w.+-]+)*", re.ASCII)
 """A branch, tag or commit of the Hub. Its client opens a file of that name in its cache."""
@@ -40,6 +41,8 @@ def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
         # lerobot writes `int = False` of a switch, and `str = None` of what may be left out.
         if not _fits(hint, value) and type(value) is not type(field.default):
             raise wrong_type(where, field.name, _described(hint), value)
+        if "layers" in field.name and type(value) is int and value > MAX_LAYERS:
+            raise wrong_type(where, field.name, f"at most {MAX_LAYERS:,} layers", value)
         if "revision" in field.name and isinstance(value, str) and not REVISION.fullmatch(value):
             raise wrong_type(where, field.name, "a branch, tag or commit", value)
     for name in COUNTS:

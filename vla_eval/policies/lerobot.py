@@ -34,7 +34,6 @@ from vla_eval.features import PROPRIO_STATES, StateKind
 from vla_eval.policies.bases import first_fetch
 from vla_eval.policies.checkpoint import read_facts
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_device import autocast, choose_device, cuda_devices
 from vla_eval.policies.lerobot_episodes import (
     Episode,
@@ -52,7 +51,7 @@ from vla_eval.policies.lerobot_inputs import (
     default_cameras,
     input_map,
 )
-from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint, plain_errors
 from vla_eval.policies.lerobot_memory import (
     memory_of,
     recall,
@@ -179,7 +178,8 @@ class LeRobotPolicy:
     def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
         policy, config = self._loaded.policy, self._loaded.config
         seeds = [episode.seed() for episode in rows]
-        with torch.random.fork_rng(devices=cuda_devices(config.device)), autocast(config), only_data():
+        devices = cuda_devices(config.device)
+        with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting():
             torch.manual_seed(seeds[0])
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}
@@ -260,15 +260,16 @@ def make_lerobot(
     asked = InputOptions(
         cameras=default_cameras() if cameras is None else cameras, state=state, absent_cameras=absent_cameras
     )
-    facts = read_facts(loaded.folder)
-    check_control_mode(facts, context.env, policy=context.name)
-    inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
-    check_training(
-        facts,
-        inputs,
-        loaded.config,
-        loaded.preprocessor,
-        context.env,
-        policy=context.name,
-    )
-    return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)
+    with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
+        facts = read_facts(loaded.folder)
+        check_control_mode(facts, context.env, policy=context.name)
+        inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
+        check_training(
+            facts,
+            inputs,
+            loaded.config,
+            loaded.preprocessor,
+            context.env,
+            policy=context.name,
+        )
+        return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)

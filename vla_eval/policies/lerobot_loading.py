@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
+import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -44,6 +45,7 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
+from vla_eval.policies.checkpoint_json import FETCH_AGAIN
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
 from vla_eval.policies.foreign_code import no_foreign_code, only_data
@@ -91,6 +93,42 @@ class LoadedPolicy:
     preprocessor: Any
     postprocessor: Any
 
+    @contextlib.contextmanager
+    def acting(self) -> Iterator[None]:
+        """Let the policy infer within the context, as safely as it was loaded.
+
+        Raises:
+            CheckpointError: from within, whatever its steps and its network make of what does not fit.
+        """
+        # Some policies open a tokenizer only in their first pass.
+        with plain_errors(self.folder, self.config.type, "cannot infer"), only_data():
+            yield
+
+
+@contextlib.contextmanager
+def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
+    """Make one message of whatever lerobot, torch and transformers raise of files that do not fit.
+
+    Args:
+        where: the checkpoint.
+        kind: lerobot's type of policy.
+        what: what fails, for the message.
+
+    Raises:
+        CheckpointError: from within, for every error that says nothing to the user.
+    """
+    try:
+        yield
+    except VlaEvalError:
+        raise
+    except Exception as exc:
+        is_memory = isinstance(exc, MemoryError | torch.OutOfMemoryError)
+        hint = f"Expected processors, a configuration and weights that belong together. {FETCH_AGAIN}"
+        raise CheckpointError(
+            f"{where}: the policy of type '{kind}' {what}: {type(exc).__name__}: {exc!s:.500} "
+            f"{'Use a device with more memory, or smaller batches.' if is_memory else hint}"
+        ) from exc
+
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
     """Load policy and processors.
@@ -105,11 +143,12 @@ def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
     """
     folder = find_checkpoint(path)
     config = read_config(folder, options)
-    with no_foreign_code(config.type):
-        policy = load_weights(folder, config, options)
-        preprocessor, postprocessor = load_processors(folder, config, tokenizer=options.tokenizer)
-    policy.eval()
-    check_statistics(folder, preprocessor, postprocessor)
+    with plain_errors(folder, config.type, "cannot be loaded"):
+        with no_foreign_code(config.type):
+            policy = load_weights(folder, config, options)
+            preprocessor, postprocessor = load_processors(folder, config, tokenizer=options.tokenizer)
+        policy.eval()
+        check_statistics(folder, preprocessor, postprocessor)
     return LoadedPolicy(
         folder=folder, config=config, policy=policy, preprocessor=preprocessor, postprocessor=postprocessor
     )

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.policies.checkpoint import WEIGHTS_FILE, checkpoint_sha256, weights_file
-from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import (
     LoadedPolicy,
     LoadOptions,
@@ -117,9 +116,9 @@ def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
         InvalidActionError: the actions have another shape than declared, or are not finite.
     """
     loaded = load_checkpoint(path, options)
-    with only_data():
+    with loaded.acting():
         actions = _act(loaded)
-    expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
+        expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
     if tuple(actions.shape) != expected or not torch.isfinite(actions).all():
         raise InvalidActionError(
             f"{loaded.folder}: expected finite actions of shape {expected}, found {tuple(actions.shape)}, "
