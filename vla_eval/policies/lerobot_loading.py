@@ -231,8 +231,18 @@ def _search_path() -> tuple[tuple[str, int], ...]:
     return tuple((place, folder.stat().st_mtime_ns) for place, folder in folders if folder.exists())
 
 
-def make_empty_policy(config: Any, **kwargs: Any) -> Any:
-    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer."""
+def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) -> Any:
+    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer.
+
+    Args:
+        config: of the policy.
+        where: its checkpoint, for messages.
+        kwargs: further arguments of the constructor.
+
+    Raises:
+        CheckpointError: the configuration does not fit, a file is missing, or code would have been run.
+        MissingDependencyError: the policy needs a package that is not installed.
+    """
     try:
         with no_foreign_code(config.type):
             return get_policy_class(config.type)(config, **kwargs)
@@ -245,8 +255,9 @@ def make_empty_policy(config: Any, **kwargs: Any) -> Any:
     except Exception as exc:  # the constructors raise what they like of a configuration that does not fit
         if isinstance(exc, OSError | RuntimeError) and _is_missing_file(exc):
             raise_plainly(exc, config.type)
+        of = "" if where is None else f"{where}: "
         raise CheckpointError(
-            f"a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
+            f"{of}a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
             f"{exc!s:.500} Expected sizes that belong together and fit into memory; fetch the checkpoint "
             "again."
         ) from exc
@@ -288,7 +299,9 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
     """
-    return fill_policy(make_unfilled_policy(config, **kwargs), folder, options).to(config.device)
+    return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
+        config.device
+    )
 
 
 def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:

@@ -97,7 +97,7 @@ def check_structure(folder: Path) -> Structure:
         CheckpointError: the configuration is refused, or tensors are missing, unexpected or of another shape.
     """
     config = read_config(folder, LoadOptions(device="cpu"))
-    policy = make_unfilled_policy(config)
+    policy = make_unfilled_policy(config, where=folder)
     file = folder / WEIGHTS_FILE
     weights = read_weights(file)
     check_fit(policy, weights, where=str(file), cast=True)
