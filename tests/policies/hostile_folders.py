@@ -1,12 +1,17 @@
 """Folders as a repository of the Hub has them, each with another payload that writes a file if it runs."""
 
+import contextlib
 import json
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from safetensors.torch import save_file
+
+from vla_eval.policies.foreign_code import COPY_AND_IMPORT, DATA
 
 AUTO = (
     *("AutoConfig", "AutoModel", "AutoModelForCausalLM", "AutoModelForImageTextToText", "AutoBackbone"),
@@ -227,3 +232,46 @@ def write_hostile(folder: Path, payload: str, trace: Path) -> Path:
         torch.save(WritesWhenUnpickled(trace), folder / name)
     PAYLOADS[payload](folder, trace)
     return folder
+
+
+_watched: list[list[Path]] = []
+
+
+def _note(event: str, args: tuple[Any, ...]) -> None:
+    if event == "open" and _watched and isinstance(args[0], str | Path):
+        _watched[-1].append(Path(args[0]))
+
+
+sys.addaudithook(_note)  # of Python's own calls; what opens files natively is given data alone
+
+
+@contextlib.contextmanager
+def files_opened() -> Iterator[list[Path]]:
+    """Give the list of the files that Python opens within the context."""
+    opened: list[Path] = []
+    _watched.append(opened)
+    try:
+        yield opened
+    finally:
+        _watched.remove(opened)
+
+
+def other_than_data(opened: list[Path], folder: Path) -> list[Path]:
+    return [file for file in opened if file.is_relative_to(folder) and file.suffix not in DATA]
+
+
+@pytest.fixture
+def trace(tmp_path: Path) -> Path:
+    """What a payload writes if it runs."""
+    return tmp_path / "it-ran"
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's cache of modules, where an earlier program has left some and which Python searches."""
+    modules = tmp_path / "cache-of-modules"
+    modules.mkdir()
+    for module in COPY_AND_IMPORT:
+        monkeypatch.setattr(f"{module}.HF_MODULES_CACHE", str(modules))
+    monkeypatch.syspath_prepend(str(modules))
+    return modules

@@ -1,18 +1,13 @@
 """While a checkpoint is open no library imports, copies, unpickles or opens anything but data.
 
-The payloads are those of `hostile_folders`. Each is given to every loader of transformers, and every field of
-every policy of lerobot's that holds text names one.
+The payloads are those of `hostile_folders`. Each is given to every loader of transformers.
 """
 
 import contextlib
 import importlib
-import json
 import pickle
-import re
 import sys
 import threading
-import types
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,46 +16,26 @@ import pytest
 import torch
 import torchvision
 import transformers
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
 
-from tests.policies.hostile_folders import PAYLOADS, write_hostile
-from vla_eval.errors import CheckpointError, VlaEvalError
+from tests.policies import hostile_folders
+from tests.policies.hostile_folders import PAYLOADS, files_opened, other_than_data, write_hostile
+from vla_eval.errors import CheckpointError
 from vla_eval.policies.backbones import fetched_backbones
 from vla_eval.policies.closed_doors import functions_of, refuse
-from vla_eval.policies.empty_weights import empty_weights
 from vla_eval.policies.foreign_code import (
     ADAPTERS,
     COPY_AND_IMPORT,
-    DATA,
     LEFT_OPEN,
     no_foreign_code,
     only_data,
 )
-from vla_eval.policies.lerobot import LeRobotPolicy
-from vla_eval.policies.lerobot_loading import LoadOptions, config_class, make_empty_policy, read_config
 
+trace, cache = hostile_folders.trace, hostile_folders.cache
 LOADERS = (
     *("AutoConfig", "AutoTokenizer", "AutoProcessor", "AutoImageProcessor", "AutoVideoProcessor"),
     *("AutoFeatureExtractor", "AutoModel", "AutoModelForCausalLM", "GenerationConfig", "GPT2Model"),
     *("GPT2Tokenizer", "PreTrainedTokenizerFast", "BarkProcessor"),
 )
-FIELDS = {
-    "input_features": {
-        "observation.images.base": {"type": "VISUAL", "shape": [3, 64, 64]},
-        "observation.state": {"type": "STATE", "shape": [10]},
-    },
-    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
-}
-with contextlib.suppress(VlaEvalError):
-    config_class("none", where="")  # registers all
-LEROBOTS = sorted(
-    kind
-    for kind in PreTrainedConfig.get_known_choices()
-    if PreTrainedConfig.get_choice_class(kind).__module__.startswith("lerobot.policies.")
-)
-NAMES_FILES = re.compile("name|path|model|base|tokenizer|encoder|repo")
-BACKBONES = ("auto_map", "imports_are_copied_first", "pickled_weights", "adapter")
 KNOWN: dict[str, set[str]] = {
     "transformers.dynamic_module_utils": {
         *("_sanitize_module_name", "init_hf_modules", "create_dynamic_module", "get_relative_imports"),
@@ -75,48 +50,6 @@ KNOWN: dict[str, set[str]] = {
     },
 }
 """Functions that were looked at, in transformers 5.5 and diffusers 0.39."""
-
-_watched: list[list[Path]] = []
-
-
-def _note(event: str, args: tuple[Any, ...]) -> None:
-    if event == "open" and _watched and isinstance(args[0], str | Path):
-        _watched[-1].append(Path(args[0]))
-
-
-sys.addaudithook(_note)  # of Python's own calls; what opens files natively is given data alone
-
-
-@contextlib.contextmanager
-def files_opened() -> Iterator[list[Path]]:
-    """Give the list of the files that Python opens within the context."""
-    opened: list[Path] = []
-    _watched.append(opened)
-    try:
-        yield opened
-    finally:
-        _watched.remove(opened)
-
-
-def other_than_data(opened: list[Path], folder: Path) -> list[Path]:
-    return [file for file in opened if file.is_relative_to(folder) and file.suffix not in DATA]
-
-
-@pytest.fixture
-def trace(tmp_path: Path) -> Path:
-    """What a payload writes if it runs."""
-    return tmp_path / "it-ran"
-
-
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's cache of modules, where an earlier program has left some and which Python searches."""
-    modules = tmp_path / "cache-of-modules"
-    modules.mkdir()
-    for module in COPY_AND_IMPORT:
-        monkeypatch.setattr(f"{module}.HF_MODULES_CACHE", str(modules))
-    monkeypatch.syspath_prepend(str(modules))
-    return modules
 
 
 class TestEveryLoader:
@@ -203,92 +136,6 @@ class TestEveryLoader:
             found = transformers.AutoModel.from_pretrained(str(tmp_path), trust_remote_code=True)
         for key, tensor in made.state_dict().items():
             torch.testing.assert_close(found.state_dict()[key], tensor)
-
-
-class TestEveryField:
-    """A backbone is a checkpoint of its own, whichever field of a configuration names it."""
-
-    @pytest.mark.parametrize("kind", LEROBOTS)
-    def test_a_payload_that_a_field_names_leaves_no_trace(
-        self, tmp_path: Path, trace: Path, cache: Path, kind: str
-    ) -> None:
-        hints = typing.get_type_hints(PreTrainedConfig.get_choice_class(kind))
-        fields = [name for name, hint in hints.items() if _is_text(hint) and name != "device"]
-        assert "pretrained_path" in fields
-        for field in fields:
-            for payload in BACKBONES if NAMES_FILES.search(field) else ("auto_map",):
-                folder = tmp_path / "all" / field / payload
-                hostile = write_hostile(folder / "hostile", payload, trace)
-                for part in ("vae", "text_encoder", "tokenizer", "processor"):
-                    write_hostile(hostile / part, payload, trace)
-                data = {"type": kind, **FIELDS, field: str(hostile)}
-                (folder / "config.json").write_text(json.dumps(data))
-                with files_opened() as opened:
-                    build(folder)
-                assert not trace.exists(), (field, payload)
-                assert other_than_data(opened, folder) == []
-        assert list(cache.iterdir()) == []
-
-    @pytest.mark.parametrize(
-        ("kind", "field"),
-        [
-            ("gaussian_actor", "vision_encoder_name"),
-            ("eo1", "vlm_base"),
-            ("groot", "base_model_path"),
-            ("vla_jepa", "qwen_model_name"),
-            ("evo1", "vlm_model_name"),
-        ],
-    )
-    @pytest.mark.parametrize(
-        ("payload", "says"),
-        [
-            ("pickled_weights", r"expected the weights of a backbone as \.safetensors"),
-            ("adapter", r"expected a whole model as a backbone, found an adapter"),
-        ],
-    )
-    def test_what_was_opened_once_is_refused_with_a_message(
-        self, tmp_path: Path, trace: Path, kind: str, field: str, payload: str, says: str
-    ) -> None:
-        hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
-        data = {"type": kind, **FIELDS, field: str(hostile)}
-        (tmp_path / "config.json").write_text(json.dumps(data))
-        config = read_config(tmp_path, LoadOptions(device="cpu"))
-        with pytest.raises(CheckpointError, match=says), empty_weights():
-            make_empty_policy(config)
-
-    def test_a_tokenizer_that_is_opened_in_the_first_forward_pass_goes_through_the_door(
-        self, tmp_path: Path
-    ) -> None:
-        torch.save({}, tmp_path / "x.pt")
-
-        class Lazy(LeRobotPolicy):
-            def __init__(self) -> None:
-                def lazy(*_: Any) -> Any:
-                    return torch.load(tmp_path / "x.pt")
-
-                config = types.SimpleNamespace(device="cpu", type="act", use_amp=False, dtype="float32")
-                policy: Any = types.SimpleNamespace(reset=lazy)
-                self._loaded = types.SimpleNamespace(policy=policy, config=config)  # type: ignore[assignment]
-
-        episode: Any = types.SimpleNamespace(seed=lambda: 0)
-        with pytest.raises(CheckpointError, match="would be unpickled"):
-            Lazy()._infer([episode])
-
-
-def _is_text(hint: Any) -> bool:
-    return bool({str, Path} & {hint, *typing.get_args(hint)}) and typing.get_origin(hint) not in (list, dict)
-
-
-def build(folder: Path) -> None:
-    """Read a configuration, and make the policy and its processors of it, as far as it goes."""
-    try:
-        config = read_config(folder, LoadOptions(device="cpu"))
-    except VlaEvalError:
-        return
-    with contextlib.suppress(VlaEvalError), empty_weights():
-        make_empty_policy(config)
-    with contextlib.suppress(Exception), no_foreign_code(config.type):  # lerobot's own raise what they like
-        make_pre_post_processors(config)
 
 
 class TestDoors:

@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any, NoReturn  # transformers and lerobot are untyped
 from unittest.mock import patch
 
+from vla_eval.policies.checkpoint_json import FETCH_AGAIN, read_json
 from vla_eval.policies.closed_doors import Door, closed, functions_of, refuse, replace
 from vla_eval.policies.processor_door import processors_through_the_door
+from vla_eval.policies.saved_processor import leads_out
+from vla_eval.strict_json import shown
 
 READS_ACTION_TOKENIZERS = (
     "lerobot.policies.pi0_fast.modeling_pi0_fast",
     "lerobot.processor.tokenizer_processor",
 )
-RUNS_CODE = "get_class_in_module"
-"""The only function of transformers that executes a file; a test counts who calls it."""
-CALLS_IT = ("transformers.dynamic_module_utils", "transformers.generation.utils")
 COPY_AND_IMPORT = ("transformers.dynamic_module_utils", "diffusers.utils.dynamic_modules_utils")
 """They copy code files into a cache, import what these import, and run them: nothing of it is left open."""
 LEFT_OPEN = frozenset({"custom_object_save", "_sanitize_module_name", "find_pipeline_class"})
@@ -64,6 +64,9 @@ DATA = frozenset(
     {WEIGHTS, ".json", ".jinja", ".txt", ".model", ".spm", ".vocab", ".codes", ".tokenizer", ".tiktoken"}
 )
 """Endings of the files that transformers may open: weights, JSON, templates and vocabularies."""
+TOKENIZER_CONFIG = "tokenizer_config.json"
+NOT_OPENED = "special_tokens_map_file"
+"""Of old tokenizers: where it lay on the machine that saved it."""
 MODULES_CACHE = "HF_MODULES_CACHE"
 TRUSTS = (
     "If you trust it, LeRobot's own loop does: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
@@ -164,7 +167,7 @@ def _only_data_class(look_up: Callable[..., Any], class_name: str, *args: Any, *
     if found is not None and not _reads_data(found):
         refuse(
             f"a file names '{class_name!s:.100}' of transformers as its tokenizer or processor, which is "
-            "none. It is not called. Fetch the checkpoint again, from where you trust it."
+            f"none. It is not called. {FETCH_AGAIN}"
         )
     return found
 
@@ -192,8 +195,7 @@ def _refuse_pickle(_original: object, file: object = "?", *_: object, **__: obje
 
 def _refuse_kernel(_original: object, name: object = "?", *_: object, **__: object) -> NoReturn:
     refuse(
-        f"a file names the kernel {name!s:.100}, compiled code of the Hub. It is not loaded. Fetch the "
-        "checkpoint again, from where you trust it."
+        f"a file names the kernel {name!s:.100}, compiled code of the Hub. It is not loaded. {FETCH_AGAIN}"
     )
 
 
@@ -233,7 +235,19 @@ def _data_files(
     for file in found or ():
         if file is not None:
             _check_ending(file, DATA)
+            if Path(file).name == TOKENIZER_CONFIG:
+                _check_named_files(Path(file))
     return found
+
+
+def _check_named_files(config: Path) -> None:
+    """Refuse a tokenizer that names files elsewhere as its own: transformers would open them."""
+    for key, value in read_json(config).items():
+        is_file = key.endswith("_file") and key != NOT_OPENED and isinstance(value, str)
+        if is_file and os.path.exists(value) and leads_out(os.path.abspath(value), config.parent):
+            refuse(
+                f"{config}: {key!r:.100}: expected a file of this folder, found {shown(value)}. {FETCH_AGAIN}"
+            )
 
 
 def _safetensors(find: Callable[..., tuple[list[str] | None, Any]], *args: Any, **kwargs: Any) -> Any:
@@ -261,7 +275,7 @@ def _check_ending(file: str, endings: frozenset[str]) -> None:
     if Path(file).suffix not in endings:
         refuse(
             f"{file!s:.300}: expected a file whose name ends in {', '.join(sorted(endings))}; others are not "
-            "opened. Fetch the checkpoint again, from where you trust it."
+            f"opened. {FETCH_AGAIN}"
         )
 
 

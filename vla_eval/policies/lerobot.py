@@ -51,7 +51,7 @@ from vla_eval.policies.lerobot_inputs import (
     default_cameras,
     input_map,
 )
-from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint, plain_errors
+from vla_eval.policies.lerobot_loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.policies.lerobot_memory import (
     memory_of,
     recall,
@@ -60,6 +60,7 @@ from vla_eval.policies.lerobot_memory import (
     remembers_singly,
 )
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.specs import PolicySpec
 

@@ -17,10 +17,9 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn  # lerobot is untyped: its configs, policies and processors are Any here
+from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
-import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -45,12 +44,12 @@ from vla_eval.policies.checkpoint import (
     find_checkpoint,
     read_json,
 )
-from vla_eval.policies.checkpoint_json import FETCH_AGAIN
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
 from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.plain_errors import plain_errors, raise_plainly, says_what_is_missing
 from vla_eval.policies.weight_file import WeightFile
 from vla_eval.policies.weights import check_same, put_weights
 
@@ -103,31 +102,6 @@ class LoadedPolicy:
         # Some policies open a tokenizer only in their first pass.
         with plain_errors(self.folder, self.config.type, "cannot infer"), only_data():
             yield
-
-
-@contextlib.contextmanager
-def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
-    """Make one message of whatever lerobot, torch and transformers raise of files that do not fit.
-
-    Args:
-        where: the checkpoint.
-        kind: lerobot's type of policy.
-        what: what fails, for the message.
-
-    Raises:
-        CheckpointError: from within, for every error that says nothing to the user.
-    """
-    try:
-        yield
-    except VlaEvalError:
-        raise
-    except Exception as exc:
-        is_memory = isinstance(exc, MemoryError | torch.OutOfMemoryError)
-        hint = f"Expected processors, a configuration and weights that belong together. {FETCH_AGAIN}"
-        raise CheckpointError(
-            f"{where}: the policy of type '{kind}' {what}: {type(exc).__name__}: {exc!s:.500} "
-            f"{'Use a device with more memory, or smaller batches.' if is_memory else hint}"
-        ) from exc
 
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
@@ -253,7 +227,7 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
     except VlaEvalError:
         raise
     except Exception as exc:  # the constructors raise what they like of a configuration that does not fit
-        if isinstance(exc, OSError | RuntimeError) and _is_missing_file(exc):
+        if isinstance(exc, OSError | RuntimeError) and says_what_is_missing(exc):
             raise_plainly(exc, config.type)
         of = "" if where is None else f"{where}: "
         raise CheckpointError(
@@ -261,30 +235,6 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
             f"{exc!s:.500} Expected sizes that belong together and fit into memory; fetch the checkpoint "
             "again."
         ) from exc
-
-
-def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
-    """Say which file is missing, if that is what ended the making of a policy or of its processors.
-
-    Raises:
-        CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
-        OSError, RuntimeError: as given, if it was something else.
-    """
-    if isinstance(exc.__cause__, VlaEvalError):
-        raise exc.__cause__
-    if not _is_missing_file(exc):
-        raise exc
-    missing = exc if isinstance(exc, OSError) else exc.__cause__
-    raise CheckpointError(
-        f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
-        "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
-        "fetch the file."
-    ) from exc
-
-
-def _is_missing_file(exc: BaseException) -> bool:
-    """Whether a file is missing; lerobot's π0-FAST wraps whatever went wrong."""
-    return isinstance(exc, OSError) or isinstance(exc.__cause__, OSError)
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:

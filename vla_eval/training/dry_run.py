@@ -16,7 +16,8 @@ from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.conversion.octo import SIZES
 from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_device import choose_device
-from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class, plain_errors
+from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.failures import chosen_episodes

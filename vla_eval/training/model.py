@@ -21,10 +21,9 @@ from vla_eval.policies.lerobot_loading import (
     begin_from,
     config_class,
     fill_policy,
-    plain_errors,
-    raise_plainly,
 )
 from vla_eval.policies.lerobot_processors import step_names, tokenizer_overrides
+from vla_eval.policies.plain_errors import plain_errors, raise_plainly
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.lora import check_adapters, peft_config

@@ -28,7 +28,8 @@ from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.config_check import check_config
 from vla_eval.policies.foreign_code import only_data
-from vla_eval.policies.lerobot_loading import config_class, plain_errors, with_local_files
+from vla_eval.policies.lerobot_loading import config_class, with_local_files
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
