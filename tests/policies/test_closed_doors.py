@@ -242,6 +242,20 @@ class TestDoors:
         with pytest.raises(CheckpointError, match="found an adapter, which peft would load"), only_data():
             found("a/folder")
 
+    @pytest.mark.parametrize("installed", [True, False])
+    def test_no_kernel_of_the_hub_is_loaded(self, monkeypatch: pytest.MonkeyPatch, installed: bool) -> None:
+        kernels: Any = importlib.import_module("transformers.integrations.hub_kernels")
+        monkeypatch.setattr(kernels, "_kernels_available", installed)
+        monkeypatch.setattr(kernels, "get_kernel_hub", lambda *_, **__: pytest.fail("loaded"), raising=False)
+        for load in ("get_kernel", "load_and_register_attn_kernel"):
+            with (
+                pytest.raises(CheckpointError, match="'kernels-community/x', compiled code"),
+                only_data(),
+            ):
+                getattr(kernels, load)("kernels-community/x")
+        with only_data():  # a network that asks for a faster one does without
+            assert kernels.lazy_load_kernel("mamba-ssm", {}) is None
+
     def test_torchvisions_own_weights_are_still_read(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:

@@ -36,8 +36,8 @@ class Door:
     guard: Guard
 
 
-_open: list[list[CheckpointError]] = []
-"""For each context that is open, what was refused within it."""
+_open: dict[int, list[CheckpointError]] = {}
+"""For each context that is open, of whatever thread, what was refused within it."""
 _let_through: ContextVar[bool] = ContextVar("_let_through", default=False)
 _replaced: set[tuple[str, str]] = set()
 
@@ -91,7 +91,7 @@ def closed() -> Iterator[None]:
         CheckpointError: what was refused, also where a library went on without it.
     """
     refused: list[CheckpointError] = []
-    _open.append(refused)
+    _open[id(refused)] = refused
     try:
         yield
     except Exception as exc:
@@ -99,7 +99,7 @@ def closed() -> Iterator[None]:
             raise refused[0] from exc
         raise
     finally:
-        _open[:] = [other for other in _open if other is not refused]
+        del _open[id(refused)]
     if refused:
         raise refused[0]
 
@@ -107,7 +107,7 @@ def closed() -> Iterator[None]:
 def refuse(message: str) -> NoReturn:
     """Raise an error that is not forgotten if somebody catches it."""
     error = CheckpointError(message)
-    for refused in _open:
+    for refused in list(_open.values()):
         refused.append(error)
     raise error
 

@@ -47,7 +47,7 @@ UNPICKLES = (
     ("torch.hub", "load"),
     ("torch.hub", "load_state_dict_from_url"),
 )
-KERNELS = ("load_and_register_attn_kernel", "get_kernel", "lazy_load_kernel")
+KERNELS = "transformers.integrations.hub_kernels"
 ADAPTERS = (
     ("peft.config", "PeftConfigMixin.from_pretrained"),
     ("peft.config", "PeftConfigMixin.from_json_file"),
@@ -125,8 +125,9 @@ def _doors() -> tuple[Door, ...]:
     ]
     pickles = [Door(module=module, name=name, guard=_refuse_pickle) for module, name in UNPICKLES]
     kernels = [
-        Door(module="transformers.integrations.hub_kernels", name=name, guard=_refuse_kernel)
-        for name in KERNELS
+        Door(module=KERNELS, name="get_kernel", guard=_refuse_kernel),
+        Door(module=KERNELS, name="load_and_register_attn_kernel", guard=_refuse_kernel),
+        Door(module=KERNELS, name="lazy_load_kernel", guard=_without_kernels),
     ]
     adapters = [Door(module=module, name=name, guard=_refuse_adapter) for module, name in ADAPTERS]
     files = [
@@ -195,8 +196,14 @@ def _refuse_pickle(_original: object, file: object = "?", *_: object, **__: obje
 
 def _refuse_kernel(_original: object, name: object = "?", *_: object, **__: object) -> NoReturn:
     refuse(
-        f"a file names the kernel {name!s:.100}, compiled code of the Hub. It is not loaded. {FETCH_AGAIN}"
+        f"a file names the kernel {str(name)[:100]!r}, compiled code of the Hub. It is not loaded. "
+        f"{FETCH_AGAIN}"
     )
+
+
+def _without_kernels(look_up: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Let a network that asks for a faster kernel of the Hub do without; an installed package is taken."""
+    return None if sys.modules[KERNELS]._kernels_available else look_up(*args, **kwargs)
 
 
 def _refuse_adapter(_original: object, *args: object, **_: object) -> NoReturn:
