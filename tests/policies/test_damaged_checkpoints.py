@@ -21,6 +21,7 @@ from vla_eval.policies.verify import verify_checkpoint
 from vla_eval.testing.tiny_models import tiny_resnet
 
 CONFIG, BEFORE, AFTER = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "memory_color3"
 Damage = Callable[[Path], None]
 
 
@@ -135,14 +136,24 @@ def test_a_dry_run_says_what_is_wrong(
 
 @pytest.mark.slow  # a worker that imports torch and lerobot
 @pytest.mark.parametrize(
-    "damaged",
-    [NETWORKS["a backbone that is no network"], PROCESSORS["a new name for the state"]],
-    indirect=True,
+    ("damage", "says"),
+    [
+        (fields(patch_px=7), "memory_color3"),
+        (PROCESSORS["a step that is not registered"], "one_of_tomorrow"),
+        (step(BEFORE, "groot_n1d7_unpack_v1"), "memory_color3"),
+    ],
 )
-def test_eval_says_what_is_wrong(damaged: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--task", TASK, "--policy", str(damaged), "--episodes", "1", "--workers", "1"]
+def test_eval_says_what_is_wrong(
+    damage: Damage, says: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "memory_color3"
+    shutil.copytree(SHIPPED, folder)
+    damage(folder)
+    arguments = ["--task", TASK, "--policy", str(folder), "--episodes", "1", "--workers", "1"]
     assert main(["eval", *arguments, "--set", "simulator=fake", "--out", str(tmp_path / "run")]) == 1
-    assert "Traceback" not in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert says in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("file", [BEFORE, AFTER])
