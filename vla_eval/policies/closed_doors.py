@@ -88,7 +88,7 @@ def closed() -> Iterator[None]:
     """Close the doors within the context.
 
     Raises:
-        CheckpointError: what was refused, also where a library went on without it.
+        CheckpointError: what was refused, also where a library continued without it.
     """
     refused: list[CheckpointError] = []
     _open[id(refused)] = refused
@@ -114,7 +114,7 @@ def refuse(message: str) -> NoReturn:
 
 @contextlib.contextmanager
 def let_through() -> Iterator[None]:
-    """Open the doors again within the context, for this thread alone: for files of nobody's checkpoint."""
+    """Open the doors again within the context, for this thread alone and for files of no checkpoint."""
     token = _let_through.set(True)
     try:
         yield
