@@ -1,6 +1,12 @@
-"""Random JSON in the place of a checkpoint's: it is accepted, or refused with a message. Loads no model."""
+"""Random JSON in the place of a checkpoint's: it is accepted, or refused with a message.
 
+Of every family its configuration and its processors are read; of some the network is built, without memory.
+"""
+
+import contextlib
+import dataclasses
 import json
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,15 +14,21 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.processor import ProcessorStepRegistry
 from safetensors.numpy import save_file
 
 from tests.fuzz.json_cases import accepted_or_refused
+from vla_eval.errors import VlaEvalError
 from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import checkpoint_sha256
 from vla_eval.policies.checkpoint_notes import normalization_notes
-from vla_eval.policies.lerobot_loading import LoadOptions, read_config
-from vla_eval.policies.processor_door import resolve_step
+from vla_eval.policies.empty_weights import empty_weights
+from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.lerobot_loading import LoadOptions, config_class, make_empty_policy, read_config
+from vla_eval.policies.lerobot_processors import register_steps
+from vla_eval.policies.processor_door import load_processor, resolve_step
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.saved_processor import check_paths, read_saved_processor
 
@@ -131,3 +143,112 @@ def test_other_bytes_are_accepted_or_refused_with_a_message(
     (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     for ask in QUESTIONS[name]:
         accepted_or_refused(lambda ask=ask: ask(folder))
+
+
+with contextlib.suppress(VlaEvalError):
+    config_class("none", where="")  # registers all
+FAMILIES = sorted(
+    kind
+    for kind in PreTrainedConfig.get_known_choices()
+    if PreTrainedConfig.get_choice_class(kind).__module__.startswith(("lerobot.policies.", "vla_eval."))
+)
+FEATURES: dict[str, Any] = {
+    "input_features": {
+        "observation.images.base": {"type": "VISUAL", "shape": [3, 64, 64]},
+        "observation.images.wrist": {"type": "VISUAL", "shape": [3, 64, 64]},
+        "observation.state": {"type": "STATE", "shape": [10]},
+    },
+    "output_features": {"action": {"type": "ACTION", "shape": [7]}},
+}
+INTEGERS = st.sampled_from((-1, 0, 1, 2, 3, 7, 64, 10_000, 2**31, 2**63, 10**30)) | st.integers()
+SIZES = st.sampled_from((-1, 0, 1, 2, 3, 7, 64, 2**31, 2**63))
+SMALL: dict[str, dict[str, Any]] = {
+    "act": {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32},
+    "diffusion": {"down_dims": [16, 32], "n_groups": 4},
+}
+BY_TYPE: dict[type, st.SearchStrategy[Any]] = {
+    bool: st.booleans(),
+    int: INTEGERS,
+    float: st.floats() | INTEGERS,
+    str: NASTY | st.text(max_size=8) | st.sampled_from(("resnet", "resnet9", "gemma_1t", "float8", "DDPM")),
+    list: st.lists(INTEGERS | NASTY, max_size=4),
+    tuple: st.lists(INTEGERS | NASTY, max_size=4),
+    dict: st.dictionaries(NAMES, VALUES, max_size=3),
+}
+
+
+def of_its_type(hint: Any, numbers: st.SearchStrategy[Any] | None = None) -> st.SearchStrategy[Any]:
+    """Return values that the check of types lets pass, as far as it knows the type."""
+    if numbers is not None and hint in (int, float, int | None):
+        return numbers
+    options = [typing.get_origin(one) or one for one in (hint, *typing.get_args(hint))]
+    known = [BY_TYPE[one] for one in options if isinstance(one, type) and one in BY_TYPE]
+    return st.one_of(*known) if known else VALUES
+
+
+@st.composite
+def config_of(draw: Any, kind: str, numbers: st.SearchStrategy[Any] | None = None) -> dict[str, Any]:
+    """Return a configuration of a family with up to three wrong fields.
+
+    Args:
+        draw: of hypothesis.
+        kind: of the family.
+        numbers: instead of all numbers, those that a network of moderate size can have, or none.
+    """
+    hints = typing.get_type_hints(PreTrainedConfig.get_choice_class(kind))
+    names = [field.name for field in dataclasses.fields(PreTrainedConfig.get_choice_class(kind))]
+    some = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
+
+    def value(name: str) -> Any:
+        fitting = of_its_type(hints[name], numbers)
+        return draw(fitting if numbers is not None else fitting | VALUES)
+
+    return {"type": kind, **FEATURES, **{name: value(name) for name in some}}
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_a_configuration_of_any_family_is_accepted_or_refused(folder: Path, kind: str, data: Any) -> None:
+    (folder / CONFIG).write_bytes(written(data.draw(config_of(kind))))
+    accepted_or_refused(lambda: read_config(folder, LoadOptions(device="cpu")))
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("kind", ["act", "diffusion", "mikasa_memory", "mikasa_octo", "mikasa_sequence"])
+def test_a_network_of_any_configuration_is_built_or_refused(folder: Path, kind: str, data: Any) -> None:
+    described = data.draw(config_of(kind, numbers=SIZES))
+    (folder / CONFIG).write_bytes(written({**SMALL.get(kind, {}), **described}))
+
+    def build() -> None:
+        config = read_config(folder, LoadOptions(device="cpu"))
+        with empty_weights():
+            make_empty_policy(config)
+
+    accepted_or_refused(build)
+
+
+for _kind in FAMILIES:
+    with contextlib.suppress(ImportError):  # a package that a family needs is not installed
+        register_steps(PreTrainedConfig.get_choice_class(_kind))
+REGISTERED = sorted(ProcessorStepRegistry.list())
+
+
+@st.composite
+def step_of_any_family(draw: Any) -> dict[str, Any]:
+    """Return a registered step with settings of their names, and wrong values."""
+    name = draw(st.sampled_from(REGISTERED))
+    cls: Any = ProcessorStepRegistry.get(name)
+    known = [field.name for field in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else []
+    names = st.sampled_from(known) | NAMES if known else NAMES
+    return {"registry_name": name, "config": draw(st.dictionaries(names, VALUES, max_size=3))}
+
+
+@given(steps=st.lists(step_of_any_family(), max_size=3))
+def test_steps_of_any_family_are_made_or_refused(folder: Path, steps: list[dict[str, Any]]) -> None:
+    (folder / PREPROCESSOR).write_bytes(written({"steps": steps}))
+
+    def load() -> None:
+        with no_foreign_code("act"):
+            load_processor(folder / PREPROCESSOR, overrides={})
+
+    accepted_or_refused(load)

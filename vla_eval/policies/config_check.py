@@ -6,6 +6,7 @@ machine's memory before anything could be said about it.
 
 import dataclasses
 import math
+import re
 import types
 from collections.abc import Mapping
 from typing import Any, Union, get_args, get_origin, get_type_hints  # Any: JSON, and types of lerobot's
@@ -14,7 +15,11 @@ from vla_eval.errors import CheckpointError
 from vla_eval.policies.checkpoint_json import FETCH_AGAIN, WORDS, get_count, wrong_type
 
 MAX_ACTIONS = 10_000  # of a chunk or a history, in control steps: many times the longest episode
+MOST: Mapping[str, int] = {"layers": 1_000, "depth": 1_000, "cameras": 100}
+"""End of a field's name -> the largest number of what is made one by one, many times what there is."""
 MAX_VALUES = 1 << 28  # of one field of an observation: a gigabyte in float32
+REVISION = re.compile(r"(?!.*\.\.)\w[\w.+-]*(/[\w.+-]+)*", re.ASCII)
+"""A branch, tag or commit of the Hub. Its client opens a file of that name in its cache."""
 COUNTS = ("chunk_size", "n_action_steps", "horizon", "n_obs_steps", "window_steps")
 
 
@@ -37,8 +42,21 @@ def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
         # lerobot writes `int = False` of a switch, and `str = None` of what may be left out.
         if not _fits(hint, value) and type(value) is not type(field.default):
             raise wrong_type(where, field.name, _described(hint), value)
+        _check_most(where, field.name, value)
+        if "revision" in field.name and isinstance(value, str) and not REVISION.fullmatch(value):
+            raise wrong_type(where, field.name, "a branch, tag or commit", value)
     for name in COUNTS:
         get_count(data, name, maximum=MAX_ACTIONS, where=where)
+
+
+def _check_most(where: str, name: str, value: object) -> None:
+    """Refuse to make so many of something that there would be no end; within mappings, too."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_most(where, str(key), inner)
+    most = next((most for end, most in MOST.items() if name.endswith(end)), None)
+    if most is not None and type(value) is int and value > most:
+        raise wrong_type(where, name, f"at most {most:,}", value)
 
 
 def check_features(config: Any, *, where: str) -> None:

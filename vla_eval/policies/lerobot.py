@@ -60,6 +60,7 @@ from vla_eval.policies.lerobot_memory import (
     remembers_singly,
 )
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.specs import PolicySpec
 
@@ -178,7 +179,8 @@ class LeRobotPolicy:
     def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
         policy, config = self._loaded.policy, self._loaded.config
         seeds = [episode.seed() for episode in rows]
-        with torch.random.fork_rng(devices=cuda_devices(config.device)), autocast(config):
+        devices = cuda_devices(config.device)
+        with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting():
             torch.manual_seed(seeds[0])
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}
@@ -259,15 +261,16 @@ def make_lerobot(
     asked = InputOptions(
         cameras=default_cameras() if cameras is None else cameras, state=state, absent_cameras=absent_cameras
     )
-    facts = read_facts(loaded.folder)
-    check_control_mode(facts, context.env, policy=context.name)
-    inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
-    check_training(
-        facts,
-        inputs,
-        loaded.config,
-        loaded.preprocessor,
-        context.env,
-        policy=context.name,
-    )
-    return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)
+    with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
+        facts = read_facts(loaded.folder)
+        check_control_mode(facts, context.env, policy=context.name)
+        inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
+        check_training(
+            facts,
+            inputs,
+            loaded.config,
+            loaded.preprocessor,
+            context.env,
+            policy=context.name,
+        )
+        return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)

@@ -10,14 +10,14 @@ import dataclasses
 import functools
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 # Before lerobot is imported, which reads it once: an evaluation must not depend on the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn  # lerobot is untyped: its configs, policies and processors are Any here
+from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
 from lerobot.configs import PreTrainedConfig
@@ -46,9 +46,10 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
-from vla_eval.policies.foreign_code import no_foreign_code
+from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.plain_errors import plain_errors, raise_plainly, says_what_is_missing
 from vla_eval.policies.weight_file import WeightFile
 from vla_eval.policies.weights import check_same, put_weights
 
@@ -91,6 +92,17 @@ class LoadedPolicy:
     preprocessor: Any
     postprocessor: Any
 
+    @contextlib.contextmanager
+    def acting(self) -> Iterator[None]:
+        """Let the policy infer within the context, as safely as it was loaded.
+
+        Raises:
+            CheckpointError: from within, whatever its steps and its network make of what does not fit.
+        """
+        # Some policies open a tokenizer only in their first pass.
+        with plain_errors(self.folder, self.config.type, "cannot infer"), only_data():
+            yield
+
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
     """Load policy and processors.
@@ -105,11 +117,12 @@ def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
     """
     folder = find_checkpoint(path)
     config = read_config(folder, options)
-    with no_foreign_code(config.type):
-        policy = load_weights(folder, config, options)
-        preprocessor, postprocessor = load_processors(folder, config, tokenizer=options.tokenizer)
-    policy.eval()
-    check_statistics(folder, preprocessor, postprocessor)
+    with plain_errors(folder, config.type, "cannot be loaded"):
+        with no_foreign_code(config.type):
+            policy = load_weights(folder, config, options)
+            preprocessor, postprocessor = load_processors(folder, config, tokenizer=options.tokenizer)
+        policy.eval()
+        check_statistics(folder, preprocessor, postprocessor)
     return LoadedPolicy(
         folder=folder, config=config, policy=policy, preprocessor=preprocessor, postprocessor=postprocessor
     )
@@ -129,10 +142,15 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
                 "recipe."
             )
         data["dtype"] = options.dtype
-    data = with_local_files(data, folder, tokenizer=options.tokenizer)
+    # Also where the file does not have the field: its default may be weights that would be downloaded.
+    closed = {name: value for name, value in NO_DOWNLOADS.items() if name in cls.__dataclass_fields__}
+    data = with_local_files({**closed, **data}, folder, tokenizer=options.tokenizer)
     check_config(cls, data, where=where)
     try:
-        config = draccus.decode(cls, data)
+        with only_data():  # some configurations open the backbone that they name
+            config = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
         raise CheckpointError(
             f"{where}: not the configuration of a '{kind}' policy of the installed lerobot: {exc!s:.1000}"
@@ -187,8 +205,18 @@ def _search_path() -> tuple[tuple[str, int], ...]:
     return tuple((place, folder.stat().st_mtime_ns) for place, folder in folders if folder.exists())
 
 
-def make_empty_policy(config: Any, **kwargs: Any) -> Any:
-    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer."""
+def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) -> Any:
+    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer.
+
+    Args:
+        config: of the policy.
+        where: its checkpoint, for messages.
+        kwargs: further arguments of the constructor.
+
+    Raises:
+        CheckpointError: the configuration does not fit, a file is missing, or code would have been run.
+        MissingDependencyError: the policy needs a package that is not installed.
+    """
     try:
         with no_foreign_code(config.type):
             return get_policy_class(config.type)(config, **kwargs)
@@ -196,36 +224,17 @@ def make_empty_policy(config: Any, **kwargs: Any) -> Any:
         raise MissingDependencyError(
             f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
         ) from exc
-    except OSError as exc:
-        raise_plainly(exc, config.type)
-    except (RuntimeError, ValueError, OverflowError, MemoryError) as exc:
-        if isinstance(exc, RuntimeError) and exc.__cause__ is not None:
+    except VlaEvalError:
+        raise
+    except Exception as exc:  # the constructors raise what they like of a configuration that does not fit
+        if isinstance(exc, OSError | RuntimeError) and says_what_is_missing(exc):
             raise_plainly(exc, config.type)
+        of = "" if where is None else f"{where}: "
         raise CheckpointError(
-            f"a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
+            f"{of}a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "
             f"{exc!s:.500} Expected sizes that belong together and fit into memory; fetch the checkpoint "
             "again."
         ) from exc
-
-
-def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
-    """Say which file is missing, if that is what ended the making of a policy or of its processors.
-
-    Raises:
-        CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
-        OSError, RuntimeError: as given, if it was something else.
-    """
-    cause = exc.__cause__  # lerobot's π0-FAST wraps whatever went wrong
-    if isinstance(cause, VlaEvalError):
-        raise cause
-    if not isinstance(exc, OSError) and not isinstance(cause, OSError):
-        raise exc
-    missing = exc if isinstance(exc, OSError) else cause
-    raise CheckpointError(
-        f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
-        "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
-        "fetch the file."
-    ) from exc
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
@@ -240,7 +249,9 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
     """
-    return fill_policy(make_unfilled_policy(config, **kwargs), folder, options).to(config.device)
+    return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
+        config.device
+    )
 
 
 def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:

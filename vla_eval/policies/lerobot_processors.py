@@ -20,6 +20,7 @@ from vla_eval.policies.checkpoint import (
     VLM_FOLDER,
 )
 from vla_eval.policies.checkpoint_notes import NEEDED_STATISTICS
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.processor_door import processors_through_the_door
 from vla_eval.policies.saved_processor import read_saved_processor
 from vla_eval.policies.steps.processor_steps import DecoderStep, EncoderStep
@@ -53,7 +54,7 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
         {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
     )
     try:
-        with processors_through_the_door():
+        with only_data(), processors_through_the_door():
             return make_pre_post_processors(  # type: ignore[no-any-return]
                 config,
                 pretrained_path=str(folder),

@@ -97,7 +97,7 @@ def check_structure(folder: Path) -> Structure:
         CheckpointError: the configuration is refused, or tensors are missing, unexpected or of another shape.
     """
     config = read_config(folder, LoadOptions(device="cpu"))
-    policy = make_unfilled_policy(config)
+    policy = make_unfilled_policy(config, where=folder)
     file = folder / WEIGHTS_FILE
     weights = read_weights(file)
     check_fit(policy, weights, where=str(file), cast=True)
@@ -116,8 +116,9 @@ def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
         InvalidActionError: the actions have another shape than declared, or are not finite.
     """
     loaded = load_checkpoint(path, options)
-    actions = _act(loaded)
-    expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
+    with loaded.acting():
+        actions = _act(loaded)
+        expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
     if tuple(actions.shape) != expected or not torch.isfinite(actions).all():
         raise InvalidActionError(
             f"{loaded.folder}: expected finite actions of shape {expected}, found {tuple(actions.shape)}, "

@@ -14,8 +14,10 @@ from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
 from vla_eval.policies.bases import how_to_get
 from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.policies.conversion.octo import SIZES
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.failures import chosen_episodes
@@ -43,7 +45,10 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     if "action_grid" in known:
         data["action_grid"] = "uniform"
     try:
-        policy: Any = draccus.decode(cls, data)
+        with only_data():
+            policy: Any = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
     height, width, n_colors = IMAGE_SHAPE
@@ -115,13 +120,15 @@ def _estimate(
         missing.append(
             f"the base {base}; its sizes are taken to be the defaults of '{recipe.type}'.{how_to_get(base)}"
         )
-    if dataset is not None and (base is None or _is_there(base)):
-        policy = policy_config(recipe, dataset, device="cpu")
-        passes: str | None = _passes(policy, dataset, recipe)
-    else:
-        policy, passes = options.assume(recipe), None
-    model = unfilled_model(policy, recipe)
-    return estimate(model, policy, recipe, device=device, tflops=options.tflops), missing, passes
+    with plain_errors(base or "finetune.policy", recipe.type, "cannot be trained"):
+        if dataset is not None and (base is None or _is_there(base)):
+            policy = policy_config(recipe, dataset, device="cpu")
+            passes: str | None = _passes(policy, dataset, recipe)
+        else:
+            policy, passes = options.assume(recipe), None
+        model = unfilled_model(policy, recipe)
+        found = estimate(model, policy, recipe, device=device, tflops=options.tflops)
+    return found, missing, passes
 
 
 def _passes(policy: Any, dataset: TrainingDataset, recipe: FinetuneRecipe) -> str:

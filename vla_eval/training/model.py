@@ -21,9 +21,9 @@ from vla_eval.policies.lerobot_loading import (
     begin_from,
     config_class,
     fill_policy,
-    raise_plainly,
 )
 from vla_eval.policies.lerobot_processors import step_names, tokenizer_overrides
+from vla_eval.policies.plain_errors import plain_errors, raise_plainly
 from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.lora import check_adapters, peft_config
@@ -49,17 +49,20 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
         VlaEvalError: the base does not fit, or something would have to be downloaded.
     """
     config = job.policy
-    try:
-        # A map that renames nothing: the names of the cameras are checked in `policy_config`.
-        with fetched_backbones():
-            model = make_policy(cfg=config, ds_meta=meta, rename_map=job.recipe.rename_cameras or {"": ""})
-    except URLError as exc:
-        raise TrainingError(
-            f"the policy asks for weights that are not on this machine, and they could not be downloaded "
-            f"({exc.reason}). {WITHOUT}"
-        ) from exc
-    except (OSError, RuntimeError) as exc:
-        raise_plainly(exc, config.type)
+    with _plain_errors(job, "cannot be built"):
+        try:
+            # A map that renames nothing: the names of the cameras are checked in `policy_config`.
+            with fetched_backbones():
+                model = make_policy(
+                    cfg=config, ds_meta=meta, rename_map=job.recipe.rename_cameras or {"": ""}
+                )
+        except URLError as exc:
+            raise TrainingError(
+                f"the policy asks for weights that are not on this machine, and they could not be downloaded "
+                f"({exc.reason}). {WITHOUT}"
+            ) from exc
+        except (OSError, RuntimeError) as exc:
+            raise_plainly(exc, config.type)
     config.pretrained_path = job.weights  # only now: lerobot's loaders leave out what does not fit
     if job.weights is not None:
         model = _filled(model, job, job.weights)
@@ -96,12 +99,17 @@ def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
     kwargs: dict[str, Any] = {} if stats is None else {"dataset_stats": stats}
     if job.weights is not None:
         kwargs |= _overrides(job, model.config, job.weights, stats)
-    try:
-        return Processors(
-            *make_pre_post_processors(policy_cfg=job.policy, pretrained_path=job.weights, **kwargs)
-        )
-    except OSError as exc:
-        raise_plainly(exc, job.policy.type)
+    with _plain_errors(job, "has no processors"):
+        try:
+            return Processors(
+                *make_pre_post_processors(policy_cfg=job.policy, pretrained_path=job.weights, **kwargs)
+            )
+        except OSError as exc:
+            raise_plainly(exc, job.policy.type)
+
+
+def _plain_errors(job: TrainingJob, what: str) -> contextlib.AbstractContextManager[None]:
+    return plain_errors(job.weights or "finetune.policy", job.policy.type, what)
 
 
 def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[str, dict[str, Any]]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import (
+    CheckpointError,
     RecipeError,
     SpecMismatchError,
     VlaEvalError,
@@ -26,7 +27,9 @@ from vla_eval.errors import (
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.policies.config_check import check_config
+from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
+from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
@@ -59,23 +62,27 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
     try:
-        config = draccus.decode(cls, data)
+        with only_data():  # some configurations open the backbone that they name
+            config = draccus.decode(cls, data)
+    except CheckpointError:
+        raise
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
-    _set_features(config, recipe, dataset)
-    if hasattr(config, "fit_to_control_mode"):
-        config.fit_to_control_mode(dataset.control_mode)
-    if hasattr(config, "window_steps"):
-        _set_window(config, dataset)
-    _check_features(config, dataset)
-    if hasattr(config, "fit_to_actions"):
-        actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
-        config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
-    if hasattr(config, "fit_to_rewards"):
-        config.fit_to_rewards(_columns_trained_on(dataset))
-    if not masks_padding(config):
-        # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
-        config.drop_n_last_frames = max(config.action_delta_indices)
+    with plain_errors(recipe.base_checkpoint or "finetune.policy", recipe.type, "does not fit the dataset"):
+        _set_features(config, recipe, dataset)
+        if hasattr(config, "fit_to_control_mode"):
+            config.fit_to_control_mode(dataset.control_mode)
+        if hasattr(config, "window_steps"):
+            _set_window(config, dataset)
+        _check_features(config, dataset)
+        if hasattr(config, "fit_to_actions"):
+            actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
+            config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
+        if hasattr(config, "fit_to_rewards"):
+            config.fit_to_rewards(_columns_trained_on(dataset))
+        if not masks_padding(config):
+            # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
+            config.drop_n_last_frames = max(config.action_delta_indices)
     return config
 
 

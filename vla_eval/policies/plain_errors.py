@@ -1,0 +1,60 @@
+"""One message for whatever lerobot, torch and transformers raise of files that do not fit."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import torch
+
+from vla_eval.errors import CheckpointError, VlaEvalError
+from vla_eval.policies.checkpoint_json import FETCH_AGAIN
+
+
+@contextlib.contextmanager
+def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
+    """Make one message of whatever lerobot, torch and transformers raise of files that do not fit.
+
+    Args:
+        where: the checkpoint.
+        kind: lerobot's type of policy.
+        what: what fails, for the message.
+
+    Raises:
+        CheckpointError: from within, for every error that says nothing to the user.
+    """
+    try:
+        yield
+    except VlaEvalError:
+        raise
+    except Exception as exc:
+        is_memory = isinstance(exc, MemoryError | torch.OutOfMemoryError)
+        hint = f"Expected processors, a configuration and weights that belong together. {FETCH_AGAIN}"
+        raise CheckpointError(
+            f"{where}: the policy of type '{kind}' {what}: {type(exc).__name__}: {exc!s:.500} "
+            f"{'Use a device with more memory, or smaller batches.' if is_memory else hint}"
+        ) from exc
+
+
+def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
+    """Say which file is missing, if that is what ended the making of a policy or of its processors.
+
+    Raises:
+        CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
+        OSError, RuntimeError: as given, if it was something else.
+    """
+    if isinstance(exc.__cause__, VlaEvalError):
+        raise exc.__cause__
+    if not says_what_is_missing(exc):
+        raise exc
+    missing = exc if isinstance(exc, OSError) else exc.__cause__
+    raise CheckpointError(
+        f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
+        "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
+        "fetch the file."
+    ) from exc
+
+
+def says_what_is_missing(exc: BaseException) -> bool:
+    """Whether a file is missing, or one of our errors is the cause: lerobot's π0-FAST wraps both."""
+    return isinstance(exc, OSError) or isinstance(exc.__cause__, OSError | VlaEvalError)
