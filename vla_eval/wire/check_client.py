@@ -89,7 +89,7 @@ class Server:
                     **options,
                 )
             )
-        except (OSError, UnicodeError, InvalidHandshake, InvalidURI, TimeoutError) as exc:
+        except (OSError, ValueError, InvalidHandshake, InvalidURI, TimeoutError) as exc:
             raise self.failed(f"no connection: {exc or type(exc).__name__}. Start the server first.") from exc
         connection = Connection(self, socket, opened)
         try:
