@@ -95,7 +95,14 @@ def code_folders() -> tuple[str, ...]:
     compiled = os.path.join(tempfile.gettempdir(), f"torchinductor_{getpass.getuser()}")
     named = [os.environ[name] for name in COMPILED_VARIABLES if os.environ.get(name)]
     searched = (*(place or "." for place in sys.path), sys.prefix, os.path.dirname(os.__file__))
-    return tuple(sorted({*elsewhere, *map(os.path.realpath, (*searched, compiled, *named))}))
+    found = {*elsewhere, *map(os.path.realpath, (*searched, compiled, *named))}
+    return tuple(sorted(found - {_cache_of_modules()}))
+
+
+def _cache_of_modules() -> str:
+    """Return where transformers copies code of checkpoints to; it puts this folder on `sys.path`."""
+    home = os.environ.get("HF_HOME", os.path.join(os.path.expanduser("~"), ".cache", "huggingface"))
+    return os.path.realpath(os.environ.get("HF_MODULES_CACHE", os.path.join(home, "modules")))
 
 
 def library_folders() -> set[str]:
