@@ -31,13 +31,10 @@ VLM_FOLDER = "vlm"  # configuration and processor of SmolVLA's language model, w
 FACTS_FILE = "mikasa_training.json"
 BASE_FILE = "mikasa_base.json"  # where a base that was fetched came from
 MODEL_FOLDER = "pretrained_model"
-# Where a checkpoint may lie below the folder that was named: lerobot's layout, then that of our runs.
-INSIDE = (
-    Path(),
-    Path(MODEL_FOLDER),
-    Path("checkpoints/last") / MODEL_FOLDER,
-    Path("train/checkpoints/last") / MODEL_FOLDER,
-)
+# Where a checkpoint may lie below the folder that was named, and those of a run: lerobot's, then ours.
+INSIDE = (Path(), Path(MODEL_FOLDER))
+RUNS = (Path("checkpoints"), Path("train/checkpoints"))
+LAST = "last"
 SHIPPED_FOLDER = "checkpoints"
 FACTS_VERSION = 1
 """Of `mikasa_training.json`. Raise it when a field changes its meaning."""
@@ -91,7 +88,7 @@ def find_checkpoint(path: Path) -> Path:
     places = [path]
     if path.name == str(path):
         places += [folder / path for folder in search_folders(SHIPPED_FOLDER)]
-    for folder in (place / inside for place in places for inside in INSIDE):
+    for folder in (folder for place in places for folder in _may_be_in(place)):
         # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
         if os.path.isfile(folder / CONFIG_FILE) and weights_file(folder) is not None:
             distrust(path if os.path.isdir(path) else folder)
@@ -108,6 +105,26 @@ def find_checkpoint(path: Path) -> Path:
         f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) "
         f"are never loaded: convert them to safetensors.{hint}"
     )
+
+
+def _may_be_in(place: Path) -> Iterator[Path]:
+    """Yield the folders of a place that may hold a checkpoint; of a run the newest comes first.
+
+    `last` is followed where it is a link. A copy of a run may have a folder of that name, or none: then the
+    highest step is the newest.
+    """
+    yield from (place / inside for inside in INSIDE)
+    for checkpoints in (place / run for run in RUNS):
+        last = checkpoints / LAST
+        steps = step_folders(checkpoints)[::-1] if os.path.isdir(checkpoints) else []
+        in_order = (last, *steps) if os.path.islink(last) else (*steps, last)
+        yield from (folder / MODEL_FOLDER for folder in in_order)
+
+
+def step_folders(checkpoints: Path) -> list[Path]:
+    """Return the folders of steps (`000100`), in the order of their steps."""
+    found = [entry for entry in checkpoints.glob("[0-9]*") if entry.name.isascii() and entry.name.isdigit()]
+    return sorted(found, key=lambda entry: int(entry.name))
 
 
 def list_checkpoints() -> list[str]:

@@ -5,10 +5,12 @@
     train/          lerobot's: checkpoints/000100/{pretrained_model,training_state}, checkpoints/last
     evaluations/    run folders of evaluations on held-out seeds, if asked for
 
-Standard library only.
+Knows no networks.
 """
 
+import errno
 import json
+import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -16,16 +18,22 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.errors import TrainingError
+from vla_eval.policies.checkpoint import LAST, step_folders
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.run_file import JsonValue, find_changes
 from vla_eval.strict_json import Source, read_file, read_json, read_version, shown
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"
-CHECKPOINTS_FOLDER, LAST = "checkpoints", "last"
+CHECKPOINTS_FOLDER = "checkpoints"
 STATE_FOLDER = "training_state"
 PARTIAL_PREFIX = ".partial-"
+NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+"""What systems of files without links answer: exFAT, buckets, some shares."""
 COMPARED = "settings"  # what results depend on; the rest is for the record
+
+
+logger = logging.getLogger(__name__)
 
 
 def open_folder(
@@ -86,7 +94,7 @@ def newest_checkpoint(path: Path) -> Path | None:
 def whole_checkpoints(path: Path) -> list[Path]:
     """Return the folders of the checkpoints that training can resume from, oldest first."""
     folder = path / TRAIN_FOLDER / CHECKPOINTS_FOLDER
-    return sorted(entry for entry in folder.glob("[0-9]*") if (entry / STATE_FOLDER).is_dir())
+    return [entry for entry in step_folders(folder) if (entry / STATE_FOLDER).is_dir()]
 
 
 def drop_extra_checkpoints(path: Path, *, save_every_steps: int) -> None:
@@ -127,13 +135,24 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def point(link: Path, target: str) -> None:
-    """Let the link name the target, without a moment at which there is no link."""
+    """Let the link name the target, without a moment at which there is no link.
+
+    Where there can be no links, or a folder of that name, there is none: the highest step is the newest.
+    """
     if link.is_symlink() and os.readlink(link) == target:
         return
+    if link.is_dir() and not link.is_symlink():
+        logger.warning("%s: is a folder, not a link. It is left as it is; the highest step is used.", link)
+        return
     temporary = link.with_name(f"{link.name}.tmp")
-    temporary.unlink(missing_ok=True)
-    temporary.symlink_to(target)
-    os.replace(temporary, link)
+    try:
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(target)
+        os.replace(temporary, link)
+    except OSError as exc:
+        if exc.errno not in NO_LINKS:
+            raise
+        logger.warning("%s: there can be no link here (%s). The highest step is used.", link, exc.strerror)
 
 
 def _settings(file: Path) -> dict[str, Any]:  # Any: JSON
