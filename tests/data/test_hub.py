@@ -17,6 +17,7 @@ from vla_eval.data.completeness import check_complete
 from vla_eval.data.hub import pull_dataset, push_dataset
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.lock.switch import let_write
 from vla_eval.testing.synthetic import write_synthetic_dataset
 
 REPO = "somebody/demos"
@@ -208,6 +209,7 @@ def test_the_command_line(
     recorded: Path, tmp_path: Path, api: Any, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     monkeypatch.setattr(hub, "HfApi", lambda: api)
+    let_write(tmp_path / "hub")  # the stand-in for the Hub
 
     assert main(["dataset", "push", str(recorded), REPO, "--private"]) == 0
     assert main(["dataset", "pull", REPO, str(tmp_path / "pulled")]) == 0

@@ -92,12 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    for number, argument in enumerate(arguments, start=1):
-        if not _is_text(argument):
-            return _fail(
-                f"argument {number}: expected text in UTF-8, found {argument!a:.{MAX_SHOWN}}. Rename the "
-                "file or correct the argument."
-            )
+    if (nul := next((one for one in arguments if "\0" in one), None)) is not None:
+        return _fail(_no_text(nul))
     first = arguments[0] if arguments else ""
     if not arguments:
         print(FIRST_STEPS)
@@ -110,6 +106,8 @@ def _run(arguments: list[str]) -> int:
         args, unknown = parser.parse_known_args(arguments)
         if unknown:
             return _fail(_unknown_arguments(parser, first, unknown))
+        if (no_text := next((one for one in _words(args) if not _is_utf8(one)), None)) is not None:
+            return _fail(_no_text(no_text))
         if getattr(args, "no_lock", False):
             os.environ[OFF_VARIABLE] = "1"
         with locked():
@@ -165,9 +163,10 @@ def _add_no_lock(parser: argparse.ArgumentParser) -> None:
 
 def _paths(args: argparse.Namespace) -> list[Path]:
     """Return what may be a file or a folder that the user named: it may be written to."""
-    values = vars(args).values()
-    each = [one for value in values for one in (value if isinstance(value, list) else [value])]
-    return [Path(one) for one in each if isinstance(one, str | Path) and str(one) and "\0" not in str(one)]
+    named = [value for value in vars(args).values() if isinstance(value, Path)]
+    lists = [value for value in vars(args).values() if isinstance(value, list)]
+    paths = [one for each in lists for one in each if isinstance(one, Path)]
+    return [*named, *paths, *(Path(word) for word in _words(args) if word)]
 
 
 def _verb(name: str) -> Verb:
@@ -201,9 +200,19 @@ def _fail(message: str) -> int:
     return EXIT_USER_MISTAKE
 
 
-def _is_text(argument: str) -> bool:
-    """Whether it is what a file name and a record can hold: no zero byte, and no byte that is not UTF-8."""
-    return "\0" not in argument and not any("\ud800" <= character <= "\udfff" for character in argument)
+def _no_text(argument: str) -> str:
+    return f"expected text in UTF-8, found {argument!a:.{MAX_SHOWN}}. Correct the argument."
+
+
+def _words(args: argparse.Namespace) -> list[str]:
+    """Return what goes into records and messages as text; the names of files and folders may be any bytes."""
+    values = vars(args).values()
+    each = [one for value in values for one in (value if isinstance(value, list) else [value])]
+    return [one for one in each if isinstance(one, str)]
+
+
+def _is_utf8(argument: str) -> bool:
+    return not any("\ud800" <= character <= "\udfff" for character in argument)
 
 
 def _with_short_words(message: str) -> str:

@@ -31,6 +31,7 @@ def locked() -> Iterator[None]:
         yield
         return
     before = STATE.network, STATE.everything, set(STATE.writes), set(STATE.foreign), set(STATE.hosts)
+    STATE.network = STATE.everything = None
     lock()
     try:
         yield

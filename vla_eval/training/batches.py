@@ -19,7 +19,7 @@ from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 
 
 class Position(NamedTuple):
-    """Where a training goes on: so many samples of an epoch have been taken, by all processes together."""
+    """Where a training continues: so many samples of an epoch have been taken, by all processes together."""
 
     epoch: int
     n_taken: int
@@ -34,7 +34,7 @@ class Sharing:
     process: int = 0
 
     def position(self, step: int, n_samples: int) -> Position:
-        """Return where a training goes on after so many steps.
+        """Return where a training continues after so many steps.
 
         Args:
             step: steps done, by as many processes.

@@ -13,7 +13,7 @@ from tests.evaluation.evaluation_bench import Bench
 from tests.policies.small_checkpoints import FAKE, TASK, context_for
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.envs.factory import make_env
-from vla_eval.errors import InvalidActionError
+from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 
 bench = evaluation_bench.bench
@@ -199,7 +199,7 @@ class TestRows:
             if is_disturbed:
                 with monkeypatch.context() as patched:
                     patched.setattr(network, "predict_action_chunk", lambda *a, **k: 1 / 0)
-                    with pytest.raises(ZeroDivisionError):
+                    with pytest.raises(CheckpointError, match="ZeroDivisionError"):
                         table.ask({1: 4})
                 table.n_shown[1] -= 4
             answers[-1].append(table.ask({1: 4}))

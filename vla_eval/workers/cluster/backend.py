@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any  # Ray is optional: not looked at by mypy
 
 from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers
 from vla_eval.workers.cluster.actor import OWN_VARIABLES, Place, WorkerSpec
 from vla_eval.workers.cluster.connect import connected
 from vla_eval.workers.cluster.machines import Machines
@@ -115,4 +116,5 @@ def cluster(
 
 def _place(logs: Path) -> Place:
     own = {name: value for name, value in os.environ.items() if name.startswith(OWN_VARIABLES)}
+    own[WRITING_VARIABLE] = folders_for_workers()
     return Place(folder=os.getcwd(), variables=own, path=tuple(sys.path), logs=str(logs.resolve()))
