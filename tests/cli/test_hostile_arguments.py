@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 
 import vla_eval.bench.loader
+import vla_eval.bench.official
+import vla_eval.bench.rendering
+import vla_eval.bench.serving
 import vla_eval.doctor
 import vla_eval.serving.server
 import vla_eval.training.finetune
@@ -65,6 +68,9 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         (vla_eval.serving.server, "run_server"),
         (vla_eval.training.finetune, "finetune"),
         (vla_eval.bench.loader, "run_loader_bench"),
+        (vla_eval.bench.rendering, "run_bench"),
+        (vla_eval.bench.official, "run_official_bench"),
+        (vla_eval.bench.serving, "run_serving_bench"),
         (vla_eval.doctor, "run_probe"),
     ):
         monkeypatch.setattr(module, name, refuse)
