@@ -13,7 +13,7 @@ from tests.policies.test_closed_doors import LOADERS
 from vla_eval.lock.switch import distrust, locked
 
 trace = hostile_folders.trace
-RUNNING = ("auto_map", "imports_are_copied_first", "auto_map_of_another_repository")
+RUNNING = ("auto_map", "auto_map_of_another_repository")
 """Payloads that do run where there is neither door nor lock."""
 
 

@@ -49,11 +49,11 @@ def lock() -> None:
     STATE.code = code_folders()
     STATE.tools = frozenset(filter(None, map(shutil.which, TOOLS)))
     STATE.writes |= library_folders() | _inherited()
-    if os.environ.get(HUB_VARIABLE, "1").lower() in ONLINE:
-        let_connect(f"{HUB_VARIABLE}=0")
     STATE.finder = _InstalledOnly(tuple(sys.meta_path))
     sys.meta_path.insert(0, STATE.finder)
     STATE.is_on = True
+    if os.environ.get(HUB_VARIABLE, "1").lower() in ONLINE:
+        let_connect(f"{HUB_VARIABLE}=0")
     if not STATE.has_hook:
         sys.addaudithook(audit)
         STATE.has_hook = True
@@ -74,16 +74,24 @@ def let_resolve(host: str) -> None:
     STATE.hosts.add(host)
 
 
-def let_connect(why: str) -> None:
-    """Let this process connect to anything, since the user has asked for something that does."""
+def let_connect(why: str, *programs: str) -> None:
+    """Let this process connect to anything, since the user has asked for something that does.
+
+    Args:
+        why: what was asked for.
+        programs: names of programs that it starts.
+    """
+    if not STATE.is_on:
+        return
     STATE.network = STATE.network or why
+    STATE.tools |= frozenset(filter(None, map(shutil.which, programs)))
 
 
 def let_everything(why: str) -> None:
     """Let this process start programs, connect, write and import: it runs code of the user's own."""
-    if STATE.everything is None:
+    if STATE.is_on and STATE.everything is None:
         logger.info("nothing is locked in this process: %s", why)
-    STATE.everything = STATE.everything or why
+        STATE.everything = why
 
 
 @contextlib.contextmanager

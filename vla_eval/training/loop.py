@@ -100,7 +100,7 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
         training = _Training(job, accelerator, listeners.on_model)
         is_main = accelerator.is_main_process
         if recipe.wandb_project is not None:
-            let_connect("finetune.wandb_project")
+            let_connect("finetune.wandb_project", "git")
         wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
         silent = not (is_main and sys.stderr.isatty())
         is_saved = is_finished = True

@@ -35,7 +35,7 @@ def trackio_run(project: str | None, *, name: str, settings: Mapping[str, Any]) 
         yield lambda _line: None
         return
     try:
-        let_connect("finetune.trackio_project")
+        let_connect("finetune.trackio_project", "git")
         trackio: Any = importlib.import_module("trackio")
     except ModuleNotFoundError as exc:
         raise MissingDependencyError(

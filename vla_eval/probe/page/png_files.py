@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from vla_eval.errors import ReportError
+from vla_eval.lock.switch import let_write
 
 
 def write_beside(folder: Path, name: str, png: bytes) -> Path:
@@ -12,6 +13,7 @@ def write_beside(folder: Path, name: str, png: bytes) -> Path:
         ReportError: the file cannot be written.
     """
     path = folder.parent / f"{folder.resolve().name}_{name}.png"
+    let_write(path)
     try:
         path.write_bytes(png)
     except OSError as exc:
