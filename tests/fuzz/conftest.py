@@ -1,6 +1,6 @@
 """Random input against everything that reads a file or a flag.
 
-Each test runs 100 cases that are the same every time. `pytest -m fuzz` runs these tests alone, with 20,000
+Each test runs 50 cases that are the same every time. `pytest -m fuzz` runs these tests alone, with 20,000
 new cases each.
 """
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-CASES, MANY_CASES = 100, 20_000  # some 30 tests: 3,000 cases in the default run
+CASES, MANY_CASES = 50, 20_000  # some 130 tests: more than 6,000 cases in the default run
 RELAXED = {
     "deadline": None,  # one slow case is no failure: the machine may be busy
     "database": None,  # a run depends on nothing that an earlier one left
