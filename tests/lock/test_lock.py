@@ -120,12 +120,21 @@ def test_no_program_is_started(mark: Path, name: str, caplog: pytest.LogCaptureF
     assert name == "spawnv" or "refused to" in caplog.text  # said even where the error is swallowed
 
 
+def _link(owned: Path, target: Path) -> Path:
+    """Return a link in the folder that may be written, which leads out of it."""
+    link = owned.with_name("link")
+    link.symlink_to(target)
+    return link
+
+
 def writes(mark: Path, owned: Path) -> dict[str, Callable[[], object]]:
     """Return ways to make or change something at `mark`; `owned` is a file that may be written."""
     folder = os.open(mark.parent, os.O_RDONLY)
     template = "{{ cycler.__init__.__globals__.os.mkdir(p) }}"
     return {
         "open": lambda: open(mark, "w"),
+        "through a link": lambda: open(_link(owned, mark), "w"),
+        "truncate through a link": lambda: os.truncate(_link(owned, mark.parent / "kept"), 0),
         "append": lambda: open(mark, "a"),
         "os.open": lambda: os.open(mark, os.O_CREAT | os.O_WRONLY),
         "by a folder's descriptor": lambda: os.open("mark", os.O_CREAT | os.O_WRONLY, dir_fd=folder),

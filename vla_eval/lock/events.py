@@ -20,6 +20,7 @@ TOOLS = (
 """Programs that libraries start of their own accord: those of the system, or first on the search path."""
 PROGRAM_FOLDERS = ("/bin", "/sbin", "/usr/bin", "/usr/sbin", "/usr/local/bin", "/usr/local/cuda/bin")
 LOCAL_HOSTS = ("", "localhost", "127.0.0.1", "::1", "0.0.0.0", "::")
+DEVICES = ("/dev/", "/proc/")  # `/dev/stderr` leads to wherever it was redirected
 OF_MULTIPROCESSING = "pymp-"
 """Beginning of the folder with the sockets of Python's own processes."""
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -84,7 +85,7 @@ def _open(path: Any, _mode: Any, flags: Any) -> None:
         return
     # A folder cannot be written; `tempfile` names it where it makes a file without a name, or with its own.
     if isinstance(path, int) or not os.path.isdir(path):
-        _write(path)
+        _change(path)
 
 
 def _write(path: Any, folder: Any = -1, *_: object) -> None:
@@ -93,6 +94,14 @@ def _write(path: Any, folder: Any = -1, *_: object) -> None:
     place = _place(path, folder)
     if not may_write(place):
         raise refused(f"write to {place!r:.300}")
+
+
+def _change(path: Any, folder: Any = -1, *_: object) -> None:
+    """Refuse to change a file by a path: a link is followed, unlike where an entry is removed or renamed."""
+    if isinstance(path, int):
+        return
+    place = _place(path, folder)
+    _write(place if place.startswith(DEVICES) else os.path.realpath(place))
 
 
 def _place(path: Any, folder: Any) -> str:
@@ -137,10 +146,10 @@ _CHECKS: Mapping[str, Callable[..., None]] = {
     "open": _open,
     "os.remove": _write,
     "os.rmdir": _write,
-    "os.truncate": _write,
+    "os.truncate": _change,
     "os.mkdir": _make_folder,
-    "os.chmod": lambda path, _mode, folder=-1: _write(path, folder),
-    "os.chown": lambda path, _user, _group, folder=-1: _write(path, folder),
+    "os.chmod": lambda path, _mode, folder=-1: _change(path, folder),
+    "os.chown": lambda path, _user, _group, folder=-1: _change(path, folder),
     "os.rename": _rename,
     "os.link": lambda _old, new, _old_folder=-1, new_folder=-1: _write(new, new_folder),
     "os.symlink": lambda _old, new, folder=-1: _write(new, folder),
