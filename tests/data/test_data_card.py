@@ -12,11 +12,13 @@ from PIL import Image
 from tests.data.failed_episodes import let_fail
 from vla_eval.cli.main import main
 from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
-from vla_eval.data.convert import convert_to_lerobot, find_source
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.dataset_summary import ActionStatistics
+from vla_eval.data.foreign.changes import Changes
+from vla_eval.data.foreign.convert import convert_to_lerobot, find_source
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.synthetic import write_synthetic_dataset
 from vla_eval.viz.contact_sheet import EDGE_PX, LABEL_PX, LEFT_PX, MARGIN_PX, SheetRow, contact_sheet
 
@@ -128,15 +130,19 @@ def test_a_sheet_of_one_picture() -> None:
 
 def imported(tmp_path: Path) -> Path:
     rng = np.random.default_rng(0)
+    joints = rng.uniform(-1, 1, (6, 25))
+    joints[:, 3:7] = 1, 0, 0, 0
     (tmp_path / "npz").mkdir()
     np.savez(
         tmp_path / "npz/train_data_0.npz",
         rgb=np.zeros((6, 128, 128, 6), np.uint8),
-        joints=rng.uniform(-1, 1, (6, 25)),
+        joints=joints,
         action=rng.uniform(-1, 1, (6, 8)),
     )
     source = find_source(tmp_path / "npz")
-    convert_to_lerobot(source, tmp_path / "ours", task="RememberColor3-v0", state="eef")
+    convert_to_lerobot(
+        source, tmp_path / "ours", state="eef", changes=Changes(task=task_spec("RememberColor3-v0"))
+    )
     return tmp_path / "ours"
 
 

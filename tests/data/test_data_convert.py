@@ -9,12 +9,15 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.cli.main import main
-from vla_eval.data.convert import convert_to_lerobot, convert_to_npz, find_source
-from vla_eval.data.import_writer import eef_of_proprio
+from vla_eval.data.foreign.changes import Changes
+from vla_eval.data.foreign.convert import convert_to_lerobot, convert_to_npz, find_source
+from vla_eval.data.foreign.import_writer import eef_of_proprio
+from vla_eval.data.foreign.npz_files import npz_files, read_npz
 from vla_eval.data.imported import read_import
-from vla_eval.data.layouts import npz_files, read_npz
+from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.synthetic import write_synthetic_dataset
 from vla_eval.training.dataset import training_dataset
 
@@ -23,6 +26,7 @@ TASK = "RememberColor3-v0"
 # prompts/paper.yaml, from the paper's appendix.
 SENTENCE = "Remember the color of the cube and then pick the matching one"
 N_FRAMES = (5, 3)
+FOR_TASK = Changes(task=task_spec(TASK))
 
 
 def smooth_picture(rng: np.random.Generator) -> np.ndarray:
@@ -78,7 +82,7 @@ def load(root: Path) -> LeRobotDataset:
 def test_the_papers_layout_there_and_back_keeps_every_number(tmp_path: Path) -> None:
     source = paper_folder(tmp_path / "paper")
 
-    convert_to_lerobot(find_source(source), tmp_path / "ours", task=TASK, state="eef")
+    convert_to_lerobot(find_source(source), tmp_path / "ours", changes=FOR_TASK, state="eef")
     convert_to_npz(find_source(tmp_path / "ours"), tmp_path / "back")
 
     for index in range(2):
@@ -101,7 +105,7 @@ def test_base_and_wrist_are_not_swapped(tmp_path: Path) -> None:
     arrays["rgb"][..., :3], arrays["rgb"][..., 3:] = (200, 40, 40), (40, 40, 200)  # base red, wrist blue
     source = write_npz(tmp_path / "paper", [arrays])
 
-    convert_to_lerobot(find_source(source), tmp_path / "ours", task=TASK, state="eef")
+    convert_to_lerobot(find_source(source), tmp_path / "ours", changes=FOR_TASK, state="eef")
 
     sample = load(tmp_path / "ours")[0]
     assert sample[BASE][0].mean() > 0.7 > 0.3 > sample[BASE][2].mean()
@@ -110,7 +114,7 @@ def test_base_and_wrist_are_not_swapped(tmp_path: Path) -> None:
 
 def test_what_the_papers_layout_lacks_comes_from_the_named_task(tmp_path: Path) -> None:
     source = find_source(paper_folder(tmp_path / "paper"))
-    facts = convert_to_lerobot(source, tmp_path / "ours", task=TASK, state="joints")
+    facts = convert_to_lerobot(source, tmp_path / "ours", changes=FOR_TASK, state="joints")
 
     dataset = load(tmp_path / "ours")
     sample = dataset[5]  # first frame of the second episode
@@ -131,14 +135,14 @@ def test_what_the_papers_layout_lacks_comes_from_the_named_task(tmp_path: Path) 
 def test_without_instruction_and_task_nothing_is_written(tmp_path: Path) -> None:
     source = find_source(paper_folder(tmp_path / "paper"))
 
-    with pytest.raises(DatasetError, match=r"train_data_0.npz has no language instruction.*--task"):
-        convert_to_lerobot(source, tmp_path / "ours", task=None, state="eef")
+    with pytest.raises(DatasetError, match=r"train_data_0.npz, frame 0: the language ins.*--task"):
+        convert_to_lerobot(source, tmp_path / "ours", state="eef")
     assert [path.name for path in tmp_path.iterdir()] == ["paper"]
 
 
 def test_joint_delta_actions_are_kept_and_flagged(tmp_path: Path) -> None:
     source = find_source(paper_folder(tmp_path / "paper", n_action=8))
-    facts = convert_to_lerobot(source, tmp_path / "ours", task=TASK, state="eef")
+    facts = convert_to_lerobot(source, tmp_path / "ours", changes=FOR_TASK, state="eef")
 
     dataset = load(tmp_path / "ours")
     assert np.array_equal(dataset[2]["action"].numpy(), episode_arrays(0, n_action=8)["action"][2])
@@ -150,7 +154,7 @@ def test_joint_delta_actions_are_kept_and_flagged(tmp_path: Path) -> None:
 def test_the_official_vla_recordings_bring_their_own_instruction_and_seeds(tmp_path: Path) -> None:
     source = write_npz(tmp_path / "vla", [official_vla_arrays(index) for index in range(2)])
 
-    facts = convert_to_lerobot(find_source(source), tmp_path / "ours", task=None, state="eef")
+    facts = convert_to_lerobot(find_source(source), tmp_path / "ours", state="eef")
 
     sample = load(tmp_path / "ours")[0]
     proprio = official_vla_arrays(0)["proprio"][0]
@@ -168,7 +172,7 @@ def test_joints_that_a_source_does_not_have_are_an_error(tmp_path: Path) -> None
     with pytest.raises(
         DatasetError, match=r"has no joint velocities, so observation.state cannot be 'joints'"
     ):
-        convert_to_lerobot(source, tmp_path / "a", task=None, state="joints")
+        convert_to_lerobot(source, tmp_path / "a", state="joints")
     with pytest.raises(
         DatasetError, match="has no joints, which the paper's layout holds; nothing is made up"
     ):
@@ -231,7 +235,7 @@ def write_official_lerobot(root: Path, cameras: tuple[str, str] = OFFICIAL_CAMER
 def test_the_official_lerobot_release_gets_our_names_and_no_invented_fields(tmp_path: Path) -> None:
     source = find_source(write_official_lerobot(tmp_path / "official"))
 
-    facts = convert_to_lerobot(source, tmp_path / "ours", task=None, state="eef")
+    facts = convert_to_lerobot(source, tmp_path / "ours", state="eef")
 
     sample = load(tmp_path / "ours")[1]
     arrays = official_vla_arrays(0)
@@ -248,7 +252,9 @@ def test_a_dataset_of_the_90_tasks_can_be_trained_on(tmp_path: Path) -> None:
     task = "mikasa_vla/RememberColor3-VLA-v0"
     assert json.loads((root / "meta/info.json").read_text())["codebase_version"] == "v3.0"
 
-    convert_to_lerobot(find_source(root), tmp_path / "ours", task=task, state="eef")
+    convert_to_lerobot(
+        find_source(root), tmp_path / "ours", changes=Changes(task=task_spec(task)), state="eef"
+    )
 
     with pytest.raises(DatasetError, match="--allow-unreplayed"):
         training_dataset(tmp_path / "ours", allow_unreplayed=False)
@@ -274,7 +280,7 @@ def test_a_recorded_dataset_becomes_the_papers_layout(tmp_path: Path) -> None:
 
 def test_an_imported_dataset_has_exact_statistics(tmp_path: Path) -> None:
     source = find_source(paper_folder(tmp_path / "paper"))
-    convert_to_lerobot(source, tmp_path / "ours", task=TASK, state="eef")
+    convert_to_lerobot(source, tmp_path / "ours", changes=FOR_TASK, state="eef")
 
     stats = json.loads((tmp_path / "ours/meta/stats.json").read_text())
     actions = np.concatenate([episode_arrays(index)["action"] for index in range(2)]).astype(np.float64)
@@ -298,14 +304,12 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            (
-                {"rgb": np.zeros((5, 64, 64, 6), np.uint8)},
-                r"rgb is \(5, 64, 64, 6\) uint8, expected \(5, 128",
-            ),
+            ({"rgb": np.zeros((5, 64, 64, 3), np.uint8)}, r"rgb is \(5, 64, 64, 3\), expected \(5, height"),
+            ({"rgb": np.zeros((5, 64, 64, 6))}, r"rgb is \(5, 64, 64, 6\) float64, expected uint8"),
             ({"joints": np.zeros((4, 25))}, r"joints is \(4, 25\) float64, expected \(5, 25\)"),
             ({"action": np.zeros((5, 6))}, r"action is \(5, 6\), expected \(T, 7\) or \(T, 8\)"),
-            ({"reward": np.full(5, np.nan)}, "reward has values that are not finite"),
-            ({"language_instruction": ""}, "expected one sentence"),
+            ({"language_instruction": 3}, "expected one sentence"),
+            ({"language_instruction": ["one", "two"]}, "expected one sentence, or one per frame"),
         ],
     )
     def test_wrong_shapes_and_values_say_what_was_expected(
@@ -332,19 +336,21 @@ class TestMistakes:
         source = find_source(paper_folder(tmp_path / "paper"))
 
         with pytest.raises(DatasetError, match="exists already"):
-            convert_to_lerobot(source, tmp_path / "paper", task=TASK, state="eef")
+            convert_to_lerobot(source, tmp_path / "paper", changes=FOR_TASK, state="eef")
 
     def test_episodes_of_two_kinds_do_not_become_one_dataset(self, tmp_path: Path) -> None:
         source = write_npz(tmp_path / "mixed", [episode_arrays(0), episode_arrays(1, n_action=8)])
 
         with pytest.raises(DatasetError, match=r"train_data_1.npz differs .* in action"):
-            convert_to_lerobot(find_source(source), tmp_path / "ours", task=TASK, state="eef")
+            convert_to_lerobot(find_source(source), tmp_path / "ours", changes=FOR_TASK, state="eef")
 
-    def test_our_own_dataset_is_not_imported(self, tmp_path: Path) -> None:
+    def test_our_own_recording_is_not_imported(self, tmp_path: Path) -> None:
         ours = write_synthetic_dataset(tmp_path / "ours", n_episodes=1, n_frames=2)
+        (ours / RECORDING_FILE).parent.mkdir()
+        (ours / RECORDING_FILE).touch()
 
         with pytest.raises(DatasetError, match="of this project already"):
-            convert_to_lerobot(find_source(ours), tmp_path / "again", task=None, state="eef")
+            convert_to_lerobot(find_source(ours), tmp_path / "again", state="eef")
 
 
 def test_files_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:

@@ -9,12 +9,14 @@ import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.config.environment import EnvSettings
-from vla_eval.data.convert import convert_to_lerobot, find_source
+from vla_eval.data.foreign.changes import Changes
+from vla_eval.data.foreign.convert import convert_to_lerobot, find_source
 from vla_eval.data.initial_states import InitialState, InitialStates, read_initial_states
 from vla_eval.data.leak import check_leak
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError
 from vla_eval.features import proprioception
+from vla_eval.tasks.catalog import task_spec
 
 TASK = "RememberColor3-v0"
 CAMERAS = ("base_camera", "hand_camera")
@@ -68,7 +70,7 @@ def npz_episode(joints: np.ndarray) -> dict[str, Any]:
     return {
         "rgb": np.zeros((n, 128, 128, 6), dtype=np.uint8),
         "joints": np.stack([joints, joints]).astype(np.float32),
-        "action": np.zeros((n, 7), dtype=np.float32),
+        "action": np.full((n, 7), -1, dtype=np.float32),
         "reward": np.zeros(n, dtype=np.float32),
         "success": np.zeros(n, dtype=bool),
         "done": np.zeros(n, dtype=bool),
@@ -88,7 +90,9 @@ def test_in_the_simulator_the_arms_state_decides_for_npz_files_and_what_is_conve
     folder.mkdir()
     np.savez(folder / "train_data_0.npz", **npz_episode(begun[777]))
     np.savez(folder / "train_data_1.npz", **npz_episode(begun[2]))
-    convert_to_lerobot(find_source(folder), tmp_path / "ours", task=TASK, state="eef")
+    convert_to_lerobot(
+        find_source(folder), tmp_path / "ours", state="eef", changes=Changes(task=task_spec(TASK))
+    )
 
     report = check_leak(read_initial_states(tmp_path / "ours"), task=TASK, seeds=range(1, 4))
     assert report.evidence == "state"

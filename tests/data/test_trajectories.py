@@ -7,7 +7,7 @@ import pytest
 
 from tests.data.failed_episodes import let_fail
 from vla_eval.data.decoded_frames import DecodedFramesDataset
-from vla_eval.data.layouts import read_npz
+from vla_eval.data.foreign.npz_files import read_npz
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.trajectories import Trajectories, Trajectory
 
@@ -48,8 +48,8 @@ def test_what_reads_the_papers_files_reads_them(episodes: Trajectories, tmp_path
     np.savez(tmp_path / "train_data_0.npz", **episodes[0].arrays())
     read, left_out = read_npz(tmp_path / "train_data_0.npz")
     assert list(left_out) == []
-    np.testing.assert_array_equal(read.images_wrist_THWC, episodes[0].rgb_THWC[..., 3:])
-    assert read.success_T is not None and read.success_T.tolist() == [False] * 12 + [True]
+    np.testing.assert_array_equal(read.read_images()[1], episodes[0].rgb_THWC[..., 3:])
+    assert read.numbers["next.success"].tolist() == [0] * 12 + [1]
 
 
 def test_failures_are_there_and_say_so(episodes: Trajectories) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from tests.peers.programs import PLUGIN, example, free_port, running, with_path
 from vla_eval.cli.main import main
-from vla_eval.data.import_writer import eef_of_proprio
+from vla_eval.data.foreign.import_writer import eef_of_proprio
 from vla_eval.testing.check_remote import check_remote
 
 PAGE = "released_policies.md"

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from tests.fuzz.json_cases import BYTES, VALUES, near
 from vla_eval.data.card import write_card
-from vla_eval.data.convert import find_source
 from vla_eval.data.dataset_rrd import EpisodeWish, write_dataset_rrds
 from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.initial_states import read_initial_states
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import VlaEvalError
@@ -43,7 +43,7 @@ def root(whole: Path, tmp_path: Path) -> Path:
 
 WAYS: dict[str, Callable[[Path], object]] = {
     "view": lambda root: write_dataset_rrds(root, EpisodeWish(most=1), root.parent / "out"),
-    "convert": lambda root: list(find_source(root).episodes()),
+    "convert": lambda root: [one.read_images() for one in find_source(root).episodes],
     "check-leak": lambda root: read_initial_states(root).read_frames(),
     "finetune": lambda root: DecodedFramesDataset(open_local_dataset(root), storage="ram")[0],
     "card": write_card,
@@ -70,7 +70,7 @@ def put_back(root: Path, name: Path, content: bytes) -> Iterator[None]:
 
 def test_an_undamaged_dataset_is_read(root: Path) -> None:
     write_dataset_rrds(root, EpisodeWish(), root.parent / "out")
-    assert len(list(find_source(root).episodes())) == 2
+    assert len([one.read_images() for one in find_source(root).episodes]) == 2
     assert len(read_initial_states(root).read_frames()) == 2
 
 

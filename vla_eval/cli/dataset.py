@@ -4,9 +4,12 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import add_workers, seeds_argument
+
+if TYPE_CHECKING:
+    from vla_eval.data.foreign.changes import Changes
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -30,7 +33,25 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     convert.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
     convert.add_argument("--task", metavar="T", help="task id, for sources without an instruction")
     convert.add_argument("--state", choices=("eef", "joints"), help="what observation.state is (eef)")
-
+    convert.add_argument(
+        "--image-size",
+        metavar="PX",
+        type=int,
+        help="scale images to this size, or keep those of this size (128)",
+    )
+    convert.add_argument(
+        "--gripper",
+        metavar=("CLOSED", "OPEN"),
+        nargs=2,
+        type=float,
+        help="the source's commands that close and open the gripper (-1 1)",
+    )
+    convert.add_argument(
+        "--resample", action="store_true", help="compute frames at 20 per second from another rate"
+    )
+    convert.add_argument(
+        "--clip-actions", action="store_true", help="store actions as the environment would execute them"
+    )
     add_workers(convert, default="auto")
 
     mix = actions.add_parser(
@@ -71,24 +92,49 @@ def run(args: argparse.Namespace) -> int:
 def _convert(args: argparse.Namespace) -> int:
     if args.control_mode is not None:
         return _convert_control_mode(args)
-    from vla_eval.data.convert import convert_to_lerobot, convert_to_npz, find_source
-    from vla_eval.tasks.catalog import task_spec
+    from vla_eval.data.foreign.convert import convert_to_lerobot, convert_to_npz, find_source
 
-    if args.task is not None:
-        task_spec(args.task)  # a mistyped name must not wait for the simulator's libraries
+    changes = _changes(args)
     source = find_source(args.source)
     if args.to == "npz":
         print(f"{args.out}: {convert_to_npz(source, args.out)} episodes in the paper's layout")
         return 0
-    facts = convert_to_lerobot(source, args.out, task=args.task, state=args.state or "eef")
+    facts = convert_to_lerobot(source, args.out, state=args.state or "eef", changes=changes)
     print(f"{args.out}: {len(facts.episodes)} episodes, {facts.n_frames} frames, from {facts.source_layout}")
     print(f"instruction from {facts.instruction_source}; actions for {facts.control_mode}")
+    for label, sentences in (("converted", facts.converted), ("kept", facts.kept)):
+        for sentence in sentences:
+            print(f"{label}: {sentence}")
     for label, names in (("the source has no", facts.absent), ("left out", facts.left_out)):
         if names:
             print(f"{label}: {', '.join(names)}")
     if not facts.executable_by_pd_ee_delta_pose:
         print(f"A policy trained on them is evaluated with --set env.control_mode={facts.control_mode}.")
     return 0
+
+
+def _changes(args: argparse.Namespace) -> "Changes":
+    from vla_eval.data.foreign.changes import Changes
+    from vla_eval.errors import RecipeError
+    from vla_eval.tasks.catalog import task_spec
+
+    changes = Changes(
+        task=None if args.task is None else task_spec(args.task),
+        image_size_px=args.image_size,
+        gripper=None if args.gripper is None else tuple(args.gripper),
+        resample=args.resample,
+        clip_actions=args.clip_actions,
+    )
+    flags = [flag for flag, value in _asked_for(args) if value]
+    if args.to == "npz" and flags:
+        raise RecipeError(f"{flags[0]}: the paper's layout is written as the source is. Remove it.")
+    return changes
+
+
+def _asked_for(args: argparse.Namespace) -> list[tuple[str, object]]:
+    """Return the flags that change data, with their values."""
+    names = ("--task", "--state", "--image-size", "--gripper", "--resample", "--clip-actions")
+    return [(name, getattr(args, name.strip("-").replace("-", "_"))) for name in names]
 
 
 def _convert_control_mode(args: argparse.Namespace) -> int:
@@ -99,9 +145,9 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
     from vla_eval.errors import RecipeError
 
     action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
-    for flag, value in (("--task", args.task), ("--state", args.state)):
-        if value is not None:
-            raise RecipeError(f"{flag}: --control-mode keeps task and state of the recording. Remove it.")
+    for flag, value in _asked_for(args):
+        if value:
+            raise RecipeError(f"{flag}: --control-mode keeps all else of the recording. Remove it.")
     from vla_eval.data.control_conversion import convert_control_mode
 
     with stop_on_signals() as stop:

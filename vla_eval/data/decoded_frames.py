@@ -14,7 +14,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.core import ImageArray
-from vla_eval.data.frame_cache import FRAMES_FOLDER, EpisodeRows, FrameSource, frames_in_ram, frames_on_disk
+from vla_eval.data.frame_cache import (
+    FRAMES_FOLDER,
+    EpisodeRows,
+    FrameSource,
+    channels_first,
+    frames_in_ram,
+    frames_on_disk,
+)
 from vla_eval.data.rewards import rewards_of
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, RewardKind
@@ -234,15 +241,5 @@ def frame_layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> FrameLay
             EpisodeRows(index=numbers[row], first=row, stop=stop, timestamps_s=tuple(times_s[row:stop]))
         )
         row = stop
-    shapes = {key: _channels_first(source.meta.features[key]) for key in source.meta.video_keys}
+    shapes = {key: channels_first(source.meta.features[key]) for key in source.meta.video_keys}
     return FrameLayout(bounds, FrameSource(dataset=source, shapes=shapes, episodes=episodes))
-
-
-def _channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return (channels, height, width) of a camera, whatever the order of its description."""
-    # lerobot's own data sets call the last one `channel` as well as `channels`.
-    names = [{"channel": "channels"}.get(str(name), name) for name in feature.get("names") or ()]
-    sizes = dict(zip(names, feature["shape"], strict=False))
-    if sorted(sizes) != ["channels", "height", "width"] or len(feature["shape"]) != 3:
-        raise DatasetError(f"a camera is described by {dict(feature)}: expected height, width and channels.")
-    return int(sizes["channels"]), int(sizes["height"]), int(sizes["width"])

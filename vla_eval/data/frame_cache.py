@@ -93,6 +93,29 @@ def dataset_digest(source: FrameSource) -> str:
     return digest.hexdigest()[:DIGEST_DIGITS]
 
 
+def channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Return (channels, height, width) of a camera, whatever the order of its description.
+
+    Raises:
+        DatasetError: it is not an RGB image, or it is not known which axis is which.
+    """
+    # lerobot's own datasets call the last one `channel` as well as `channels`.
+    names = [{"channel": "channels"}.get(str(name), name) for name in feature.get("names") or ()]
+    shape = tuple(feature["shape"])
+    if not names and len(shape) == 3 and (shape[0] == 3) != (shape[2] == 3):
+        names = ["channels", "height", "width"] if shape[0] == 3 else ["height", "width", "channels"]
+    sizes = dict(zip(names, shape, strict=False))
+    if (
+        sorted(map(str, sizes)) != ["channels", "height", "width"]
+        or len(shape) != 3
+        or sizes["channels"] != 3
+    ):
+        raise DatasetError(
+            f"a camera is described by {dict(feature)!s:.300}: expected height, width and 3 channels."
+        )
+    return 3, int(sizes["height"]), int(sizes["width"])
+
+
 def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
     """Yield the (T, 3, H, W) uint8 frames of each episode in turn.
 

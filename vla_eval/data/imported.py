@@ -39,7 +39,8 @@ class ImportFacts:
 
     Attributes:
         complete: written as true, after everything else.
-        source_layout: `npz_joints`, `npz_proprio`, `lerobot_official` or `lerobot_suite90` (see `layouts`).
+        source_layout: `npz_joints`, `npz_proprio`, `lerobot_official`, `lerobot_suite90`, `lerobot_mikasa`;
+            or `adopted`, if the files are those of the source.
         task: the task id that the user named; None if none was.
         instruction_source: where the instruction comes from: `source`, or the prompt set of that task.
         state: which proprioception `observation.state` is.
@@ -52,6 +53,9 @@ class ImportFacts:
         source_files: path below the source -> digest.
         files: path below the dataset -> digest.
         vla_eval_version: what converted it.
+        is_checked: whether the rules of `checks.rules` were applied; False for what an older version wrote.
+        converted: what was changed because it was asked for, a sentence each.
+        kept: what differs from what is expected, or is assumed, and was kept.
     """
 
     complete: bool
@@ -68,6 +72,9 @@ class ImportFacts:
     source_files: dict[str, FileDigest]
     files: dict[str, FileDigest]
     vla_eval_version: str
+    is_checked: bool = False
+    converted: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
 
 
 _FILE = FactsFile(

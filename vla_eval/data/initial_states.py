@@ -3,24 +3,23 @@
 Knows nothing of simulators.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
-from vla_eval.data.convert import find_source
-from vla_eval.data.import_writer import eef_of_proprio
+from vla_eval.data.foreign.convert import find_source
+from vla_eval.data.foreign.episodes import EEF_KEY, JOINTS_KEY, SOURCE_PROPRIO_KEY, Source, SourceEpisode
+from vla_eval.data.foreign.import_writer import eef_of_proprio
 from vla_eval.data.imported import IMPORT_FILE, read_import
-from vla_eval.data.layouts import LEROBOT_CAMERAS, Source, SourceEpisode
 from vla_eval.data.manifest import RECORDING_FILE, read_facts, read_manifest
 from vla_eval.data.mixture import read_mixture
-from vla_eval.data.opening import open_local_dataset, read_sample
-from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
-from vla_eval.features import PROPRIO_KEYS, STATE_KEY, StateKind
+from vla_eval.features import CAMERA_KEYS, StateKind
 
 Frames = dict[str, ImageArray]
 """Camera -> (H, W, 3) uint8."""
@@ -71,76 +70,41 @@ def read_initial_states(path: Path) -> InitialStates:
         DatasetError: there is no dataset that can be read.
     """
     source = find_source(path)
-    if source.layout.startswith("npz"):
-        return _of_npz(source)
-    return _of_lerobot(source)
-
-
-def _of_npz(source: Source) -> InitialStates:
-    states: list[InitialState] = []
-    frames: list[Frames] = []
-    for episode in source.episodes():
+    seeds, task, simulator = _recorded_facts(source)
+    states = []
+    for episode, seed in zip(source.episodes, seeds, strict=True):
         kind, state = _state_of(episode)
-        states.append(InitialState(name=episode.name, seed=episode.seed, kind=kind, state=state))
-        images = (episode.images_base_THWC[0], episode.images_wrist_THWC[0])
-        frames.append(dict(zip(("base_camera", "hand_camera"), images, strict=True)))
+        states.append(InitialState(name=episode.name, seed=seed, kind=kind, state=state.astype(np.float32)))
     return InitialStates(
-        path=source.path,
-        task=None,
-        simulator="maniskill",
+        path=path,
+        task=task,
+        simulator=simulator,
         episodes=tuple(states),
-        read_frames=lambda: frames,
+        read_frames=lambda: [_first_frames(episode) for episode in source.episodes],
     )
 
 
 def _state_of(episode: SourceEpisode) -> tuple[StateKind, FloatArray]:
-    if episode.joints_TD is not None:
-        return "joints", episode.joints_TD[0]
-    assert episode.proprio_TD is not None  # `read_npz` refuses a file without either
-    return "eef", eef_of_proprio(episode.proprio_TD[0])
+    firsts: Mapping[str, Any] = {name: rows[0] for name, rows in episode.numbers.items()}  # Any: numbers
+    if JOINTS_KEY in firsts:
+        return "joints", firsts[JOINTS_KEY]
+    if EEF_KEY in firsts:
+        return "eef", firsts[EEF_KEY]
+    return "eef", eef_of_proprio(firsts[SOURCE_PROPRIO_KEY])  # a source has one of the three
 
 
-def _of_lerobot(source: Source) -> InitialStates:
-    columns = read_columns(source.path)
-    first_rows = np.flatnonzero(columns["frame_index"] == 0)
-    joints = columns.get(PROPRIO_KEYS["joints"])
-    eef = columns.get(PROPRIO_KEYS["eef"])
-    seeds, task, simulator = _recorded_facts(source.path, len(first_rows))
-    states = []
-    for number, row in enumerate(first_rows):
-        kind: StateKind = "eef" if joints is None else "joints"
-        if joints is not None:
-            state = joints[row]
-        else:
-            state = eef_of_proprio(columns[STATE_KEY][row]) if eef is None else eef[row]
-        states.append(
-            InitialState(
-                name=f"episode {number}", seed=seeds[number], kind=kind, state=state.astype(np.float32)
-            )
-        )
-
-    def read_frames() -> list[Frames]:
-        dataset = open_local_dataset(source.path, return_uint8=True)
-        keys = zip(("base_camera", "hand_camera"), LEROBOT_CAMERAS[source.layout], strict=True)
-        named = tuple(keys)
-        items = (read_sample(dataset, int(row)) for row in first_rows)
-        return [{name: item[key].permute(1, 2, 0).numpy() for name, key in named} for item in items]
-
-    return InitialStates(
-        path=source.path,
-        task=task,
-        simulator=simulator,
-        episodes=tuple(states),
-        read_frames=read_frames,
-    )
+def _first_frames(episode: SourceEpisode) -> Frames:
+    images = (images[0] for images in episode.read_images())
+    return dict(zip(CAMERA_KEYS, images, strict=True))
 
 
-def _recorded_facts(root: Path, n_episodes: int) -> tuple[Sequence[int | None], str | None, Simulator]:
+def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, Simulator]:
     """Return seeds, task and simulator as far as `meta/mikasa` knows them.
 
     Raises:
         DatasetError: the dataset is one of several tasks, whose seeds are episodes of each.
     """
+    root, n_episodes = source.path, len(source.episodes)
     mixture = read_mixture(root)
     if mixture is not None:
         names = ", ".join(source.name for source in mixture.sources)
@@ -148,7 +112,7 @@ def _recorded_facts(root: Path, n_episodes: int) -> tuple[Sequence[int | None], 
             f"{root}: was mixed of several datasets ({names}). Compare each of those with the evaluation's "
             "episodes of its task: mikasa-vla dataset check-leak DIR"
         )
-    seeds: Sequence[int | None] = [None] * n_episodes
+    seeds: Sequence[int | None] = [episode.seed for episode in source.episodes]
     task: str | None = None
     simulator: Simulator = "maniskill"
     if (root / RECORDING_FILE).is_file():

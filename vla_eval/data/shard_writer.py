@@ -17,6 +17,7 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from vla_eval.data.checks.rules import MIN_FRAMES
 from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import join_datasets, video_decoder
@@ -36,7 +37,6 @@ from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 ROBOT_TYPE = "panda_wristcam"
 SHARD_EPISODES = MIKASA_FOLDER / "manifest.jsonl"
 SHARD_HISTOGRAMS = MIKASA_FOLDER / "histograms.npz"
-MIN_FRAMES = 2  # lerobot's statistics need two
 # One thread, so that the bytes of a video do not depend on the machine's cores.
 ENCODER_THREADS = 1
 

@@ -30,10 +30,8 @@ PLAIN_EXTENSIONS = (
     *(f"datasets.features.features.Array{n}DExtensionType" for n in range(2, 6)),
 )
 """Extensions of arrow that are read as the plain type they are stored as."""
-PLAIN_TYPES = (
-    *(pa.types.is_string, pa.types.is_large_string),
-    *(pa.types.is_boolean, pa.types.is_integer, pa.types.is_floating),
-)
+PLAIN_NUMBERS = (pa.types.is_boolean, pa.types.is_integer, pa.types.is_floating)
+PLAIN_TYPES = (pa.types.is_string, pa.types.is_large_string, *PLAIN_NUMBERS)
 MIB = 1024**2
 REMEDY = "It is not read. Fetch the dataset again, from where you trust it."
 
@@ -90,7 +88,24 @@ def read_columns(root: Path, only: Sequence[str] | None = None) -> Columns:
     for path, table in zip(paths, tables, strict=True):
         check_columns(path, table, names)
         check_values(path, table, names)
-    return {name: np.concatenate([np.asarray(table[name].to_pylist()) for table in tables]) for name in names}
+    return {name: np.concatenate([_as_array(table[name]) for table in tables]) for name in names}
+
+
+def _as_array(column: Any) -> NDArray[np.generic]:  # Any: pyarrow.ChunkedArray
+    """Return a column that `check_values` has seen, in the type in which it is stored."""
+    values, shape = column, [len(column)]
+    while True:
+        if isinstance(values.type, pa.BaseExtensionType):
+            values = pa.chunked_array([chunk.storage for chunk in values.chunks], values.type.storage_type)
+        if not pa.types.is_nested(values.type) or pa.types.is_struct(values.type):
+            break
+        flat = pc.list_flatten(values)
+        shape.append(len(flat) // len(values) if len(values) else 0)
+        values = flat
+    if not any(is_kind(values.type) for is_kind in PLAIN_NUMBERS):
+        return np.asarray(column.to_pylist())
+    array: NDArray[np.generic] = values.to_numpy().reshape(shape)
+    return array
 
 
 def rows_of_episode(columns: Columns, episode_index: int) -> Columns:

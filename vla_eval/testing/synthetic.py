@@ -17,6 +17,7 @@ from vla_eval.features import (
     DONE_KEY,
     IMAGE_SHAPE,
     REWARD_KEY,
+    STATE_NAMES,
     SUCCESS_KEY,
     EncoderSettings,
     StateKind,
@@ -75,8 +76,12 @@ def _texture(rng: np.random.Generator) -> ImageArray:
 
 
 def _numbers(rng: np.random.Generator, features: dict[str, Any]) -> dict[str, Any]:  # Any: arrays
-    return {
+    numbers = {
         key: rng.uniform(-1, 1, feature["shape"]).astype(np.float32)
         for key, feature in features.items()
         if feature["dtype"] == "float32" and key != REWARD_KEY
     }
+    for key, values in numbers.items():
+        if tuple(features[key]["names"]) == STATE_NAMES["joints"]:
+            values[3:7] /= np.linalg.norm(values[3:7])
+    return numbers

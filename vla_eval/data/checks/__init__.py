@@ -1,0 +1,1 @@
+"""What demonstrations must be like before anything is encoded, trained or compared."""
