@@ -2,14 +2,19 @@
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.arguments import add_workers, seeds_argument
+from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
     from vla_eval.data.foreign.changes import Changes
+    from vla_eval.data.imported import ImportFacts
+
+MAX_SENTENCES = 5  # that `check` shows
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -60,6 +65,19 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     mix.add_argument("datasets", metavar="DIR", type=Path, nargs="+", help="complete datasets, one per task")
     mix.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
 
+    check = actions.add_parser(
+        "check",
+        help="say all that differs from what is expected (exit code 1 if something has to be changed)",
+        allow_abbrev=False,
+    )
+    check.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, whoever made it")
+
+    adopt = actions.add_parser(
+        "adopt", help="use a dataset that lerobot-edit-dataset has edited", allow_abbrev=False
+    )
+    adopt.add_argument("dataset", metavar="DIR", type=Path, help="a dataset with this project's fields")
+    adopt.add_argument("--task", metavar="T", help="task id of its demonstrations")
+
     leak = actions.add_parser(
         "check-leak",
         help="whether demonstrations begin as the evaluation's episodes do (exit code 1 if any does)",
@@ -102,12 +120,7 @@ def _convert(args: argparse.Namespace) -> int:
     facts = convert_to_lerobot(source, args.out, state=args.state or "eef", changes=changes)
     print(f"{args.out}: {len(facts.episodes)} episodes, {facts.n_frames} frames, from {facts.source_layout}")
     print(f"instruction from {facts.instruction_source}; actions for {facts.control_mode}")
-    for label, sentences in (("converted", facts.converted), ("kept", facts.kept)):
-        for sentence in sentences:
-            print(f"{label}: {sentence}")
-    for label, names in (("the source has no", facts.absent), ("left out", facts.left_out)):
-        if names:
-            print(f"{label}: {', '.join(names)}")
+    _print_sentences(facts)
     if not facts.executable_by_pd_ee_delta_pose:
         print(f"A policy trained on them is evaluated with --set env.control_mode={facts.control_mode}.")
     return 0
@@ -188,11 +201,55 @@ def _mix(args: argparse.Namespace) -> int:
     return 0
 
 
+def _check(args: argparse.Namespace) -> int:
+    from vla_eval.data.check import check
+
+    report = check(args.dataset)
+    what = report.demonstrations
+    print(f"{args.dataset}: {report.kind}")
+    print(f"{len(what.lengths)} episodes, {what.n_frames} frames, {what.fps:g} per second")
+    for camera, (height, width) in what.image_sizes_px.items():
+        print(f"{camera}: {height} × {width}")
+    for sentence, n_frames in Counter(what.sentences).most_common(MAX_SENTENCES):
+        print(f"sentence: {sentence!r} ({n_frames} frames)")
+    for said in report.said:
+        print(f"{said.answer}: {said.sentence}")
+    if not report.said:
+        print("as expected")
+    if report.is_refused:
+        n_refused = sum(said.answer == "refused" for said in report.said)
+        raise DatasetError(f"{args.dataset}: {n_refused} of these have to be changed before it can be used.")
+    if report.next_step:
+        print(f"next: {report.next_step}")
+    return 0
+
+
+def _adopt(args: argparse.Namespace) -> int:
+    from vla_eval.data.adopt import adopt
+    from vla_eval.tasks.catalog import task_spec
+
+    facts = adopt(args.dataset, task=None if args.task is None else task_spec(args.task))
+    print(
+        f"{args.dataset}: {len(facts.episodes)} episodes, {facts.n_frames} frames, for {facts.control_mode}"
+    )
+    _print_sentences(facts)
+    print("Seeds and phases are lost: it cannot be replayed. `finetune` asks for --allow-unreplayed.")
+    return 0
+
+
+def _print_sentences(facts: "ImportFacts") -> None:
+    for label, sentences in (("converted", facts.converted), ("kept", facts.kept)):
+        for sentence in sentences:
+            print(f"{label}: {sentence}")
+    for label, names in (("the source has no", facts.absent), ("left out", facts.left_out)):
+        if names:
+            print(f"{label}: {', '.join(names)}")
+
+
 def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.config.dataset import EVALUATION_SEEDS
     from vla_eval.data.initial_states import read_initial_states
     from vla_eval.data.leak import check_leak
-    from vla_eval.errors import DatasetError
     from vla_eval.results.table_formats import markdown_table
     from vla_eval.tasks.catalog import task_spec
 
@@ -250,6 +307,8 @@ def _pull(args: argparse.Namespace) -> int:
 _ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
     "convert": _convert,
     "mix": _mix,
+    "check": _check,
+    "adopt": _adopt,
     "check-leak": _check_leak,
     "card": _card,
     "push": _push,

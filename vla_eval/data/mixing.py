@@ -14,6 +14,7 @@ from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.io_utils import write_stats
 
 from vla_eval import __version__
+from vla_eval.data.check import require_checked
 from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
@@ -65,7 +66,7 @@ def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
     try:
         with whole_folder(out, error=DatasetError) as draft:
             _aggregate([one.root for one in opened], draft)
-            _write_statistics(draft, [one.meta for one in opened])
+            write_statistics(draft, [one.meta for one in opened])
             facts = MixtureFacts(
                 complete=True,
                 state=opened[0].facts.state,
@@ -85,7 +86,9 @@ def _open(root: Path) -> _Opened:
     if isinstance(facts, MixtureFacts):
         names = ", ".join(source.name for source in facts.sources)
         raise DatasetError(f"{root}: is a mixture itself, of {names}. Name those instead.")
-    return _Opened(root=root, facts=facts, meta=open_local_dataset(root).meta)
+    dataset = open_local_dataset(root)
+    require_checked(dataset, facts)
+    return _Opened(root=root, facts=facts, meta=dataset.meta)
 
 
 def _source(opened: _Opened) -> MixtureSource:
@@ -154,13 +157,13 @@ def _aggregate(roots: Sequence[Path], draft: Path) -> None:
         ) from exc
 
 
-def _write_statistics(draft: Path, metas: Sequence[Any]) -> None:
+def write_statistics(root: Path, metas: Sequence[Any]) -> None:
     """Write statistics over all frames: of numbers from their rows, of images from those of the sources.
 
     Those of images have no quantiles: what the sources know of them does not give that of all pixels. The
     rest is exact (`exact_statistics` says what lerobot makes of quantiles).
     """
-    numbers = {key: rows.reshape(len(rows), -1) for key, rows in read_columns(draft).items()}
+    numbers = {key: rows.reshape(len(rows), -1) for key, rows in read_columns(root).items()}
     cameras = metas[0].video_keys
     images = aggregate_stats(
         [
@@ -172,4 +175,4 @@ def _write_statistics(draft: Path, metas: Sequence[Any]) -> None:
         ]
     )
     in_order = {camera: images[camera] for camera in cameras}  # lerobot's is that of a set
-    write_stats({**{key: vector_statistics(rows) for key, rows in numbers.items()}, **in_order}, draft)
+    write_stats({**{key: vector_statistics(rows) for key, rows in numbers.items()}, **in_order}, root)

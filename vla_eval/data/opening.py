@@ -7,12 +7,11 @@ and cache by name and time. `lerobot_tables.py` says what they are replaced by.
 import contextlib
 import functools
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn  # lerobot is untyped
 from unittest.mock import patch
 
-import numpy as np
 from av.error import FFmpegError
 from lerobot.datasets import dataset_metadata, dataset_reader
 from lerobot.datasets.aggregate import aggregate_datasets
@@ -20,12 +19,12 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL.Image import DecompressionBombError
 
+from vla_eval.data.checks.agreement import check_meta, check_rows
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.info_file import check_info
 from vla_eval.data.lerobot_tables import read_episodes, read_frames, read_statistics, read_tasks
-from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, refused
+from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES
 from vla_eval.errors import DatasetError
-from vla_eval.viz.mp4 import check_mp4
 
 UNREADABLE = (
     *(OSError, RuntimeError, ValueError, LookupError, TypeError, OverflowError, MemoryError),
@@ -134,19 +133,13 @@ def _open(root: Path, options: dict[str, Any]) -> LeRobotDataset:
         meta = LeRobotDatasetMetadata(repo_id, root=root)
     except UNREADABLE as exc:
         raise DatasetError(f"{root}: lerobot cannot read its meta/ ({exc!r:.300}).") from exc
-    _check_totals(root, meta)
-    _check_videos(root, meta)
-    for path in _files(meta):
-        if not (root / path).is_file():
-            raise DatasetError(
-                f"{root}: {path} is missing. Fetch the dataset again, or rebuild it from its manifest."
-            )
+    check_meta(root, meta)
     options.setdefault("video_backend", decoder_for(root))
     try:
         dataset = LeRobotDataset(repo_id, root=root, **options)
     except UNREADABLE as exc:
         raise DatasetError(f"{root}: lerobot cannot read the dataset ({exc!r:.300}).") from exc
-    _check_rows(dataset)
+    check_rows(dataset)
     return dataset
 
 
@@ -170,93 +163,3 @@ def video_decoder() -> str:
     except (ImportError, OSError, RuntimeError):
         return "pyav"
     return "torchcodec"
-
-
-def _files(meta: LeRobotDatasetMetadata) -> list[Path]:
-    numbers = range(meta.total_episodes)
-    return sorted({Path(meta.get_data_file_path(number)) for number in numbers} | _videos(meta))
-
-
-def _videos(meta: LeRobotDatasetMetadata) -> set[Path]:
-    numbers = range(meta.total_episodes)
-    return {
-        Path(meta.get_video_file_path(number, camera)) for camera in meta.video_keys for number in numbers
-    }
-
-
-# ------------------------------------------------------------------------------------------- checks
-
-
-def _check_totals(root: Path, meta: LeRobotDatasetMetadata) -> None:
-    """Raise `DatasetError` unless `info.json` counts what the tables hold."""
-    rows: Any = meta.episodes if meta.episodes is not None else ()
-    n_frames = rows[-1]["dataset_to_index"] if rows else 0
-    found = {
-        "episodes": (meta.total_episodes, len(rows)),
-        "frames": (meta.total_frames, n_frames),
-        "tasks": (meta.total_tasks, 0 if meta.tasks is None else len(meta.tasks)),
-    }
-    for what, (said, counted) in found.items():
-        if said != counted or not counted:
-            where = "meta/tasks.parquet" if what == "tasks" else "meta/episodes"
-            raise DatasetError(
-                f"{root}: meta/info.json says {said} {what}, {where} has {counted}. Fetch the dataset again, "
-                "or rebuild it from its manifest."
-            )
-
-
-def _check_videos(root: Path, meta: LeRobotDatasetMetadata) -> None:
-    """Raise `DatasetError` unless each camera's videos are named, begin at a time, and are MP4 files."""
-    rows: Mapping[str, Any] = meta.episodes[:]
-    where = root / "meta/episodes"
-    if meta.video_keys and meta.info.video_path is None:
-        raise refused(root / "meta/info.json", "a video_path for its videos", "null")
-    for camera in meta.video_keys:
-        for name, kinds in (("chunk_index", int), ("file_index", int), ("from_timestamp", (int, float))):
-            column = f"videos/{camera}/{name}"
-            values = rows.get(column, [None])
-            if not all(isinstance(one, kinds) and 0 <= one < float("inf") for one in values):
-                raise refused(where, f"a number in each row of {column}", f"{values!s:.80}")
-    for path in _videos(meta):
-        if (root / path).is_file():
-            check_mp4(root / path, DatasetError)
-
-
-def _check_rows(dataset: LeRobotDataset) -> None:
-    """Raise `DatasetError` unless the rows of frames are those that `meta/episodes` describes."""
-    table: Any = dataset.hf_dataset.data
-    found = {name: table.column(name).to_numpy() for name in ROW_NUMBERS if name in table.column_names}
-    rows = dataset.meta.episodes[:]
-    ends = list(zip(rows["dataset_from_index"], rows["dataset_to_index"], strict=True))
-    chosen = range(len(ends)) if dataset.episodes is None else sorted(dataset.episodes)
-    lengths = [ends[number][1] - ends[number][0] for number in chosen]
-    expected = {
-        "index": np.concatenate([np.arange(*ends[number]) for number in chosen]),
-        "episode_index": np.repeat(np.asarray(chosen), lengths),
-        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
-    }
-    for name in ROW_NUMBERS:
-        if name not in found:
-            raise refused(dataset.root / "data", f"the column {name}", ", ".join(found))
-    for name, values in expected.items():
-        if not np.array_equal(found[name], values):
-            raise refused(
-                dataset.root / "data",
-                f"in {name} the {len(values)} rows that meta/episodes describes",
-                _first_difference(values, found[name]),
-            )
-    if not np.isfinite(found["timestamp"]).all() or (found["timestamp"] < 0).any():
-        raise refused(dataset.root / "data", "a time from 0 on in each row of timestamp", "another value")
-    n_tasks = len(dataset.meta.tasks)
-    if not np.isin(found["task_index"], np.arange(n_tasks)).all():
-        raise refused(dataset.root / "data", f"a task_index from 0 to {n_tasks - 1}", "another")
-
-
-ROW_NUMBERS = ("index", "episode_index", "frame_index", "timestamp", "task_index")
-
-
-def _first_difference(expected: Any, found: Any) -> str:  # Any: arrays
-    if len(expected) != len(found):
-        return f"{len(found)} rows"
-    row = int(np.flatnonzero(expected != found)[0])
-    return f"{found[row]} in row {row}, where {expected[row]} is due"

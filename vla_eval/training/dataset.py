@@ -7,6 +7,7 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 
 from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.data.check import require_checked
 from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.imported import ImportFacts
@@ -95,6 +96,7 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
             f"evaluated."
         )
     opened = open_recorded(root) if isinstance(facts, DatasetFacts) else open_local_dataset(root)
+    require_checked(opened, facts)
     missing = [key for key in CAMERA_KEYS.values() if key not in opened.meta.features]
     if missing:
         raise DatasetError(f"{root}: expected the images {', '.join(missing)}, found none of that name.")

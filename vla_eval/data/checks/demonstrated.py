@@ -29,6 +29,7 @@ class Demonstrations:
         action: what the actions are for; None if that is not known.
         image_sizes_px: camera -> height and width.
         expected_px: height and width that images shall have; None: any, if it is the same for all.
+        is_gripper_named: whether the user has said what the gripper's commands mean.
     """
 
     where: Path
@@ -41,6 +42,7 @@ class Demonstrations:
     action: ActionSpec | None
     image_sizes_px: Mapping[str, tuple[int, int]]
     expected_px: int | None = None
+    is_gripper_named: bool = False
 
     @property
     def n_frames(self) -> int:

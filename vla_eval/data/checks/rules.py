@@ -128,7 +128,7 @@ def _bounds(what: Demonstrations) -> Iterator[str]:
 
 def _gripper(what: Demonstrations) -> Iterator[str]:
     """Find grippers from 0 to 1; constant commands of 1 are ours, too."""
-    if what.action is not None and what.n_frames:
+    if what.action is not None and what.n_frames and not what.is_gripper_named:
         values = what.floats(ACTION_KEY)[:, -1]
         if values.min() == 0 and values.max() <= 1:
             yield (

@@ -11,10 +11,10 @@ from fractions import Fraction
 import numpy as np
 from PIL import Image
 
-from vla_eval.config.prompts import instruction_for
+from vla_eval.config.prompts import instruction_for, instructions_for
 from vla_eval.control_modes import ABSOLUTE_MODES
 from vla_eval.core import ImageArray
-from vla_eval.data.checks.demonstrated import Numbers
+from vla_eval.data.checks.demonstrated import Demonstrations, Numbers
 from vla_eval.data.foreign.episodes import PER_STEP, Pictures, Source, SourceEpisode
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, DONE_KEY, FPS, IMAGE_SIZE_PX, SUCCESS_KEY
@@ -72,6 +72,20 @@ def change(source: Source, changes: Changes) -> tuple[Source, tuple[str, ...]]:
         if sentence:
             said.append(sentence)
     return source, tuple(said)
+
+
+def other_sentences(what: Demonstrations, task: TaskSpec | None) -> tuple[str, ...]:
+    """Return a sentence if the instructions are not those with which the task is evaluated."""
+    if task is None:
+        return ()
+    known = instructions_for(task)
+    other = sorted({sentence for sentence in what.sentences if sentence and sentence not in known})
+    if not other:
+        return ()
+    return (
+        f"The instruction {other[0]!r:.200} is not the one with which {task.id} is evaluated ({known[0]!r}): "
+        "evaluate with a prompt set that has it.",
+    )
 
 
 Step = Callable[[Source, Changes], tuple[Source, str]]

@@ -1,0 +1,108 @@
+"""Give a dataset with our fields the records that training asks for, after another tool has edited it.
+
+`lerobot-edit-dataset` splits, merges and deletes, and does not copy `meta/mikasa/`. What only a recording
+knows (seeds, phases, digests of states) is lost, and nothing is made up: an adopted dataset is an import.
+"""
+
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import numpy as np
+
+from vla_eval import __version__
+from vla_eval.control_modes import EE_DELTA_POSE
+from vla_eval.data.check import check_videos, demonstrations_of, has_our_fields
+from vla_eval.data.checks.demonstrated import Demonstrations
+from vla_eval.data.checks.rules import require_sound
+from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.folder_contents import check_folder
+from vla_eval.data.foreign.changes import other_sentences
+from vla_eval.data.foreign.lerobot_files import names_of
+from vla_eval.data.imported import IMPORT_FILE, ImportedEpisode, ImportFacts, write_import
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE
+from vla_eval.data.mixing import write_statistics
+from vla_eval.data.opening import open_local_dataset
+from vla_eval.errors import DatasetError
+from vla_eval.features import STATE_KEY, STATE_NAMES, SUCCESS_KEY, dataset_features
+from vla_eval.tasks.spec import TaskSpec
+
+
+def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
+    """Check a dataset, compute its statistics again, and write what it is; return that.
+
+    Args:
+        root: its folder. `meta/stats.json` is replaced, and `meta/mikasa/import.json` is written last.
+        task: of which the demonstrations are; None if there are several, or it is not known.
+
+    Raises:
+        DatasetError: it has such records already, has other fields than ours, or breaks a rule.
+    """
+    check_folder(root)
+    for file in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE):
+        if (root / file).exists():
+            raise DatasetError(
+                f"{root}: {file} is there: the dataset has its records, and `mikasa-vla dataset check` says "
+                "whether they fit. If another tool has changed its files, remove meta/mikasa and adopt it."
+            )
+    dataset = open_local_dataset(root)
+    meta = dataset.meta
+    if not has_our_fields(meta.features):
+        raise DatasetError(
+            f"{root}: its fields are not those of this project (docs/datasets.md). Import it: mikasa-vla "
+            f"dataset convert {root} --to lerobot --out DIR"
+        )
+    wrong = [said.sentence for said in check_videos(root, meta) if said.answer == "refused"]
+    if wrong:
+        raise DatasetError(f"{root}: {' '.join(wrong)}")
+    demonstrations = demonstrations_of(dataset)
+    kept = require_sound(demonstrations)
+    without = [camera for camera in meta.video_keys if camera not in (meta.stats or {})]
+    if without:
+        raise DatasetError(
+            f"{root}: meta/stats.json has nothing on {', '.join(without)}. Compute it: lerobot-edit-dataset "
+            "--operation.type recompute_stats"
+        )
+    write_statistics(root, [meta])
+    facts = _facts(root, demonstrations, meta, task, kept)
+    write_import(root, facts)
+    return facts
+
+
+def _facts(
+    root: Path, what: Demonstrations, meta: Any, task: TaskSpec | None, kept: tuple[str, ...]
+) -> ImportFacts:
+    assert what.action is not None  # `has_our_fields`
+    mode = what.action.control_mode
+    state = next(kind for kind, names in STATE_NAMES.items() if names == names_of(meta.features[STATE_KEY]))
+    other = other_sentences(what, task)
+    return ImportFacts(
+        complete=True,
+        source_layout="adopted",
+        task=None if task is None else task.id,
+        instruction_source="source",
+        state=state,
+        control_mode=mode,
+        executable_by_pd_ee_delta_pose=mode == EE_DELTA_POSE,
+        absent=tuple(key for key in dataset_features(state) if key not in meta.features),
+        left_out=(),
+        n_frames=what.n_frames,
+        episodes=tuple(_episode(what, number, first) for number, first in enumerate(what.firsts.tolist())),
+        source_files={},
+        files=digest_files(root),
+        vla_eval_version=__version__,
+        is_checked=True,
+        converted=("statistics: those of numbers computed from all rows, those of images without quantiles",),
+        kept=(*kept, *other),
+    )
+
+
+def _episode(what: Demonstrations, number: int, first: int) -> ImportedEpisode:
+    rows = slice(first, first + what.lengths[number])
+    success = what.columns.get(SUCCESS_KEY)
+    return ImportedEpisode(
+        name=what.names[number],
+        n_steps=what.lengths[number],
+        instruction=str(what.sentences[first]),
+        source_seed=None,
+        success=None if success is None else bool(np.any(success[rows])),
+    )

@@ -1,0 +1,262 @@
+"""What `mikasa-vla dataset check` says of a dataset, whoever made it. Decodes no image."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import numpy as np
+from av.error import FFmpegError
+
+from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.data.checks.agreement import episodes_by_video
+from vla_eval.data.checks.demonstrated import Demonstrations
+from vla_eval.data.checks.rules import Answer, find_breaches, require_sound
+from vla_eval.data.completeness import check_complete
+from vla_eval.data.folder_contents import check_folder
+from vla_eval.data.foreign.convert import find_source
+from vla_eval.data.foreign.lerobot_files import OF_LEROBOT, names_of
+from vla_eval.data.frame_cache import channels_first
+from vla_eval.data.imported import IMPORT_FILE, ImportFacts
+from vla_eval.data.info_file import INFO_FILE
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, DatasetFacts
+from vla_eval.data.mixture import MixtureFacts
+from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.tables import read_columns
+from vla_eval.errors import DatasetError
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, IMAGE_SIZE_PX, PROPRIO_KEYS, STATE_KEY, STATE_NAMES
+from vla_eval.viz.mp4 import open_mp4
+
+Facts = DatasetFacts | ImportFacts | MixtureFacts
+STATISTICS = ("min", "max", "mean", "std")
+"""Of `meta/stats.json`; not its quantiles, since lerobot averages those of episodes."""
+STATISTICS_TOLERANCE = 1e-3  # relative; lerobot computes in float32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Said:
+    """One line of the report."""
+
+    answer: Answer
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckReport:
+    """What there is to say of a dataset.
+
+    Attributes:
+        path: its folder.
+        kind: what it is.
+        demonstrations: its numbers and sentences.
+        said: what was found.
+        next_step: what can be done with it.
+    """
+
+    path: Path
+    kind: str
+    demonstrations: Demonstrations
+    said: tuple[Said, ...]
+    next_step: str
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether something has to be changed before it can be used."""
+        return any(one.answer == "refused" for one in self.said)
+
+
+def check(path: Path) -> CheckReport:
+    """Look at all of a dataset but the pixels.
+
+    Raises:
+        DatasetError: there is nothing that can be read, or its files do not belong together.
+    """
+    check_folder(path)
+    if not (path / INFO_FILE).is_file():
+        return _of_source(path, "")
+    facts = _own_facts(path)
+    kind = "" if facts is None else _kind(facts)
+    dataset = open_local_dataset(path)
+    videos = tuple(check_videos(path, dataset.meta))
+    if kind or has_our_fields(dataset.meta.features):
+        demonstrations = demonstrations_of(dataset)
+        said = (*videos, *_statistics(dataset, demonstrations), *_known_or_found(facts, demonstrations))
+        return CheckReport(
+            path=path,
+            kind=kind or "a LeRobotDataset with the fields of this project, without its records",
+            demonstrations=demonstrations,
+            said=said,
+            next_step="" if kind else f"mikasa-vla dataset adopt {path}",
+        )
+    try:
+        report = _of_source(path, "a LeRobotDataset")
+    except DatasetError as exc:
+        demonstrations = demonstrations_of(dataset)
+        said = (Said(answer="refused", sentence=str(exc)), *_breaches(demonstrations))
+        report = CheckReport(
+            path=path, kind="a LeRobotDataset", demonstrations=demonstrations, said=said, next_step=""
+        )
+    statistics = _statistics(dataset, demonstrations_of(dataset))
+    return CheckReport(
+        path=path,
+        kind=report.kind,
+        demonstrations=report.demonstrations,
+        said=(*videos, *statistics, *report.said),
+        next_step=report.next_step,
+    )
+
+
+def demonstrations_of(dataset: Any) -> Demonstrations:  # Any: LeRobotDataset
+    """Return what is checked of a dataset by the names in its own `meta/info.json`."""
+    meta = dataset.meta
+    columns = {
+        name: rows
+        for name, rows in read_columns(dataset.root).items()
+        if name not in OF_LEROBOT and rows.dtype.kind in "biuf"
+    }
+    names = {name: names_of(meta.features[name]) for name in columns}
+    sentences = meta.tasks.index
+    ends = zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True)
+    lengths = tuple(int(stop - first) for first, stop in ends)
+    return Demonstrations(
+        where=Path(dataset.root),
+        fps=meta.fps,
+        names=tuple(f"episode {number}" for number in range(len(lengths))),
+        lengths=lengths,
+        columns=columns,
+        dims={name: known for name, known in names.items() if known},
+        sentences=tuple(
+            str(sentences[int(index)]) for index in read_columns(dataset.root, ("task_index",))["task_index"]
+        ),
+        action=next((spec for spec in CONTROL_MODES.values() if spec.dims == names.get(ACTION_KEY)), None),
+        image_sizes_px={camera: channels_first(meta.features[camera])[1:] for camera in meta.camera_keys},
+    )
+
+
+def has_our_fields(features: Any) -> bool:  # Any: lerobot's plain data
+    """Whether a dataset has the fields that policies here are trained on, with our names of numbers."""
+    states = [names_of(features[STATE_KEY])] if STATE_KEY in features else []
+    modes = [spec.dims for spec in CONTROL_MODES.values()]
+    return (
+        set(CAMERA_KEYS.values()) <= set(features)
+        and any(state in STATE_NAMES.values() for state in states)
+        and any(key in features for key in PROPRIO_KEYS.values())
+        and ACTION_KEY in features
+        and names_of(features[ACTION_KEY]) in modes
+    )
+
+
+def _of_source(path: Path, kind: str) -> CheckReport:
+    source = find_source(path)
+    demonstrations = source.demonstrations(expected_px=IMAGE_SIZE_PX)
+    said = [Said(answer="kept", sentence=f"{remark}.") for remark in source.remarks]
+    if source.left_out:
+        said.append(Said(answer="kept", sentence=f"A conversion leaves out {', '.join(source.left_out)}."))
+    return CheckReport(
+        path=path,
+        kind=kind or f"{len(source.files)} npz files",
+        demonstrations=demonstrations,
+        said=(*said, *_breaches(demonstrations)),
+        next_step=f"mikasa-vla dataset convert {path} --to lerobot --out DIR",
+    )
+
+
+def require_checked(dataset: Any, facts: Facts) -> None:  # Any: LeRobotDataset
+    """Apply the rules to what no conversion has applied them to.
+
+    Raises:
+        DatasetError: an import that an older version made, or a mixture, breaks one.
+    """
+    is_known = isinstance(facts, DatasetFacts) or (isinstance(facts, ImportFacts) and facts.is_checked)
+    if not is_known:
+        require_sound(
+            dataclasses.replace(demonstrations_of(dataset), is_gripper_named=isinstance(facts, MixtureFacts))
+        )
+
+
+def _own_facts(root: Path) -> Facts | None:
+    """Return what a dataset of this project says of itself; None for others.
+
+    Raises:
+        DatasetError: it is not complete, or its files are not what they were.
+    """
+    is_ours = any((root / file).exists() for file in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE))
+    return check_complete(root) if is_ours else None
+
+
+def _kind(facts: Facts) -> str:
+    match facts:
+        case DatasetFacts():
+            return f"a recording of {facts.task}, complete"
+        case ImportFacts(source_layout="adopted"):
+            return "an adopted dataset, complete"
+        case ImportFacts():
+            return f"an import from {facts.source_layout}, complete"
+        case MixtureFacts():
+            return f"a mixture of {len(facts.sources)} datasets, complete"
+
+
+def _known_or_found(facts: Facts | None, demonstrations: Demonstrations) -> Iterator[Said]:
+    """Yield what a conversion has found, or what is found now; a recording follows the rules."""
+    if isinstance(facts, ImportFacts) and facts.is_checked:
+        yield from (Said(answer="kept", sentence=sentence) for sentence in facts.kept)
+    elif not isinstance(facts, DatasetFacts):
+        yield from _breaches(demonstrations)
+
+
+def _breaches(demonstrations: Demonstrations) -> Iterator[Said]:
+    for one in find_breaches(demonstrations):
+        yield Said(answer=one.rule.answer, sentence=str(one))
+
+
+def check_videos(root: Path, meta: Any) -> Iterator[Said]:
+    """Compare the headers of videos with what `meta/` says of them."""
+    ends = list(zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True))
+    for path, (camera, numbers) in episodes_by_video(meta).items():
+        needed = sum(ends[number][1] - ends[number][0] for number in numbers)
+        try:
+            with open_mp4(root / path, DatasetError) as container:
+                stream = container.streams.video[0]
+                size, n_frames, fps = (stream.height, stream.width), stream.frames, stream.average_rate
+        except (FFmpegError, LookupError) as exc:
+            yield Said(answer="refused", sentence=f"{path}: cannot be read as a video ({exc!s:.100}).")
+            continue
+        expected = channels_first(meta.features[camera])[1:]
+        if size != expected:
+            found = f"{size[0]} × {size[1]} px, expected {expected[0]} × {expected[1]}"
+            yield Said(answer="refused", sentence=f"{path}: its frames are {found} (meta/info.json).")
+        if n_frames < needed:
+            yield Said(
+                answer="refused",
+                sentence=f"{path}: has {n_frames} frames, its {len(numbers)} episodes need {needed}.",
+            )
+        if fps != meta.fps:
+            yield Said(
+                answer="refused", sentence=f"{path}: has {fps} frames per second, expected {meta.fps}."
+            )
+
+
+def _statistics(dataset: Any, demonstrations: Demonstrations) -> Iterator[Said]:
+    """Compare `meta/stats.json` with the rows; a conversion and an adoption compute it from them."""
+    stored = dataset.meta.stats or {}
+    differing = []
+    for name, rows in demonstrations.columns.items():
+        values = rows.reshape(len(rows), -1).astype(np.float64)
+        computed = {kind: getattr(values, kind)(axis=0) for kind in STATISTICS}
+        known = stored.get(name, {})
+        for kind, expected in computed.items():
+            found = np.asarray(known.get(kind, np.nan), dtype=np.float64).reshape(-1)
+            scale = np.abs(values).max(axis=0) + 1e-12
+            if (
+                found.shape != expected.shape
+                or not (np.abs(found - expected) <= STATISTICS_TOLERANCE * scale).all()
+            ):
+                differing.append(f"{kind} of {name}")
+                break
+    if differing:
+        yield Said(
+            answer="kept",
+            sentence=f"meta/stats.json differs from the rows: {', '.join(differing)}. `dataset adopt` and "
+            "`dataset convert` compute it again.",
+        )
