@@ -139,7 +139,9 @@ def check_values(path: Path, table: Any, names: Sequence[str]) -> None:  # Any: 
         column, level = table[name], 0
         while True:
             if column.null_count:
-                raise refused(path, f"a value in each row of {name}", f"{column.null_count} without one")
+                place = pc.index(pc.is_null(column), True).as_py() * table.num_rows // len(column)
+                found = f"none in row {place} ({column.null_count} values are missing)"
+                raise refused(path, f"a value in each row of {name}", found)
             if isinstance(column.type, pa.BaseExtensionType):
                 column = pa.chunked_array(
                     [chunk.storage for chunk in column.chunks], column.type.storage_type

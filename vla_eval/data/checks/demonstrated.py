@@ -63,7 +63,8 @@ class Demonstrations:
 
     def floats(self, name: str) -> NDArray[np.float64]:
         """Return a field as (N, D) float64."""
-        return self.columns[name].reshape(self.n_frames, -1).astype(np.float64)
+        rows = self.columns[name]
+        return rows.reshape(self.n_frames, int(np.prod(rows.shape[1:]))).astype(np.float64)
 
     def dim(self, name: str, index: int) -> str:
         """Return `action (gripper)` for a number of a field."""

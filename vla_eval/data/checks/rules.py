@@ -51,20 +51,29 @@ class Finding:
         return f"{self.sentence} {self.rule.remedy}".rstrip()
 
 
-def find_breaches(demonstrations: Demonstrations) -> tuple[Finding, ...]:
-    """Return all breaches of all rules, in the order of the table."""
+def find_breaches(
+    demonstrations: Demonstrations, *, rules: Sequence[Rule] | None = None
+) -> tuple[Finding, ...]:
+    """Return all breaches of rules, in their order.
+
+    Args:
+        demonstrations: what is checked.
+        rules: None: all.
+    """
     return tuple(
-        Finding(rule=rule, sentence=sentence) for rule in RULES for sentence in rule.check(demonstrations)
+        Finding(rule=rule, sentence=sentence)
+        for rule in (RULES if rules is None else rules)
+        for sentence in rule.check(demonstrations)
     )
 
 
-def require_sound(demonstrations: Demonstrations) -> tuple[str, ...]:
-    """Return what is kept and should be known of it.
+def require_sound(demonstrations: Demonstrations, *, rules: Sequence[Rule] | None = None) -> tuple[str, ...]:
+    """Return what is kept and should be known of it; arguments as `find_breaches`.
 
     Raises:
         DatasetError: a rule refuses them; all such breaches are named.
     """
-    found = find_breaches(demonstrations)
+    found = find_breaches(demonstrations, rules=rules)
     refused = [str(one) for one in found if one.rule.answer == "refused"]
     if refused:
         raise DatasetError(f"{demonstrations.where}: {' '.join(refused)}")
@@ -202,6 +211,8 @@ def _repetitions(what: Demonstrations) -> Iterator[str]:
 
 
 _FETCH = "Correct it where the dataset was made."
+FINITE = Rule(name="finite numbers", answer="refused", check=_finite, remedy=_FETCH)
+"""Before anything is computed of them: clipping would hide what is infinite."""
 RULES = (
     Rule(
         name=f"{FPS} frames per second",
@@ -222,7 +233,7 @@ RULES = (
         check=_lengths,
         remedy="Delete such episodes (`lerobot-edit-dataset`).",
     ),
-    Rule(name="finite numbers", answer="refused", check=_finite, remedy=_FETCH),
+    FINITE,
     Rule(name="unit quaternions", answer="refused", check=_quaternions, remedy=_FETCH),
     Rule(
         name="actions within the bounds of their control mode",

@@ -15,6 +15,7 @@ from vla_eval.config.prompts import instruction_for, instructions_for
 from vla_eval.control_modes import ABSOLUTE_MODES
 from vla_eval.core import ImageArray
 from vla_eval.data.checks.demonstrated import Demonstrations, Numbers
+from vla_eval.data.checks.rules import FINITE, require_sound
 from vla_eval.data.foreign.episodes import PER_STEP, Pictures, Source, SourceEpisode
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, DONE_KEY, FPS, IMAGE_SIZE_PX, SUCCESS_KEY
@@ -64,14 +65,23 @@ class Changes:
         return self.image_size_px or IMAGE_SIZE_PX
 
 
-def change(source: Source, changes: Changes) -> tuple[Source, tuple[str, ...]]:
-    """Return the source with all that is asked for, and a sentence for each thing that was converted."""
-    said: list[str] = []
+def prepare(source: Source, changes: Changes) -> tuple[Source, tuple[str, ...], tuple[str, ...]]:
+    """Return the source with all that is asked for, checked, and sentences on what was converted and kept.
+
+    Raises:
+        DatasetError: it breaks a rule.
+    """
+    require_sound(source.demonstrations(expected_px=changes.expected_px), rules=(FINITE,))
+    converted = []
     for step in STEPS:
         source, sentence = step(source, changes)
         if sentence:
-            said.append(sentence)
-    return source, tuple(said)
+            converted.append(sentence)
+    demonstrations = dataclasses.replace(
+        source.demonstrations(expected_px=changes.expected_px), is_gripper_named=changes.gripper is not None
+    )
+    kept = (*source.remarks, *require_sound(demonstrations), *other_sentences(demonstrations, changes.task))
+    return source, tuple(converted), kept
 
 
 def other_sentences(what: Demonstrations, task: TaskSpec | None) -> tuple[str, ...]:

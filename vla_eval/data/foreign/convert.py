@@ -12,7 +12,7 @@ import numpy as np
 
 from vla_eval.data.checks.rules import require_sound
 from vla_eval.data.folder_contents import check_folder
-from vla_eval.data.foreign.changes import Changes, change, other_sentences
+from vla_eval.data.foreign.changes import Changes, prepare
 from vla_eval.data.foreign.episodes import JOINTS_KEY, Source, SourceEpisode
 from vla_eval.data.foreign.import_writer import ImportWriter
 from vla_eval.data.foreign.lerobot_files import lerobot_source
@@ -83,12 +83,7 @@ def convert_to_lerobot(
     if (source.path / RECORDING_FILE).is_file():
         raise DatasetError(f"{source.path}: is a LeRobotDataset of this project already.")
     changes = changes or Changes()
-    source, converted = change(source, changes)
-    demonstrations = dataclasses.replace(
-        source.demonstrations(expected_px=changes.expected_px),
-        is_gripper_named=changes.gripper is not None,
-    )
-    kept = (*source.remarks, *require_sound(demonstrations), *other_sentences(demonstrations, changes.task))
+    source, converted, kept = prepare(source, changes)
     with whole_folder(out, error=DatasetError) as draft:
         writer = ImportWriter(draft, source, task=changes.task, state=state)
         for episode in source.episodes:
