@@ -66,18 +66,19 @@ Seconds = Annotated[float, Range(0.0)]
 Distance = Annotated[float, Range(0.0)]
 
 
-def read_json(text: str | bytes, source: Source) -> dict[str, Any]:  # Any: JSON
+def read_json(text: str | bytes, source: Source, *, non_finite: bool = False) -> dict[str, Any]:  # Any: JSON
     """Return one JSON object.
 
     Args:
         text: the JSON; bytes are UTF-8.
         source: where it is from.
+        non_finite: whether numbers may be what Python writes as NaN and Infinity.
 
     Raises:
         VlaEvalError: of `source.error`: it is something else.
     """
     try:
-        data = loads(text, lone_surrogates=True)
+        data = loads(text, lone_surrogates=True, non_finite=non_finite)
     except ValueError as exc:  # json's and UTF-8's own are such errors
         raise source.refuse(shown(text), shorten(str(exc))) from exc
     if not isinstance(data, dict):
@@ -154,19 +155,22 @@ def read_file(path: Path, source: Source) -> bytes:
 # ------------------------------------------------------------------------------------------ JSON
 
 
-def loads(content: str | bytes, *, lone_surrogates: bool = False) -> Any:  # Any: JSON
+def loads(
+    content: str | bytes, *, lone_surrogates: bool = False, non_finite: bool = False
+) -> Any:  # Any: JSON
     """Return what JSON holds.
 
     Args:
         content: the JSON; bytes are UTF-8.
         lone_surrogates: whether text may hold what UTF-8 cannot: a file name of other bytes, in a traceback.
+        non_finite: see `read_json`.
 
     Raises:
         ValueError: it is no JSON, or not strict; the message says what was found.
     """
     text = content if isinstance(content, str) else content.decode("utf-8")
     try:
-        data = _DECODER.decode(text)
+        data = (_NON_FINITE_DECODER if non_finite else _DECODER).decode(text)
     except RecursionError:
         raise ValueError(TOO_DEEP) from None  # its traceback is a thousand lines that say nothing
     if text.count("{") + text.count("[") > MAX_DEPTH:
@@ -198,6 +202,7 @@ def _no_number(name: str) -> NoReturn:
 _DECODER = json.JSONDecoder(
     object_pairs_hook=_without_repetition, parse_float=_finite, parse_constant=_no_number
 )
+_NON_FINITE_DECODER = json.JSONDecoder(object_pairs_hook=_without_repetition)
 
 
 def _check_nesting(data: object) -> None:

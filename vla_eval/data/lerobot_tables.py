@@ -110,7 +110,8 @@ def read_statistics(root: Path) -> dict[str, dict[str, NDArray[np.generic]]] | N
     if not path.exists():
         return None
     source = Source(where=str(path), what="statistics by field and name", remedy=REMEDY, error=DatasetError)
-    fields = read_json(read_file(path, source), source)
+    # lerobot writes NaN where a column has it; which frame that is, the rules say (`checks.rules`).
+    fields = read_json(read_file(path, source), source, non_finite=True)
     for field, values in fields.items():
         if not isinstance(values, dict):
             raise source.refuse(f"{shown(field)}: {shown(values)}", "expected a mapping")
