@@ -173,3 +173,12 @@ def test_a_recording_refuses_arguments_that_the_task_cannot_have_before_anything
     with pytest.raises(TaskArgumentError, match=r"env\.show_cue: TakeItBack-v0: there are no candidates"):
         plan_recording(recipe("TakeItBack-v0", show_cue=False))
     assert plan_recording(recipe("RememberColor", n_items=4)).tasks
+
+
+@pytest.mark.parametrize("name", ["memory_color3", "memoryless_color3"])
+def test_shipped_weights_are_normalised_by_no_statistic_so_that_no_rule_on_them_moves_their_actions(
+    name: str,
+) -> None:
+    notes = normalization_notes("lerobot", {"checkpoint": name})
+
+    assert notes["before"] == notes["after"] == {}

@@ -10,6 +10,7 @@ from typing import Any
 from unittest.mock import patch
 from urllib.error import URLError
 
+import numpy as np
 import pytest
 import torch
 import torchvision
@@ -21,6 +22,7 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
+from vla_eval.data.convert import convert_to_lerobot, find_source
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
@@ -56,6 +58,22 @@ def run_an_episode(policy: Any) -> int:
     return record.n_inferences
 
 
+def imported_with_a_still_gripper(tmp_path: Path) -> Path:
+    """Import an episode in the paper's layout, in which all moves but the gripper and what it is told."""
+    draws = np.random.default_rng(0)
+    joints, action = draws.uniform(-1, 1, (8, 25)), draws.uniform(-1, 1, (8, 7))
+    joints[:, 14:16], action[:, 6] = 0.5, 1.0
+    (tmp_path / "npz").mkdir()
+    np.savez(
+        tmp_path / "npz/train_data_0.npz",
+        rgb=np.zeros((8, 128, 128, 6), np.uint8),
+        joints=joints,
+        action=action,
+    )
+    convert_to_lerobot(find_source(tmp_path / "npz"), tmp_path / "data", task=TASK, state="eef")
+    return tmp_path / "data"
+
+
 class TestRuns:
     def test_a_person_is_told_how_it_goes_and_a_file_all_that_lerobot_says(
         self, recorded: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -69,6 +87,23 @@ class TestRuns:
         log = (tmp_path / "run" / "train.log").read_text()
         assert "'optimizer'" in log
         assert "End of training" in log
+
+    def test_dimensions_that_hardly_move_are_named_and_not_blown_up(self, tmp_path: Path) -> None:
+        data = imported_with_a_still_gripper(tmp_path)
+        facts = (data / "meta/stats.json").read_text()
+        lines: list[str] = []
+
+        finetune(act(data, tmp_path / "run", steps=2), say=lines.append)
+
+        (line,) = (line for line in lines if line.startswith("hardly move in these demonstrations"))
+        assert line.endswith(": observation.state gripper_width 0; action gripper 0")
+        (file,) = find_checkpoint(tmp_path / "run").glob("policy_preprocessor*.safetensors")
+        stored = load_file(file)
+        assert stored["observation.state.std"][9] == pytest.approx(1e-3)
+        assert stored["action.std"][6] == pytest.approx(1e-3)
+        exact = json.loads(facts)["action"]["std"][:6]
+        assert stored["action.std"][:6].tolist() == pytest.approx(exact)
+        assert (data / "meta/stats.json").read_text() == facts
 
     def test_a_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
         self, recorded: Path, tmp_path: Path, killed_at: KilledAt

@@ -15,6 +15,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import (
     CheckpointError,
@@ -77,7 +78,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         _check_features(config, dataset)
         if hasattr(config, "fit_to_actions"):
             actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
-            config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
+            statistics = usable_statistics(dataset.meta.stats, dataset.meta.features)
+            config.fit_to_actions(actions, statistics[ACTION_KEY])
         if hasattr(config, "fit_to_rewards"):
             config.fit_to_rewards(_columns_trained_on(dataset))
         if not masks_padding(config):
