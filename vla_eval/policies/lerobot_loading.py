@@ -46,6 +46,7 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
+from vla_eval.policies.execution_fields import without_execution
 from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
@@ -148,7 +149,7 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
     check_config(cls, data, where=where)
     try:
         with only_data():  # some configurations open the backbone that they name
-            config = draccus.decode(cls, data)
+            config = draccus.decode(cls, without_execution(data))
     except CheckpointError:
         raise
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
