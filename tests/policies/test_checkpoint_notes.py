@@ -130,8 +130,11 @@ def test_a_statistic_that_is_used_and_not_there_is_an_error(checkpoint: Path) ->
     save_file({"action/q01": np.zeros(2, np.float32)}, checkpoint / "after.safetensors")
     with pytest.raises(CheckpointError, match=r"after\.safetensors: has no statistic 'q99' of 'action'"):
         normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
+    (checkpoint / "after.safetensors").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match=r"after\.safetensors: cannot be read as safetensors"):
+        normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
     (checkpoint / "after.safetensors").unlink()
-    with pytest.raises(CheckpointError, match="cannot be read as safetensors"):
+    with pytest.raises(CheckpointError, match=r"after\.safetensors: there is no such file"):
         normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 import torchvision
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, act, context, pi0
@@ -26,7 +26,7 @@ from vla_eval.data.convert import convert_to_lerobot, find_source
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
-from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts, write_facts
+from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, find_checkpoint, read_facts, write_facts
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
@@ -251,11 +251,30 @@ class TestRuns:
         assert not trace.exists()
         assert not (tmp_path / "next").exists()  # a mistake leaves no empty run folder
 
+    def test_a_base_of_before_lerobots_processors_or_without_theirs_is_refused_before_a_run_begins(
+        self, recorded: Path, tmp_path: Path
+    ) -> None:
+        base = tmp_path / "base"
+        finetune(act(recorded, base, steps=2))
+        folder = find_checkpoint(base)
+        after = folder / "policy_postprocessor.json"
+        content = after.read_text()
+        after.unlink()
+        lines: list[str] = []
+
+        with pytest.raises(CheckpointError, match=r"policy_postprocessor\.json: there is no such file"):
+            finetune(act(recorded, tmp_path / "next", base_checkpoint=str(base)), say=lines.append)
+        after.write_text(content)
+        tensors = weights(base)
+        save_file({**tensors, "normalize_inputs.buffer_action.mean": torch.zeros(7)}, folder / WEIGHTS_FILE)
+        with pytest.raises(CheckpointError, match="migrate_policy_normalization"):
+            finetune(act(recorded, tmp_path / "next", base_checkpoint=str(base)), say=lines.append)
+
+        assert not lines and not (tmp_path / "next").exists()
+
     def test_a_base_that_lacks_a_tensor_is_not_trained_on(
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:
-        from safetensors.torch import save_file
-
         base = tmp_path / "base"
         with tiny_paligemma():
             finetune(pi0(recorded, base, tokenizer, steps=2))

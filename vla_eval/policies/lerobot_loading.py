@@ -51,6 +51,7 @@ from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.policies.plain_errors import plain_errors, raise_plainly, says_what_is_missing
+from vla_eval.policies.saved_processor import refuse_built_in_normalization
 from vla_eval.policies.weight_file import WeightFile
 from vla_eval.policies.weights import check_same, put_weights
 
@@ -131,6 +132,7 @@ def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
 
 def read_config(folder: Path, options: LoadOptions) -> Any:
     """Return the policy's configuration, set to the wanted device and precision."""
+    refuse_built_in_normalization(folder)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
     where = str(folder / CONFIG_FILE)

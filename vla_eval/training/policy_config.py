@@ -26,11 +26,18 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
-from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.policies.checkpoint import (
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    find_checkpoint,
+    read_json,
+)
 from vla_eval.policies.config_check import check_config
 from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
@@ -171,6 +178,12 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
 def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
     assert recipe.base_checkpoint is not None
     folder = find_checkpoint(Path(recipe.base_checkpoint))
+    refuse_built_in_normalization(folder)
+    for name in (
+        PREPROCESSOR_FILE,
+        POSTPROCESSOR_FILE,
+    ):  # what they normalise by is replaced, their steps are not
+        read_saved_processor(folder / name)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
     cls = config_class(recipe.type, where="finetune.type")
