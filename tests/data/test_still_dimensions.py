@@ -167,6 +167,11 @@ def test_a_gripper_that_moves_in_one_frame_of_a_thousand_has_the_range_of_its_tw
     assert (stats["q01"], stats["q99"], stats["q10"], stats["q90"]) == (-1, 1, -1, 1)
 
 
+def test_a_dataset_without_statistics_has_none_that_are_usable() -> None:
+    assert usable_statistics(None, {}) == {}
+    assert not list(about_still_dimensions(None, {}))
+
+
 def test_statistics_of_another_program_may_lack_quantiles_and_names() -> None:
     stats = {STATE_KEY: {"mean": np.zeros(2), "std": np.array([0.0, 1.0])}, ACTION_KEY: {"q01": np.zeros(2)}}
     features = {STATE_KEY: {"names": {"motors": ["a", "b"]}}}

@@ -198,17 +198,24 @@ class TestACheckpointMadeForTemporalEnsembling:
         return make_plan(config).warnings
 
     def test_eval_check_and_serve_say_it_once_and_its_actions_are_those_of_its_weights(
-        self, act: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self,
+        act: Path,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         folder = changed(act, tmp_path, temporal_ensemble_coeff=0.02, n_action_steps=1)
+        monkeypatch.setattr("vla_eval.serving.server.run_server", lambda *_args, **_kwargs: None)
+        monkeypatch.setattr("vla_eval.cli.serve.WORKER_ENVIRONMENT", {})  # of this process
 
         (warning,) = self.evaluation(folder, n_action_steps=(1, 2))
         assert "temporal_ensemble_coeff = 0.02 is ignored" in warning
         assert "--n-action-steps 1 --set chunking.mode=temporal_ensemble" in warning
         assert "chunking.ensemble_decay=0.02." in warning
         assert host_policy(HostOptions(policy=str(folder))).ignored == (warning,)
-        assert main(["check", str(folder)]) == 0
-        assert capsys.readouterr().err.count("temporal_ensemble_coeff = 0.02 is ignored") == 1
+        for command in (["check", str(folder)], ["serve", "--policy", str(folder)]):
+            assert main(command) == 0
+            assert capsys.readouterr().err.count(f"warning: {warning}\n") == 1
         assert load_checkpoint(folder, LoadOptions(device="cpu")).config.temporal_ensemble_coeff is None
 
     def test_nothing_is_said_where_the_evaluation_does_the_same(self, act: Path, tmp_path: Path) -> None:

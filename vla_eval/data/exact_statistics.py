@@ -115,21 +115,21 @@ def dataset_statistics(
     }
 
 
-def usable_statistics(statistics: _Fields, features: _Fields) -> dict[str, dict[str, Any]]:
+def usable_statistics(statistics: _Fields | None, features: _Fields) -> dict[str, dict[str, Any]]:
     """Return statistics that a normalisation can divide by; other fields than state and action as they are.
 
     - A standard deviation is at least the resolution.
-    - Quantiles nearer to their middle than the standard deviation leave out rare frames that lie far away, of
-      which a loss would be made (a Gaussian's q01 lies 2.3 deviations away, its q10 1.3). Minimum and maximum
-      take their place, which are never nearer (Popoviciu 1935): the mean square of what is normalised is then
-      of the order of 1, as it is with mean and standard deviation.
+    - Quantiles that are nearer to their middle than the standard deviation leave out rare frames that lie far
+      away and would dominate a loss (a Gaussian's q01 is 2.3 deviations away, its q10 1.3). They are replaced
+      by minimum and maximum, which are never nearer (Popoviciu 1935). So the mean square of normalised
+      demonstrations is of the order of 1, as it is with mean and standard deviation.
     - A range reaches at least the resolution to both sides of its middle.
 
     Args:
-        statistics: of a dataset: field -> statistic -> numbers.
+        statistics: of a dataset: field -> statistic -> numbers; None: it has none.
         features: of the dataset: field -> `names` of its dimensions.
     """
-    usable = {key: dict(values) for key, values in statistics.items()}
+    usable = {key: dict(values) for key, values in (statistics or {}).items()}
     for field in _fields(statistics, features):
         ranges: dict[str, NDArray[np.float64]] = {}
         for low, high in (names for names in RANGES if field.has(*names)):
@@ -144,7 +144,7 @@ def usable_statistics(statistics: _Fields, features: _Fields) -> dict[str, dict[
     return usable
 
 
-def about_still_dimensions(statistics: _Fields, features: _Fields) -> Iterator[str]:
+def about_still_dimensions(statistics: _Fields | None, features: _Fields) -> Iterator[str]:
     """Yield lines for a person on the dimensions whose statistics `usable_statistics` changes."""
     still: list[str] = []
     rare: list[str] = []
@@ -157,12 +157,12 @@ def about_still_dimensions(statistics: _Fields, features: _Fields) -> Iterator[s
                 lines.append(f"{field.key} {', '.join(np.array(names)[chosen])}")
     if still:
         yield (
-            f"hardly move in these demonstrations, and are normalised as if their standard deviation was "
+            f"hardly move in these demonstrations; a policy that normalises takes their deviation as "
             f"{RESOLUTION:g} (of velocities {RESOLUTION * FPS:g}): {'; '.join(still)}"
         )
     if rare:
         yield (
-            f"move in few of these frames, and are normalised by minimum and maximum, not by quantiles: "
+            f"move in few of these frames; a policy that normalises by quantiles takes minimum and maximum: "
             f"{'; '.join(rare)}"
         )
 
@@ -190,9 +190,10 @@ class _Field(NamedTuple):
         return np.asarray(nearer & (farthest >= self.resolution), dtype=np.bool_)
 
 
-def _fields(statistics: _Fields, features: _Fields) -> Iterator[_Field]:
-    for key in (key for key in (STATE_KEY, ACTION_KEY) if "std" in statistics.get(key, {})):
-        found = {name: np.asarray(values, dtype=np.float64) for name, values in statistics[key].items()}
+def _fields(statistics: _Fields | None, features: _Fields) -> Iterator[_Field]:
+    known = statistics or {}
+    for key in (key for key in (STATE_KEY, ACTION_KEY) if "std" in known.get(key, {})):
+        found = {name: np.asarray(values, dtype=np.float64) for name, values in known[key].items()}
         names, n_dims = features.get(key, {}).get("names"), len(found["std"])
         if not isinstance(names, list | tuple) or len(names) != n_dims:  # of another program
             names = range(n_dims)
