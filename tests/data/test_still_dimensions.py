@@ -1,6 +1,7 @@
 """Dimensions that hardly move: what a normalisation divides by, and how they are named."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from numpy.typing import NDArray
 
 from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.data import exact_statistics
+from vla_eval.data.card import write_card
 from vla_eval.data.exact_statistics import (
     RESOLUTION,
     about_still_dimensions,
     usable_statistics,
     vector_statistics,
 )
+from vla_eval.data.opening import open_local_dataset
 from vla_eval.features import ACTION_KEY, STATE_KEY, STATE_NAMES
 from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
 from vla_eval.policies.steps.step_names import STATISTICS
@@ -201,3 +205,17 @@ def test_one_that_moves_rarely_is_named_apart() -> None:
     (line,) = about_still_dimensions(*statistics_of(rows, key=ACTION_KEY, names=("dx", "gripper")))
 
     assert line.startswith("move in few of these frames") and line.endswith(": action gripper")
+
+
+def test_a_card_names_what_hardly_moves_in_state_and_action(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exact_statistics, "RESOLUTION", 100.0)  # more than anything moves here
+    meta = open_local_dataset(recorded).meta
+
+    text = write_card(recorded)
+
+    (line,) = (line for line in text.splitlines() if line.startswith("- hardly move"))
+    for key in (STATE_KEY, ACTION_KEY):
+        pairs = zip(meta.features[key]["names"], meta.stats[key]["std"], strict=True)
+        assert f"{key} {', '.join(f'{name} {std:.2g}' for name, std in pairs)}" in line

@@ -76,12 +76,12 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
         raise RecipeError(
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
-    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, warn=_print_warning)
-
-
-def _print_warning(line: str) -> None:
-    print(f"warning: {line}", file=sys.stderr)
+    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, say=_print_said)
 
 
 def _print_met(requirement: str) -> None:
     print(f"ok  {requirement}", flush=True)
+
+
+def _print_said(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

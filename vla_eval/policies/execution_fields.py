@@ -1,4 +1,4 @@
-"""Fields of LeRobot's configurations that say how chunks are executed, and what becomes of them here.
+"""Fields of LeRobot's configurations that say how chunks are executed, and how each is answered here.
 
 LeRobot's own loop (`select_action`) reads them; ours asks for whole chunks and executes them as an evaluation
 says. All other fields are honoured: LeRobot's classes are built from them, and processors come from the
@@ -21,7 +21,7 @@ DRAWS = "an inference's draws depend on task, seed, run and control step"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """What becomes of a field.
+    """How a field is answered.
 
     Attributes:
         translated: into what of ours; None: the field is ignored.
@@ -48,7 +48,7 @@ EXECUTION_FIELDS: Mapping[str, Answer] = MappingProxyType(
         "eval_seed": Answer(instead=DRAWS),
     }
 )
-"""Field -> what becomes of it."""
+"""Field -> how it is answered."""
 
 
 def without_execution(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ N_SLOTS = 2  # as many episodes as the check runs side by side
 
 
 def check_recipe(
-    policy: str, *, task: str, report: Callable[[str], None], warn: Callable[[str], None] = lambda _line: None
+    policy: str, *, task: str, report: Callable[[str], None], say: Callable[[str], None] = lambda _line: None
 ) -> list[str]:
     """Check a policy by its name, its recipe's file or its checkpoint's folder.
 
@@ -28,7 +28,7 @@ def check_recipe(
         policy: what `eval --policy` takes.
         task: the task whose cameras, states and actions it is given.
         report: called with each requirement that is met, as soon as that is known.
-        warn: called with what the policy's checkpoint asks for that is not done here.
+        say: gets what differs from the policy's training and is no requirement, line by line.
 
     Returns:
         The requirements, all of which are met.
@@ -46,8 +46,8 @@ def check_recipe(
         simulator="fake",
     )
     plan = make_plan(config)
-    for line in plan.ignored:
-        warn(line)
+    for line in plan.warnings:
+        say(f"warning: {line}")
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
     facts = EnvFacts(shown.spec, shown.n_candidates)
