@@ -130,8 +130,11 @@ def test_a_statistic_that_is_used_and_not_there_is_an_error(checkpoint: Path) ->
     save_file({"action/q01": np.zeros(2, np.float32)}, checkpoint / "after.safetensors")
     with pytest.raises(CheckpointError, match=r"after\.safetensors: has no statistic 'q99' of 'action'"):
         normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
+    (checkpoint / "after.safetensors").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match=r"after\.safetensors: cannot be read as safetensors"):
+        normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
     (checkpoint / "after.safetensors").unlink()
-    with pytest.raises(CheckpointError, match="cannot be read as safetensors"):
+    with pytest.raises(CheckpointError, match=r"after\.safetensors: there is no such file"):
         normalization_notes("lerobot", {"checkpoint": str(checkpoint)})
 
 
@@ -173,3 +176,12 @@ def test_a_recording_refuses_arguments_that_the_task_cannot_have_before_anything
     with pytest.raises(TaskArgumentError, match=r"env\.show_cue: TakeItBack-v0: there are no candidates"):
         plan_recording(recipe("TakeItBack-v0", show_cue=False))
     assert plan_recording(recipe("RememberColor", n_items=4)).tasks
+
+
+@pytest.mark.parametrize("name", ["memory_color3", "memoryless_color3"])
+def test_shipped_weights_are_normalised_by_no_statistic_so_that_no_rule_on_them_moves_their_actions(
+    name: str,
+) -> None:
+    notes = normalization_notes("lerobot", {"checkpoint": name})
+
+    assert notes["before"] == notes["after"] == {}

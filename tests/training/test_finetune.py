@@ -10,10 +10,11 @@ from typing import Any
 from unittest.mock import patch
 from urllib.error import URLError
 
+import numpy as np
 import pytest
 import torch
 import torchvision
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, act, context, pi0
@@ -21,10 +22,12 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
+from vla_eval.data import exact_statistics
 from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
-from vla_eval.policies.checkpoint import TrainingFacts, find_checkpoint, read_facts, write_facts
+from vla_eval.features import STATE_NAMES
+from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, find_checkpoint, read_facts, write_facts
 from vla_eval.policies.lerobot import make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
@@ -69,6 +72,25 @@ class TestRuns:
         log = (tmp_path / "run" / "train.log").read_text()
         assert "'optimizer'" in log
         assert "End of training" in log
+
+    def test_dimensions_that_hardly_move_are_named_and_not_blown_up(
+        self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        facts = (recorded / "meta/stats.json").read_text()
+        exact = np.array(json.loads(facts)["observation.state"]["std"])
+        least = float(np.median(exact))  # so that half of the dimensions hardly move
+        monkeypatch.setattr(exact_statistics, "RESOLUTION", least)
+        lines: list[str] = []
+
+        finetune(act(recorded, tmp_path / "run", steps=2), say=lines.append)
+
+        (line,) = (line for line in lines if line.startswith("hardly move in these demonstrations"))
+        for name, std in zip(STATE_NAMES["eef"], exact, strict=True):
+            assert (f" {name} {std:.2g}" in line) == (std < least)
+        for processor in ("policy_preprocessor", "policy_postprocessor"):
+            (file,) = find_checkpoint(tmp_path / "run").glob(f"{processor}*.safetensors")
+            assert load_file(file)["observation.state.std"].tolist() == pytest.approx(exact.clip(min=least))
+        assert (recorded / "meta/stats.json").read_text() == facts
 
     def test_a_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
         self, recorded: Path, tmp_path: Path, killed_at: KilledAt
@@ -216,11 +238,30 @@ class TestRuns:
         assert not trace.exists()
         assert not (tmp_path / "next").exists()  # a mistake leaves no empty run folder
 
+    def test_a_base_of_before_lerobots_processors_or_without_theirs_is_refused_before_a_run_begins(
+        self, recorded: Path, tmp_path: Path
+    ) -> None:
+        base = tmp_path / "base"
+        finetune(act(recorded, base, steps=2))
+        folder = find_checkpoint(base)
+        after = folder / "policy_postprocessor.json"
+        content = after.read_text()
+        after.unlink()
+        lines: list[str] = []
+
+        with pytest.raises(CheckpointError, match=r"policy_postprocessor\.json: there is no such file"):
+            finetune(act(recorded, tmp_path / "next", base_checkpoint=str(base)), say=lines.append)
+        after.write_text(content)
+        tensors = weights(base)
+        save_file({**tensors, "normalize_inputs.buffer_action.mean": torch.zeros(7)}, folder / WEIGHTS_FILE)
+        with pytest.raises(CheckpointError, match="migrate_policy_normalization"):
+            finetune(act(recorded, tmp_path / "next", base_checkpoint=str(base)), say=lines.append)
+
+        assert not lines and not (tmp_path / "next").exists()
+
     def test_a_base_that_lacks_a_tensor_is_not_trained_on(
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:
-        from safetensors.torch import save_file
-
         base = tmp_path / "base"
         with tiny_paligemma():
             finetune(pi0(recorded, base, tokenizer, steps=2))

@@ -86,6 +86,8 @@ def run(args: argparse.Namespace) -> int:
             device=args.device,
         )
     )
+    for line in hosted.ignored:
+        print(f"warning: {line}", file=sys.stderr)
     host = f"[{args.host}]" if ":" in args.host else args.host
 
     def ready(port: int) -> None:

@@ -12,7 +12,9 @@ from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
+from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
+from vla_eval.data.opening import open_local_dataset
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
 from vla_eval.storage.durable import replace_file
 from vla_eval.tasks.catalog import find_task
@@ -38,18 +40,24 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
     summary = summarize(root)
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)
     (root / SHEET_FILE).write_bytes(draw_sheet(root, summary))
-    text = render_card(summary, license_id=license_id)
+    meta = open_local_dataset(root).meta
+    still = tuple(about_still_dimensions(meta.stats, meta.features))
+    text = render_card(summary, license_id=license_id, still=still)
     replace_file(root / CARD_FILE, text)
     return text
 
 
-def render_card(summary: DatasetSummary, *, license_id: str | None = None) -> str:
-    """Return the card of a dataset."""
+def render_card(
+    summary: DatasetSummary, *, license_id: str | None = None, still: tuple[str, ...] = ()
+) -> str:
+    """Return the card of a dataset; `still`: lines on the dimensions that hardly move."""
     if license_id is None and _is_recorded_here(summary):
         license_id = OWN_LICENSE
     sections = [f"# {_title(summary)}\n", _introduction(summary)]
     for heading, section in _SECTIONS.items():
         text = section(summary)
+        if section is _statistics:
+            text += "".join(f"\n- {markdown_cell(line)}" for line in still) + ("\n" if still else "")
         if text:
             sections.append(f"## {heading}\n\n{text}")
     if license_id is None:
@@ -255,7 +263,7 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
     if summary.action.idle:
         text += (
             f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): "
-            f"normalise with care, and expect imitation to be easier than with the paper's data."
+            f"expect imitation to be easier than with the paper's data."
         )
     return text
 

@@ -22,6 +22,7 @@ from vla_eval.evaluation.inference_choice import (
     has_weights,
 )
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes, training_seeds
+from vla_eval.policies.execution_fields import ignored_fields
 from vla_eval.policies.registry import check_adapter
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
 from vla_eval.rollout import RolloutSettings
@@ -53,6 +54,7 @@ class Plan:
         left_out: (task, policy) pairs that make no sense together, and why, for a message.
         max_workers: the most workers that `workers: auto` may start, since each loads the policies that are
             not shared; None: no limit.
+        ignored: what checkpoints ask for that is not done here, see `ignored_fields`.
         shard: the part of the configuration's episodes that `jobs` are; None: all of them.
     """
 
@@ -66,12 +68,13 @@ class Plan:
     shared: Mapping[str, str]
     left_out: tuple[str, ...]
     max_workers: int | None
+    ignored: tuple[str, ...] = ()
     shard: Shard | None = None
 
     @property
     def warnings(self) -> list[str]:
         """What a person should know before the first episode."""
-        return seen_in_training((job.key for job in self.jobs), self.training_seeds)
+        return [*self.ignored, *seen_in_training((job.key for job in self.jobs), self.training_seeds)]
 
 
 def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None) -> Plan:
@@ -117,6 +120,7 @@ def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None)
         shared=shared,
         left_out=tuple(found.left_out),
         max_workers=_max_workers(policies, shared),
+        ignored=_ignored(found.groups),
     )
 
 
@@ -177,6 +181,15 @@ def _noted[T](
         for index, recipe in enumerate(policy.recipes)
         if (noted := note(recipe.value.adapter, recipe.value.args))
     }
+
+
+def _ignored(groups: Sequence[EpisodeGroup]) -> tuple[str, ...]:
+    """Return what of the checkpoints' configurations is ignored, each once."""
+    said: dict[str, None] = {}
+    for group in groups:
+        chunking = group.rollout.chunking
+        said.update(dict.fromkeys(ignored_fields(group.adapter, group.args, chunking=chunking)))
+    return tuple(said)
 
 
 def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:

@@ -46,10 +46,12 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.config_check import check_config, check_features
 from vla_eval.policies.empty_weights import empty_weights
+from vla_eval.policies.execution_fields import without_execution
 from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
 from vla_eval.policies.plain_errors import plain_errors, raise_plainly, says_what_is_missing
+from vla_eval.policies.saved_processor import refuse_built_in_normalization
 from vla_eval.policies.weight_file import WeightFile
 from vla_eval.policies.weights import check_same, put_weights
 
@@ -130,6 +132,7 @@ def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
 
 def read_config(folder: Path, options: LoadOptions) -> Any:
     """Return the policy's configuration, set to the wanted device and precision."""
+    refuse_built_in_normalization(folder)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
     where = str(folder / CONFIG_FILE)
@@ -148,7 +151,7 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
     check_config(cls, data, where=where)
     try:
         with only_data():  # some configurations open the backbone that they name
-            config = draccus.decode(cls, data)
+            config = draccus.decode(cls, without_execution(data))
     except CheckpointError:
         raise
     except Exception as exc:  # draccus has no class of its own for all that can be wrong

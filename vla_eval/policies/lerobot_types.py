@@ -20,6 +20,9 @@ CANNOT_BE_ASKED_FOR_CHUNKS = {
 }
 """Types of lerobot 0.6 that cannot be asked for a chunk from frames given from outside, and why."""
 
+CUT_THEIR_CHUNK = frozenset({"diffusion", "groot", "molmoact2", "pi0_fast"})
+"""Types whose `predict_action_chunk` returns `n_action_steps` actions and no more."""
+
 
 def chunk_size(config: Any) -> int:
     """Return how many actions a chunk has from the observed step on; earlier ones are of no use.
@@ -34,7 +37,7 @@ def chunk_size(config: Any) -> int:
             f"(action_delta_indices is {deltas}). This adapter runs policies that do."
         )
     n_actions = sum(int(delta) >= 0 for delta in deltas)
-    if config.type in ("diffusion", "pi0_fast"):
+    if config.type in CUT_THEIR_CHUNK:
         config.n_action_steps = n_actions
     return n_actions
 

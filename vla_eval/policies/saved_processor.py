@@ -1,16 +1,20 @@
 """The description of a processor as a checkpoint has it: steps by name, their settings, their files.
 
-Says what such a file may hold, and reads it; standard library only. Names are resolved, and steps made, by
-`processor_door`.
+Says what such a file may hold, and reads it, without torch. Names are resolved, and steps made, by
+`processor_door`. Checkpoints from before LeRobot had processors are recognised here.
 """
 
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # JSON of another program
 
+from safetensors import safe_open
+
 from vla_eval.errors import CheckpointError
+from vla_eval.policies.checkpoint import CONFIG_FILE, POSTPROCESSOR_FILE, PREPROCESSOR_FILE, WEIGHTS_FILE
 from vla_eval.policies.checkpoint_json import (
     FETCH_AGAIN,
     get_mapping,
@@ -22,6 +26,14 @@ from vla_eval.strict_json import shown
 
 STATE_SUFFIX = ".safetensors"
 HUB_SNAPSHOTS, HUB_BLOBS = "snapshots", "blobs"
+BUILT_IN = (
+    *("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets."),
+    *("normalize.", "unnormalize.", "input_normalizer.", "output_normalizer.", "normalalize_inputs."),
+)
+"""Beginnings of the names of normalising layers, which LeRobot had before its processors. Source:
+https://github.com/huggingface/lerobot/blob/v0.6.1/src/lerobot/processor/migrate_policy_normalization.py"""
+BUILT_IN_STATISTICS = (".mean", ".std", ".min", ".max")
+MIGRATE = "python -m lerobot.processor.migrate_policy_normalization"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +83,11 @@ def read_saved_processor(path: Path) -> SavedProcessor:
     """Read a processor's description; nothing is imported.
 
     Raises:
-        CheckpointError: it is missing, damaged, or names files outside of the checkpoint.
+        CheckpointError: it is missing, damaged, or names files that are missing or outside of the checkpoint.
     """
+    if path.parent.is_dir() and not path.exists():
+        refuse_built_in_normalization(path.parent)
+        raise _missing(path)
     data = read_json(path)
     steps = data.get("steps")
     if not isinstance(steps, list):
@@ -103,6 +118,45 @@ def _step(path: Path, index: int, step: object) -> SavedStep:
     )
 
 
+def refuse_built_in_normalization(folder: Path) -> None:
+    """Refuse a checkpoint that has its normalisation among its weights.
+
+    Args:
+        folder: with the weights; one without them passes.
+
+    Raises:
+        CheckpointError: it is of a LeRobot before its processors, or the weights are damaged.
+    """
+    file = folder / WEIGHTS_FILE
+    if not file.is_file():
+        return
+    try:
+        with safe_open(file, framework="np") as header:
+            names = list(header.keys())
+    except Exception as exc:  # safetensors raises its own class, which is no public name
+        raise CheckpointError(
+            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
+        ) from exc
+    built_in = [name for name in names if name.startswith(BUILT_IN) and name.endswith(BUILT_IN_STATISTICS)]
+    if built_in:
+        raise CheckpointError(
+            f"{file}: the statistics of normalisation are among the weights ({shown(built_in[0])}): the "
+            f"checkpoint is of a LeRobot before its processors ({PREPROCESSOR_FILE}, {POSTPROCESSOR_FILE}). "
+            f"Migrate it with LeRobot's command, and use the folder NEW: {MIGRATE} --pretrained-path "
+            f"{shlex.quote(str(folder))} --output-dir NEW"
+        )
+
+
+def _missing(path: Path) -> CheckpointError:
+    """Return the error of a file of a processor that is not there."""
+    return CheckpointError(
+        f"{path}: there is no such file, by which the policy's inputs or actions are normalised. A training "
+        f"(`mikasa-vla finetune`, lerobot-train) writes it beside the weights: copy all files of its folder "
+        f"pretrained_model, or fetch the whole repository again (`hf download`), not {CONFIG_FILE} and "
+        f"{WEIGHTS_FILE} alone."
+    )
+
+
 def _state_file(folder: Path, name: str, *, where: str) -> Path:
     if not name.endswith(STATE_SUFFIX) or Path(name).is_absolute() or leads_out(name, folder):
         raise CheckpointError(
@@ -110,6 +164,8 @@ def _state_file(folder: Path, name: str, *, where: str) -> Path:
             f"{shown(name)}. It "
             "is not read."
         )
+    if not (folder / name).exists():
+        raise _missing(folder / name)
     return folder / name
 
 

@@ -18,6 +18,7 @@ from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.policies.checkpoint import find_checkpoint, read_facts
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes, training_seeds
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.execution_fields import ignored_fields
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import POLICIES, PRIVILEGED, make_from_adapter
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
@@ -69,12 +70,14 @@ class HostedPolicy:
         metadata: what the server says of it.
         reader: reads its observations.
         task: the task of an episode whose client names none.
+        ignored: what its checkpoint asks for that is not done here.
     """
 
     policy: Policy
     metadata: ServerMetadata
     reader: ObservationReader
     task: str
+    ignored: tuple[str, ...] = ()
 
     @property
     def n_rows(self) -> int:
@@ -114,6 +117,7 @@ def host_policy(options: HostOptions) -> HostedPolicy:
         ),
         reader=reader,
         task=env.task,
+        ignored=ignored_fields(recipe.value.adapter, recipe.value.args),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
 from vla_eval.storage.provenance import collect_environment
@@ -107,6 +108,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
         f"dataset: {dataset.name} {dataset.sha256[:12]}, {frames.n_used} of {frames.n_frames} frames as "
         "starts"
     )
+    for line in about_still_dimensions(dataset.meta.stats, dataset.meta.features):
+        say(line)
     if dataset.failed:
         say(about_failures(dataset))
     if (told := about_decisions(dataset, job.policy)) is not None:

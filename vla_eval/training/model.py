@@ -12,6 +12,7 @@ from urllib.error import URLError
 import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 
+from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.errors import RecipeError, TrainingError
 from vla_eval.policies.backbones import WITHOUT, fetched_backbones
 from vla_eval.policies.checkpoint import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
@@ -93,9 +94,10 @@ def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
     Args:
         job: see there.
         model: what `make_model` returned.
-        meta: lerobot's description of the dataset, whose statistics normalise unless training resumes.
+        meta: lerobot's description of the dataset, by whose statistics, made usable, is normalised unless
+            training resumes.
     """
-    stats = meta.stats if job.resume_from is None else None
+    stats = usable_statistics(meta.stats, meta.features) if job.resume_from is None else None
     kwargs: dict[str, Any] = {} if stats is None else {"dataset_stats": stats}
     if job.weights is not None:
         kwargs |= _overrides(job, model.config, job.weights, stats)

@@ -15,6 +15,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import (
     CheckpointError,
@@ -25,11 +26,18 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
-from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.policies.checkpoint import (
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    find_checkpoint,
+    read_json,
+)
 from vla_eval.policies.config_check import check_config
 from vla_eval.policies.foreign_code import only_data
 from vla_eval.policies.lerobot_loading import config_class, with_local_files
 from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
@@ -77,7 +85,8 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         _check_features(config, dataset)
         if hasattr(config, "fit_to_actions"):
             actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
-            config.fit_to_actions(actions, dataset.meta.stats[ACTION_KEY])
+            statistics = usable_statistics(dataset.meta.stats, dataset.meta.features)
+            config.fit_to_actions(actions, statistics[ACTION_KEY])
         if hasattr(config, "fit_to_rewards"):
             config.fit_to_rewards(_columns_trained_on(dataset))
         if not masks_padding(config):
@@ -169,6 +178,12 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
 def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
     assert recipe.base_checkpoint is not None
     folder = find_checkpoint(Path(recipe.base_checkpoint))
+    refuse_built_in_normalization(folder)
+    for name in (
+        PREPROCESSOR_FILE,
+        POSTPROCESSOR_FILE,
+    ):  # what they normalise by is replaced, their steps are not
+        read_saved_processor(folder / name)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
     cls = config_class(recipe.type, where="finetune.type")

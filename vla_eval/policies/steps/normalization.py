@@ -1,7 +1,8 @@
 """Normalise vectors dimension by dimension, and back. Knows torch, nothing of lerobot or of policies.
 
 Statistics are never missing without an error: what is to be normalised must have them, of the right size
-and finite. A dimension that does not vary is treated as the originals do it:
+and finite. Statistics from a training here are never of a dimension that does not vary
+(`data.exact_statistics`). In those of earlier and of converted checkpoints it is treated as the originals do:
 
 - `mean_std` (Octo) divides by the deviation plus epsilon, whatever it is: the one value becomes 0. Source:
   https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/data/utils/data_utils.py#L243
