@@ -115,11 +115,11 @@ def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
     n_touches = np.array([len(one.touched) for one in known])
     n_right = np.array([len(set(one.touched) & set(one.right)) for one in known])
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    drawn = np.stack([rng.integers(len(known), size=len(known)) for _ in range(N_DRAWS)])
-    # One after the other they took a second for each row of a table.
-    found = _kept(n_touches[drawn], n_right[drawn].mean(axis=1), n_shown, n_candidates)
+    chosen_DE = np.stack([rng.integers(len(known), size=len(known)) for _ in range(N_DRAWS)])
+    # At once: one after the other they took a second for each row of a table.
+    drawn = _kept(n_touches[chosen_DE], n_right[chosen_DE].mean(axis=1), n_shown, n_candidates)
     (kept,) = _kept(n_touches[None], n_right.mean(keepdims=True), n_shown, n_candidates)
-    return Capacity(float(kept), Interval(*quantiles(found.tolist())))
+    return Capacity(float(kept), Interval(*quantiles(drawn.tolist())))
 
 
 def _kept(
