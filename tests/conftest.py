@@ -21,6 +21,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from vla_eval.workers.start import worker_context  # after the lines above
 
+gc.disable()  # while tests are collected: what a module makes stays
+
 # Whatever the first test of a process needs: what a server did not import, each worker would.
 worker_context(
     preload=(
@@ -56,6 +58,7 @@ def pytest_collection_finish() -> None:
     """Keep what is imported by now from being searched for garbage, which ManiSkill does at each reset."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

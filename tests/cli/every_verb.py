@@ -58,7 +58,8 @@ COMMANDS = {
     "show": f"show {TASK}",
     "doctor": "doctor --json",
     "bench --loader": "bench --loader --samples 8 --repeats 1",
-    "bench --serve": "bench --serve --sessions 1 --seconds 0.1",
+    # Its own server of a policy that computes nothing imports torch and lerobot; one of them is enough.
+    "bench --serve": "bench --serve random --sessions 1 --seconds 0.1",
     "completion": "completion bash",
 }
 ENDLESS = {"serve": "Serving", "view": "Hosting"}

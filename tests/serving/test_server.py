@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -167,6 +168,16 @@ class TestErrors:
             assert client.close_code() == 1011
             assert values(Client(server).ask(**frame())) == (0, 0, 1)  # others are served
 
+    def test_arrays_in_the_format_of_msgpack_numpy_are_named(self) -> None:
+        state = np.zeros(9, np.float32)
+        packed = {b"nd": True, b"type": "<f4", b"kind": b"", b"shape": [9], b"data": state.tobytes()}
+        with serving(CountingPolicy()) as server:
+            client = Client(server)
+            client.socket.send(msgpack.packb(frame(**{"observation/state": packed})))
+            answer = client.receive()
+            assert "an array as msgpack-numpy packs it; expected arrays as openpi-client packs them" in answer
+            assert client.close_code() == 1011
+
     @pytest.mark.parametrize("data", ["text", b"\xc1", packb([1])])
     def test_what_is_no_request_is_refused(self, data: str | bytes) -> None:
         with serving(CountingPolicy()) as server:
@@ -212,14 +223,26 @@ class TestHttp:
                 Client(server, key=key)
             assert values(Client(server, key="secret").ask(**frame())) == (0, 0, 1)
 
-    def test_a_page_in_a_browser_is_refused(self) -> None:
-        with serving(CountingPolicy()) as server:
+    @pytest.mark.parametrize(
+        "origin", ["http://page.example", "http://127.0.0.1:{port}", "null", "file://", ""]
+    )
+    @pytest.mark.parametrize("key", [None, "secret"])
+    def test_a_client_with_an_origin_is_refused_and_told_to_leave_it_out(
+        self, origin: str, key: str | None, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        with serving(CountingPolicy(), api_key=key) as server:
+            headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
+            sent = Origin(origin.format(port=server.port))
             with (
-                pytest.raises(InvalidStatus, match="403"),
-                connect(server.url, origin=Origin("http://page.example"), proxy=None),
+                pytest.raises(InvalidStatus, match="403") as refused,
+                connect(server.url, additional_headers={**headers, "origin": sent}, proxy=None),
             ):
                 pass
-            assert values(Client(server).ask(**frame())) == (0, 0, 1)
+            assert values(Client(server, key=key).ask(**frame())) == (0, 0, 1)
+        logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        for text in ((refused.value.response.body or b"").decode(), *logged):
+            assert "leave that header out" in text and "suppress_origin=True" in text
+        assert len(logged) == 1 and "from 127.0.0.1" in logged[0]
 
 
 class TestTheEnd:

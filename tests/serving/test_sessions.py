@@ -152,6 +152,86 @@ class TestEpisodesWithoutReset:
             table_.begins(begun(table_), request(prompt="another"))
 
 
+class TestAClientThatNeverResets:
+    """Its episodes are one for the policy, which remembers all of them: one warning."""
+
+    LONGEST_STEPS = 180  # of the paper's tasks: TakeItBack-v0
+
+    def play(
+        self, table_: SessionTable, session: Session, *, n_frames: int, observes: bool, says_step: bool
+    ) -> None:
+        for step in range(n_frames):
+            message = request(**({"step": step} if says_step else {}))
+            if observes and step % 8:
+                table_.observe(session, message)
+            else:
+                table_.window(session, message)
+
+    def begun_without_reset(self, table_: SessionTable, connection: int = 0) -> Session:
+        session = table_.session(connection, request(), address="here")
+        table_.begin(session, request())
+        return session
+
+    @pytest.mark.parametrize("observes", [False, True])
+    @pytest.mark.parametrize("says_step", [False, True])
+    @pytest.mark.parametrize("resets_once", [False, True])
+    def test_it_is_warned_of_once_after_more_frames_than_the_longest_episode_has(
+        self, observes: bool, says_step: bool, resets_once: bool, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        table_ = table()
+        session = begun(table_) if resets_once else self.begun_without_reset(table_)
+        self.play(table_, session, n_frames=self.LONGEST_STEPS + 1, observes=observes, says_step=says_step)
+        assert not caplog.records  # the frame after the last action is the episode's, too
+        message = request(step=self.LONGEST_STEPS + 1)
+        for _ in range(3):
+            table_.window(session, message)
+            message["step"] += 1
+        other = self.begun_without_reset(table_, connection=1)
+        self.play(table_, other, n_frames=self.LONGEST_STEPS + 5, observes=observes, says_step=says_step)
+
+        (record,) = caplog.records
+        said = record.getMessage()
+        assert record.levelname == "WARNING" and "'reset' before each episode" in said
+        assert f"connection 0 from here, session {'s' if resets_once else None}" in said.replace("'s'", "s")
+        assert f"step {self.LONGEST_STEPS + 1} of one episode, expected at most {self.LONGEST_STEPS}" in said
+
+    @pytest.mark.parametrize(
+        ("reads", "n_episodes", "horizon_steps"), [("last", 1, None), ("every", 5, None), ("every", 1, 400)]
+    )
+    def test_no_other_client_is(
+        self,
+        reads: Literal["last", "every"],
+        n_episodes: int,
+        horizon_steps: int | None,
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        """A policy that remembers nothing; a reset before each episode; a long episode that is announced."""
+        table_ = table(reads=reads)
+        for _ in range(n_episodes):
+            session = begun(table_, **({} if horizon_steps is None else {"horizon_steps": horizon_steps}))
+            n_frames = self.LONGEST_STEPS if n_episodes > 1 else 401
+            self.play(table_, session, n_frames=n_frames, observes=True, says_step=True)
+        assert not caplog.records
+
+    def test_an_episode_longer_than_announced_is_warned_of(self, caplog: pytest.LogCaptureFixture) -> None:
+        table_ = table()
+        self.play(table_, begun(table_, horizon_steps=60), n_frames=62, observes=False, says_step=False)
+        assert "step 61 of one episode, expected at most 60 (its 'horizon_steps')" in caplog.text
+
+    def test_another_instruction_or_connection_begins_an_episode_without_reset(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        table_ = table()
+        for connection in range(3):
+            session = self.begun_without_reset(table_, connection)
+            self.play(table_, session, n_frames=100, observes=False, says_step=False)
+            other = request(prompt="another")
+            assert table_.begins(session, other)
+            table_.begin(session, other)
+            self.play(table_, session, n_frames=100, observes=False, says_step=False)
+        assert not caplog.records
+
+
 class TestLimits:
     def test_an_idle_session_is_dropped_and_must_begin_again(self) -> None:
         clock = Clock()

@@ -1,5 +1,7 @@
 """Messages with arrays: what is written is read again, as openpi does it; anything else is refused."""
 
+import base64
+import io
 from typing import Any
 
 import msgpack
@@ -136,6 +138,65 @@ def test_a_shape_that_does_not_match_the_bytes_is_refused(shape: object) -> None
 def test_an_empty_array_of_absurd_shape_is_refused() -> None:
     with pytest.raises(CodecError, match="too large"):
         unpackb(array_map(data=b"", shape=[0, 2**62, 2**62]))
+
+
+def as_msgpack_numpy(value: Any) -> dict[bytes, Any]:
+    """Return an array, a numpy scalar or a complex number as `msgpack_numpy.encode` (0.4.8) does."""
+    if isinstance(value, complex):
+        return {b"complex": True, b"data": repr(value)}
+    if not isinstance(value, np.ndarray):
+        return {b"nd": False, b"type": value.dtype.str, b"data": value.data.tobytes()}
+    kind, names = value.dtype.kind, value.dtype.names
+    descr = [list(field) for field in value.dtype.descr] if names else value.dtype.str
+    data = value.dumps() if kind == "O" else value.tobytes()
+    fields = {b"nd": True, b"type": descr, b"kind": kind.encode() if kind in "VO" else b""}
+    return {**fields, b"shape": list(value.shape), b"data": data}
+
+
+def as_json_numpy(value: Any) -> dict[str, Any]:
+    text = base64.b64encode(value.tobytes()).decode()
+    return {"__numpy__": text, "dtype": value.dtype.str, "shape": list(value.shape)}
+
+
+def as_gr00t(value: Any) -> dict[str, Any]:
+    file = io.BytesIO()
+    np.save(file, value, allow_pickle=False)
+    return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+
+
+FOREIGN = [
+    *(("msgpack-numpy", as_msgpack_numpy(array)) for array in ARRAYS),
+    ("msgpack-numpy", as_msgpack_numpy(np.array([object], dtype=object))),  # a pickle
+    ("msgpack-numpy", as_msgpack_numpy(np.zeros(2, "i4,f4"))),
+    *(("msgpack-numpy", as_msgpack_numpy(scalar)) for scalar in (np.float32(1.5), np.bool_(True), 1 + 2j)),
+    *(("json-numpy", as_json_numpy(array)) for array in ARRAYS),
+    *(("Isaac-GR00T", as_gr00t(array)) for array in ARRAYS),
+]
+
+
+@pytest.mark.parametrize(("name", "fields"), FOREIGN)
+@pytest.mark.parametrize("as_text", [False, True])
+def test_an_array_that_another_program_packed_is_refused_by_the_name_of_its_format(
+    name: str, fields: dict[Any, Any], as_text: bool
+) -> None:
+    keys = [key.decode() if as_text and isinstance(key, bytes) else key for key in fields]
+    array = dict(zip(keys, fields.values(), strict=True))
+    for message in (array, {"observation/image": array}, {"history": [{"a": 1}, [array]]}):
+        with pytest.raises(CodecError, match=f"as {name} packs it; .*openpi-client.*b'__ndarray__': True"):
+            unpackb(msgpack.packb(message))
+
+
+@pytest.mark.parametrize("name", ["nd", "type", "data", "complex", "__numpy__", "as_npy", "kind", "shape"])
+def test_one_such_key_alone_is_data(name: str) -> None:
+    assert unpackb(msgpack.packb({name: True, "x": 1})) == {name: True, "x": 1}
+
+
+@pytest.mark.parametrize("packer", [array_map, lambda: msgpack.packb(as_msgpack_numpy(np.float32(1.5)))])
+def test_arrays_packed_with_bytes_as_text_say_how_to_pack_them(packer: Any) -> None:
+    fields = msgpack.unpackb(packer(), raw=False, strict_map_key=False)
+    fields[b"data"] = b"\xff\xfe\0\0"  # no UTF-8
+    with pytest.raises(CodecError, match=r"use_bin_type=True.*openpi-client"):
+        unpackb(msgpack.packb({"x": fields}, use_bin_type=False))
 
 
 @pytest.mark.parametrize("missing", ["data", "dtype", "shape"])

@@ -150,10 +150,10 @@ def make_from_adapter(adapter: str, context: PolicyContext, args: Mapping[str, A
 
 def _target(adapter: str) -> tuple[str, str]:
     """Return module and attribute of an adapter."""
-    known = policy_adapters()
-    target = adapter if ":" in adapter else known.get(adapter)
+    # Ours first: to look through the installed packages takes 10 ms, several times per evaluation.
+    target = adapter if ":" in adapter else POLICIES.get(adapter) or policy_adapters().get(adapter)
     if target is None:
-        raise unknown_name("policy adapter", adapter, known)
+        raise unknown_name("policy adapter", adapter, policy_adapters())
     if not _TARGET.fullmatch(target):
         raise UnknownNameError(
             f"policy adapter '{adapter:.{MAX_SHOWN}}': expected 'module:attribute', for example "

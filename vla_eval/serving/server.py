@@ -43,6 +43,10 @@ LOG_SECONDS = 60.0
 IDLE_CHECKS = 4  # per idle time
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STDERR_FD = 2
+HAS_ORIGIN = (
+    "it has the header Origin, which browsers send for a page; pages are refused. If the client is a program,"
+    " leave that header out (websocket-client: suppress_origin=True)."
+)
 EXIT_UNANSWERED = 1  # of a server whose policy was still computing when it ended
 
 logger = logging.getLogger(__name__)
@@ -189,9 +193,10 @@ class PolicyServer:
             return socket.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "the server is stopping\n")
         # Browsers send it: any page that is open could talk to a server on the loopback address.
         if "Origin" in request.headers:
-            return socket.respond(
-                http.HTTPStatus.FORBIDDEN, "expected a policy client, found a page in a browser (Origin)\n"
+            logger.warning(
+                "refused a connection from %s: %s", (socket.remote_address or ("",))[0], HAS_ORIGIN
             )
+            return socket.respond(http.HTTPStatus.FORBIDDEN, f"{HAS_ORIGIN}\n")
         status = refused(request.headers.get_all(HEADER), self._options.api_key)
         if status is not None:
             return socket.respond(status, explanation(status))

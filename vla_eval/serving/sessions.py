@@ -3,6 +3,7 @@
 Used by the thread that reads messages alone. Knows nothing of sockets, and nothing of when an inference runs.
 """
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -12,6 +13,7 @@ from typing import Any, Literal  # Any: what a client sends
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.serving.observations import PROMPT_WIRE_KEY, ObservationReader, RequestError, read_prompt
 from vla_eval.strict_json import shown
+from vla_eval.tasks.catalog import TASKS
 
 MAX_UNREAD_FRAMES = 1024  # 100 MB of two cameras of 128 px
 MAX_SESSIONS = 4096
@@ -21,8 +23,11 @@ MAX_DROPPED_NAMES = 4096  # of a connection, that are remembered for a message
 MAX_TEXT = 200  # characters of an id
 MAX_NUMBER = 2**63 - 1
 UNKNOWN_HORIZON_STEPS = 1_000_000  # for a client that does not say how long its episode is
+LONGEST_HORIZON_STEPS = max(task.horizon_steps for task in TASKS.values())
 
 _Key = tuple[int, str | None]  # number of the connection, name within it
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -83,6 +88,7 @@ class SessionTable:
         self._sessions: dict[_Key, Session] = {}
         # Connection -> names that were dropped and why, until their next reset.
         self._dropped: dict[int, dict[str | None, str]] = {}
+        self._has_warned = False
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -241,7 +247,30 @@ class SessionTable:
         if given is not None and given < expected:
             raise RequestError(f"step {given} after step {session.step}: frames of an episode come in order.")
         session.step = expected if given is None else given
+        if self._reads == "every" and not self._has_warned:
+            self._warn_if_never_reset(session, session.step)
         return session.step
+
+    def _warn_if_never_reset(self, session: Session, step: int) -> None:
+        """Warn, once, of an episode with more frames than any: its memory is that of several episodes."""
+        assert session.episode is not None
+        said = session.episode.horizon_steps
+        longest = LONGEST_HORIZON_STEPS if said == UNKNOWN_HORIZON_STEPS else said
+        if step <= longest:  # an episode of H steps has H + 1 frames
+            return
+        self._has_warned = True
+        logger.warning(
+            "connection %d from %s, session %s: step %d of one episode, expected at most %d (%s). This "
+            "policy remembers all frames since the last 'reset'. A client has to send 'reset' before each "
+            "episode, or to open a connection for each; 'horizon_steps' of a 'reset' announces a longer one. "
+            "This is logged once.",
+            session.connection,
+            session.address,
+            shown(session.name),
+            step,
+            longest,
+            "its 'horizon_steps'" if longest == said else "the longest task",
+        )
 
     def _free_slot(self) -> int:
         taken = {session.slot for session in self._sessions.values()}

@@ -27,8 +27,22 @@ MAX_ARRAY_DIMS = 16
 ARRAY, SCALAR = "__ndarray__", "__npgeneric__"
 KINDS = "biufSU"  # bool, integers, floats, bytes, text: no objects, no records, no complex numbers, no times
 MAX_FLOAT_BYTES = 8  # longer ones ("float128") have other bytes on other machines
+# Keys by which arrays are known that other programs have packed.
+# Source: https://github.com/lebedov/msgpack-numpy, https://github.com/Crimson-Crow/json-numpy,
+# https://github.com/NVIDIA/Isaac-GR00T (gr00t/policy/server_client.py).
+DIALECTS = (
+    ("msgpack-numpy", frozenset({"nd", "type", "data"})),
+    ("msgpack-numpy", frozenset({"complex", "data"})),  # a complex number
+    ("json-numpy", frozenset({"__numpy__", "dtype", "shape"})),
+    ("Isaac-GR00T", frozenset({"__ndarray_class__", "as_npy"})),
+)
 _DTYPE = re.compile(r"[<>|=]?[a-zA-Z?][0-9]{0,9}")
 _MAX_CODE_POINT = 0x10FFFF
+_EXPECTED = (
+    "expected arrays as openpi-client packs them (`openpi_client.msgpack_numpy`, not the package "
+    "msgpack-numpy): {b'__ndarray__': True, b'data': array.tobytes(), b'dtype': array.dtype.str, "
+    "b'shape': array.shape}"
+)
 
 
 class CodecError(ValueError):
@@ -122,6 +136,10 @@ def unpackb(data: Any) -> Any:
         raise
     except RecursionError:
         raise CodecError(f"nesting of more than {MAX_DEPTH} levels") from None
+    except UnicodeDecodeError:
+        raise CodecError(
+            f"text that is not UTF-8. Pack bytes with `use_bin_type=True`; {_EXPECTED}"
+        ) from None
     except (ValueError, TypeError, OverflowError, MemoryError, msgpack.UnpackException) as exc:
         raise CodecError(f"the bytes are no message in msgpack: {exc!s:.200}") from exc
     _check_nesting(message)
@@ -153,7 +171,12 @@ class _Budget:
             message[name] = value
         if ARRAY in message:
             return _read_array(message)
-        return _read_scalar(message) if SCALAR in message else message
+        if SCALAR in message:
+            return _read_scalar(message)
+        for name, keys in DIALECTS:
+            if keys <= message.keys():
+                raise CodecError(f"an array as {name} packs it; {_EXPECTED}")
+        return message
 
 
 def _text(key: Any) -> str:
