@@ -24,6 +24,10 @@ from vla_eval.errors import RecipeError
 MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
 
 
+LOGGERS = ("wandb_project", "trackio_project")
+"""Fields of a recipe that may be changed when a run is resumed: no weight depends on them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoraRecipe:
     """Train low-rank adapters instead of all weights.
