@@ -1,6 +1,7 @@
 """Whether the video encoder takes a recipe's settings, found before the first seed. Knows no datasets."""
 
 import io
+from typing import Any
 
 import av
 
@@ -60,7 +61,7 @@ def _n_parts(pixel_format: "av.VideoFormat") -> int:
 def _encode_one_frame(name: str, settings: EncoderSettings) -> None:
     options = {"g": str(settings.g), "crf": str(settings.crf)}
     with av.open(io.BytesIO(), "w", format="mp4") as container:
-        stream = container.add_stream(name, FPS, options=options)
+        stream: Any = container.add_stream(name, FPS, options=options)  # Any: a VideoStream
         stream.pix_fmt, stream.width, stream.height = settings.pix_fmt, SIDE_PX, SIDE_PX
         container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
         container.mux(stream.encode())
