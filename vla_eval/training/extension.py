@@ -53,7 +53,7 @@ def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int
         f"would have been another from step {other.step} on ({other.now:.3g}, not {other.before:.3g}): its "
         f"schedule depends on the number of steps, so this could not become the training of {asked} steps. "
         f"To train on from its weights, with a new optimizer and schedule, in a folder of its own:\n  "
-        f"{_new_training(job, config, max(1, asked - done))}\nOr train {asked} steps anew in another --out."
+        f"{_new_training(job, config, max(1, asked - done))}\nOr train {asked} steps from scratch in another --out."
     )
 
 
@@ -99,8 +99,8 @@ def _new_training(job: TrainingJob, config: FinetuneConfig, steps: int) -> str:
         words += ["--held-out-every", str(config.held_out.every_steps)]
         words += ["--held-out-episodes", str(config.held_out.episodes)]
     own = {key: value for key, value in config.finetune.items() if key not in ("steps", "base_checkpoint")}
-    for path, value in _leaves(own):
-        words += ["--set", f"{path}={json.dumps(value)}"]
+    for field, value in _leaves(own):
+        words += ["--set", f"{field}={json.dumps(value)}"]
     return shlex.join(["mikasa-vla", "finetune", *words])
 
 

@@ -45,6 +45,7 @@ class TrainingJob:
         held_out: evaluation of checkpoints during training; None: there is none.
         held_out_task: on which task.
         resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
+        run_id: names the run to services, also when it is resumed; None: it has no folder yet.
     """
 
     name: str
@@ -60,6 +61,7 @@ class TrainingJob:
     held_out: HeldOutConfig | None
     held_out_task: str | None
     resume_from: Path | None = None
+    run_id: str | None = None
 
     @property
     def first_step(self) -> int:
@@ -195,7 +197,11 @@ def lerobot_config(job: TrainingJob) -> Any:
         optimizer=job.policy.get_optimizer_preset(),
         scheduler=job.policy.get_scheduler_preset(),
         rename_map=dict(recipe.rename_cameras),
-        wandb=WandBConfig(enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none"),
+        wandb=WandBConfig(  # not used here: for `lerobot-train --resume`
+            enable=recipe.wandb_project is not None,
+            project=recipe.wandb_project or "none",
+            run_id=job.run_id,
+        ),
         peft=peft_config(recipe),
     )
     config.checkpoint_path = job.resume_from

@@ -21,10 +21,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.policies.checkpoint import checkpoint_sha256, file_sha256, find_checkpoint
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
-from vla_eval.training.run_folder import newest_step, read_metrics, read_record
-
-REQUEST_KEY = "request_sha256"
-"""Of `finetune.json`: see `request_sha256`."""
+from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_metrics, read_record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,6 +33,7 @@ NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EI
 """What systems of files without links answer: exFAT, buckets, some shares."""
 COMPARED = "settings"  # what results depend on; the rest is for the record
 RECIPE, STEPS = "finetune", "steps"
+REQUEST_KEY = "request_sha256"  # see `request.request_sha256`
 STEPS_CHANGED = "steps_changed"
 """Of `finetune.json`: each time a run was extended, or shortened before its end."""
 
@@ -101,9 +102,8 @@ def _change_steps(
     if done:
         check_steps(before, done)
     entry = {"before": before, "at": done, **{name: record[name] for name in ("environment", "command")}}
-    begun = {name: known[name] for name in ("environment", "command") if name in known}
-    data = {"format_version": FORMAT_VERSION, **known, **record, **begun}
-    data |= {COMPARED: settings, STEPS_CHANGED: [*known.get(STEPS_CHANGED, ()), entry]}
+    data = {"format_version": FORMAT_VERSION, **known, COMPARED: settings, REQUEST_KEY: record[REQUEST_KEY]}
+    data[STEPS_CHANGED] = [*known.get(STEPS_CHANGED, ()), entry]
     replace_file(path / RUN_FILE, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
 
 
