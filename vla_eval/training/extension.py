@@ -53,7 +53,7 @@ def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int
         f"would have been another from step {other.step} on ({other.now:.3g}, not {other.before:.3g}): its "
         f"schedule depends on the number of steps, so this could not become the training of {asked} steps. "
         f"To train on from its weights, with a new optimizer and schedule, in a folder of its own:\n  "
-        f"{_new_training(job, config, max(1, asked - done))}\nOr train {asked} steps from scratch in another --out."
+        f"{_new_training(job, config, max(1, asked - done))}\nOr train all {asked} steps in another --out."
     )
 
 

@@ -1,6 +1,7 @@
 """Metrics to services beside the file: wandb, trackio, TensorBoard. One that fails is left out."""
 
 import contextlib
+import functools
 import importlib
 import logging
 import os
@@ -8,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any  # wandb, trackio and lerobot are untyped
+from typing import Any, NamedTuple  # wandb, trackio and lerobot are untyped
 
 from accelerate import PartialState
 from accelerate.tracking import TensorBoardTracker
@@ -120,13 +121,11 @@ def services(job: TrainingJob, say: Callable[[str], None]) -> Iterator[Services]
         MissingDependencyError: a package is not installed.
         TrainingError: wandb has no key, or settings that it refuses.
     """
-    recipe, found = job.recipe, Services(say)
-    if recipe.tensorboard:
-        found.begin("TensorBoard", lambda: _tensorboard(job))
-    if recipe.trackio_project is not None:
-        found.begin("trackio", lambda: _trackio(job, str(recipe.trackio_project)))
-    if recipe.wandb_project is not None:
-        found.begin("wandb", lambda: _wandb(job, str(recipe.wandb_project)))
+    found, asked = Services(say), [field for field in PACKAGES if getattr(job.recipe, field)]
+    for field in asked:  # all of them, before one begins to write
+        _require(field)
+    for field in asked:
+        found.begin(PACKAGES[field].name, functools.partial(PACKAGES[field].begin, job))
     is_good = False
     try:
         yield found
@@ -141,8 +140,7 @@ def _tensorboard(job: TrainingJob) -> Service:
     tracker = TensorBoardTracker("", folder, purge_step=job.first_step + 1)
     tracker.main_process_only = False  # it is made in the first process alone
     PartialState(cpu=job.device == "cpu")  # as the training's `Accelerator` makes it; trackers log by it
-    with _installed("tensorboard", "tensorboard"):
-        tracker.start()
+    tracker.start()
 
     def log(prefix: str, numbers: dict[str, float], step: int) -> None:
         tracker.log(_named(prefix, numbers), step=step)
@@ -150,14 +148,12 @@ def _tensorboard(job: TrainingJob) -> Service:
     return Service(name="TensorBoard", log=log, close=lambda _is_good: tracker.finish())
 
 
-def _trackio(job: TrainingJob, project: str) -> Service:
-    let_connect("finetune.trackio_project", "git")
-    with _installed("trackio_project", "trackio"):
-        trackio: Any = importlib.import_module("trackio")
+def _trackio(job: TrainingJob) -> Service:
+    trackio: Any = importlib.import_module("trackio")
     # No figures of the machine: they would start threads that measure beside the training.
     quiet = {"embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
     name, settings = job.out.resolve().name, to_data(job.recipe)
-    trackio.init(project=project, name=name, resume="allow", config=settings, **quiet)
+    trackio.init(project=job.recipe.trackio_project, name=name, resume="allow", config=settings, **quiet)
     return Service(
         name="trackio",
         log=lambda _prefix, numbers, step: trackio.log(numbers, step=step),
@@ -165,23 +161,21 @@ def _trackio(job: TrainingJob, project: str) -> Service:
     )
 
 
-def _wandb(job: TrainingJob, project: str) -> Service:
+def _wandb(job: TrainingJob) -> Service:
     """Begin or resume a run of wandb; WANDB_MODE and its other variables say how.
 
     Not by lerobot's logger: it overrules WANDB_MODE, and looks for its last run by a pattern in the folder.
     """
-    let_connect("finetune.wandb_project", "git")
     os.environ.setdefault("WANDB_ERROR_REPORTING", "false")  # to wandb's makers: nobody has asked for it
-    with _installed("wandb_project", "wandb"):
-        wandb: Any = importlib.import_module("wandb")
+    wandb: Any = importlib.import_module("wandb")
     config, folder = lerobot_config(job), job.out / TRAIN_FOLDER
     folder.mkdir(exist_ok=True)
     try:
         run = wandb.init(
-            **{"project": project, "id": job.run_id, "resume": "allow", "name": config.job_name},
+            **{"project": job.recipe.wandb_project, "id": job.run_id, "resume": "allow"},
             **{"dir": str(folder.resolve()), "config": config.to_dict(), "save_code": False},
             tags=cfg_to_group(config, return_list=True, truncate_tags=True),
-            job_type="train_eval",
+            **{"name": config.job_name, "job_type": "train_eval"},
             settings={"silent": True, "x_graphql_retry_max": WANDB_RETRIES},
         )
     except (wandb.errors.UsageError, wandb.errors.AuthenticationError, ValueError) as exc:
@@ -223,12 +217,45 @@ def _named(prefix: str, numbers: dict[str, float]) -> dict[str, float]:
     return {f"{prefix}/{name}": value for name, value in numbers.items()}
 
 
-@contextlib.contextmanager
-def _installed(field: str, extra: str) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as exc:
-        raise MissingDependencyError(
-            f"finetune.{field}: the package '{exc.name}' is not installed. Install it with pip install "
-            f"'mikasa-vla-eval[{extra}]', or leave the field out: {STILL_THERE}"
-        ) from exc
+class _Package(NamedTuple):
+    """What a field of a recipe needs: how to install it, one of these modules, and how to begin."""
+
+    name: str
+    install: str
+    modules: tuple[str, ...]
+    begin: Callable[[TrainingJob], Service]
+
+
+PACKAGES = {
+    "wandb_project": _Package("wandb", "wandb", ("wandb",), _wandb),
+    "trackio_project": _Package("trackio", "'mikasa-vla-eval[trackio]'", ("trackio",), _trackio),
+    "tensorboard": _Package(
+        "TensorBoard",
+        "'mikasa-vla-eval[tensorboard]'",
+        ("torch.utils.tensorboard", "tensorboardX"),
+        _tensorboard,
+    ),
+}
+
+
+def _require(field: str) -> None:
+    """Import the package that a field of the recipe needs; what it connects to is let through.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    package, missing = PACKAGES[field], None
+    if package.begin is not _tensorboard:
+        let_connect(f"finetune.{field}", "git")
+    for module in package.modules:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as exc:
+            missing = missing or exc
+        else:
+            return
+    assert missing is not None
+    raise MissingDependencyError(
+        f"finetune.{field}: the package '{missing.name}' is not installed. Install it with pip install "
+        f"{package.install}, or leave the field out: {STILL_THERE}"
+    ) from missing
