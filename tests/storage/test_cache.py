@@ -1,5 +1,6 @@
 """Where the cache cannot be written, a command does without it, and says so once."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -76,3 +77,20 @@ def test_without_a_home_folder_nothing_is_made_in_the_working_directory(
     assert cached("frames/a").is_absolute()
     assert "there is no home folder" in caplog.text
     assert not list(tmp_path.iterdir())
+
+
+NAMELESS = """import pwd
+def unknown(_): raise KeyError("uid not found")
+pwd.getpwuid = unknown
+import getpass, sys
+from vla_eval.cli.main import main
+code = main(["list", "tasks"])
+print(getpass.getuser())  # torch asks for it, too
+sys.exit(code)"""
+
+
+def test_a_user_that_has_only_a_number_can_run_commands(tmp_path: Path) -> None:
+    environment = {"PATH": "/usr/bin", "PYTHONPATH": str(Path.cwd())}
+    done = subprocess.run([sys.executable, "-c", NAMELESS], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == str(os.getuid())
