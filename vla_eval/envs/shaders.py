@@ -24,7 +24,7 @@ from typing import Any
 import sapien
 
 from vla_eval.errors import RenderingError
-from vla_eval.storage.cache import cached
+from vla_eval.storage.cache import cache_dir
 
 logger = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ def _lean_copy(installed: Path) -> Path | None:
         if path.is_file():
             name = path.relative_to(installed).as_posix()
             digest.update(f"{name}\0{lean.get(name) or path.read_text(encoding='utf-8')}\0".encode())
-    folder = cached(f"shaders/{digest.hexdigest()}")
+    folder = cache_dir() / "shaders" / digest.hexdigest()
     if not folder.is_dir():
         _publish(installed, lean, folder)
     return folder
