@@ -198,3 +198,25 @@ def test_an_evaluation_that_is_missing_is_not_finished(
     assert finished_run(evaluated) is not None
     with pytest.raises(TrainingError, match=re.escape("finetune.batch_size: 2 -> 3")):
         finetune(act(recorded, tmp_path / "run", batch_size=3))
+
+
+DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "a number of changes": lambda record: record.update(steps_changed=3),
+    "changes that are numbers": lambda record: record.update(steps_changed=[3]),
+    "a number in quotes": lambda record: record.update(steps_changed=[{"before": "3"}]),
+    "no settings": lambda record: record.update(settings=[]),
+    "no recipe": lambda record: record["settings"].update(finetune=1),
+    "steps in quotes": lambda record: record["settings"]["finetune"].update(steps="1"),
+    "another version": lambda record: record.update(format_version=2),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_record_is_one_message(recorded: Path, tmp_path: Path, damage: str) -> None:
+    file = tmp_path / "run/finetune.json"
+    finetune(act(recorded, tmp_path / "run", steps=1))
+    record = json.loads(file.read_text())
+    DAMAGES[damage](record)
+    file.write_text(json.dumps(record))
+    with pytest.raises(TrainingError, match=r"finetune\.json: (expected|format)"):
+        finetune(act(recorded, tmp_path / "run", steps=2))

@@ -119,6 +119,11 @@ def read_record(path: Path) -> dict[str, Any]:  # Any: JSON
     source = _source(str(file), what)
     data = read_json(_read(file, what), source)
     read_version(data, "format_version", FORMAT_VERSION, source)
+    changes = data.get(STEPS_CHANGED, [])
+    if not isinstance(changes, list) or not all(
+        isinstance(change, dict) and type(change.get("before")) is int for change in changes
+    ):
+        raise source.refuse(f"{STEPS_CHANGED} {shown(changes)}", "expected a list of changes, with `before`")
     return data
 
 
