@@ -15,7 +15,7 @@ from vla_eval.config.renamed import warn_renamed
 from vla_eval.errors import UnknownNameError
 from vla_eval.evaluation.grid import gpu_hours, load_model_table
 from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
-from vla_eval.training.job import default_out, load_finetune_recipe
+from vla_eval.training.request import load_finetune_recipe, run_folder_of
 
 BOTH = ["observation.images.base", "observation.images.wrist"]
 FORMER: dict[str, tuple[str, dict[str, Any]]] = {
@@ -54,7 +54,7 @@ def test_a_former_recipe_trains_what_it_trained(name: str, caplog: pytest.LogCap
         expected["steps"] = 100_000
     assert to_data(section(name)) == expected
     assert (former.name, former.value.version) == (name, base.version)
-    assert default_out(FinetuneConfig(policy=name, dataset="d")) == Path(f"runs/{name}-d-0")
+    assert run_folder_of(FinetuneConfig(policy=name, dataset="d")) == Path(f"runs/{name}-d-0")
     (warning,) = caplog.messages  # once, however often it is looked up
     assert f"mikasa-vla finetune ablations --policy {name}" in warning and base_name in warning
 

@@ -21,7 +21,7 @@ from vla_eval.policies.weight_file import write_weights
 from vla_eval.testing import rehearsal
 from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsal import RehearsalOptions, rehearse, rehearse_checkpoint
-from vla_eval.training.job import load_finetune_recipe
+from vla_eval.training.request import load_finetune_recipe
 
 pytestmark = pytest.mark.usefixtures("no_network")
 BYTES_PER_NUMBER = 4  # of tiny recipes, all float32

@@ -23,8 +23,8 @@ from vla_eval.testing.tiny_models import TINY_POLICY, Family, tiny_paligemma
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.description import describe_model
 from vla_eval.training.finetune import finetune
-from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
+from vla_eval.training.request import load_finetune_recipe
 
 pytestmark = pytest.mark.usefixtures("small_act")
 tokenizer = tiny_trainings.tokenizer

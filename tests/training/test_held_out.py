@@ -241,19 +241,6 @@ class TestTrackers:
         with pytest.raises(MissingDependencyError, match=r"pip install 'mikasa-vla-eval\[trackio\]'"):
             finetune(act(recorded, tmp_path / "run", finetune={"trackio_project": "memory"}))
 
-    def test_wandb_gets_the_figures_of_evaluations(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        from vla_eval.training.trackers import log_to_wandb
-
-        logged: list[Any] = []
-        wandb: Any = ModuleType("wandb")
-        wandb.run = ModuleType("run")
-        wandb.run.log = lambda values, step: logged.append((values, step))
-        monkeypatch.setitem(sys.modules, "wandb", wandb)
-        log_to_wandb({"step": 20, "held_out": "1a2b", "success_once": 0.5})
-        wandb.run = None
-        log_to_wandb({"step": 40, "held_out": "1a2b", "success_once": 0.5})
-        assert logged == [({"held_out/success_once": 0.5}, 20)]
-
 
 def test_the_command_line_asks_for_evaluations(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

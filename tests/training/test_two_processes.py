@@ -27,9 +27,9 @@ SETTINGS = {
 }
 
 
-def command(dataset: Path, out: Path) -> list[str]:
+def command(dataset: Path, out: Path, *, steps: int = 16) -> list[str]:
     sets = [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")]
-    flags = ("--allow-unreplayed", "--device", "cpu", "--steps", "16", "--batch-size", "4")
+    flags = ("--allow-unreplayed", "--device", "cpu", "--steps", str(steps), "--batch-size", "4")
     return [
         *(sys.executable, *PROCESSES, "finetune", "--policy", "act", "--dataset", str(dataset)),
         *(*flags, *sets, "--out", str(out)),
@@ -58,3 +58,13 @@ def test_killed_after_the_first_and_the_second_epoch(recorded: Path, tmp_path: P
     subprocess.run(command(recorded, run), env=environment, check=True)
     assert losses(run) == whole
     assert len(whole) == 16
+
+
+@pytest.mark.slow
+def test_a_training_that_is_extended_is_the_longer_one(recorded: Path, tmp_path: Path) -> None:
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
+    for out, steps in (("whole", 12), ("longer", 9), ("longer", 12)):
+        subprocess.run(command(recorded, tmp_path / out, steps=steps), env=environment, check=True)
+    assert losses(tmp_path / "longer") == losses(tmp_path / "whole")
+    record = json.loads((tmp_path / "longer/finetune.json").read_text())
+    assert [(change["before"], change["at"]) for change in record["steps_changed"]] == [(9, 9)]

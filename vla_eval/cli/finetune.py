@@ -102,12 +102,6 @@ def run(args: argparse.Namespace) -> int:
             print("\n".join(lines))
             return 0
         return finetune_table(args)
-    # Here and not above: `mikasa-vla --help` need not wait for torch.
-    from tqdm import tqdm
-
-    from vla_eval.cli.progress import ANSWER_TO_STOP, stop_on_signals
-    from vla_eval.training.finetune import finetune
-
     if args.cluster is not None:
         raise RecipeError(
             "--cluster is for a table of learned policies, whose fine-tunings run side by side. One "
@@ -121,6 +115,20 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join(lines))
         return 0
     config, command = _config(args), typed_command()
+    # Here and not above: `mikasa-vla --help` need not wait for numpy.
+    from vla_eval.training.request import finished_run
+
+    finished = finished_run(config)
+    if finished is not None:
+        print(finished, file=sys.stderr)
+        print(finished.checkpoint)
+        return 0
+    # Here and not above: what is finished need not wait for torch.
+    from tqdm import tqdm
+
+    from vla_eval.cli.progress import ANSWER_TO_STOP, stop_on_signals
+    from vla_eval.training.finetune import finetune
+
     # Some of lerobot's policies print while they are made.
     with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
         summary = finetune(

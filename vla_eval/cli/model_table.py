@@ -232,7 +232,7 @@ def _finetune_here(work: _Work, todo: Sequence[Finetuning]) -> int | None:
 def _check(table: ModelTable, ahead: Sequence[Finetuning]) -> None:
     """Find missing datasets and bases now, which would otherwise stop the work after days."""
     from vla_eval.policies.checkpoint import find_checkpoint
-    from vla_eval.training.job import load_finetune_recipe
+    from vla_eval.training.request import load_finetune_recipe
 
     missing = [one.config.dataset for one in ahead if not Path(one.config.dataset).is_dir()]
     if missing:
@@ -251,7 +251,7 @@ def _unfinished(work: _Work) -> list[Finetuning]:
 
 
 def _is_finished(one: Finetuning) -> bool:
-    from vla_eval.training.job import load_finetune_recipe
+    from vla_eval.training.request import load_finetune_recipe
     from vla_eval.training.run_folder import whole_checkpoints
 
     whole = whole_checkpoints(Path(str(one.config.out)))

@@ -103,7 +103,7 @@ def _of_dataset(args: argparse.Namespace) -> list[Path]:
     """Write the episodes into the user's cache, from where the viewer opens them."""
     from vla_eval.data.dataset_rrd import EpisodeWish, write_dataset_rrds
     from vla_eval.errors import ViewingError
-    from vla_eval.storage.cache import cache_dir
+    from vla_eval.storage.cache import cached
     from vla_eval.viz.picking import MOST_OPENED
 
     given = [flag for flag, name in RUN_FLAGS.items() if getattr(args, name) is not None]
@@ -112,7 +112,7 @@ def _of_dataset(args: argparse.Namespace) -> list[Path]:
             f"{args.run}: is a dataset; {', '.join(given)} is of runs. Use --episode or --seed."
         )
     wish = EpisodeWish(episodes=tuple(args.episode or ()), seed=args.seed, most=MOST_OPENED)
-    return write_dataset_rrds(args.run, wish, cache_dir() / "rrd" / cache_place(args.run))
+    return write_dataset_rrds(args.run, wish, cached(f"rrd/{cache_place(args.run)}"))
 
 
 def cache_place(dataset: Path) -> str:

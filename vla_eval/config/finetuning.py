@@ -24,6 +24,10 @@ from vla_eval.errors import RecipeError
 MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
 
 
+LOGGERS = ("wandb_project", "trackio_project", "tensorboard")
+"""Fields of a recipe that may be changed when a run is resumed: no weight depends on them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoraRecipe:
     """Train low-rank adapters instead of all weights.
@@ -76,6 +80,7 @@ class FinetuneRecipe:
             `random_order`, `tfs`); {}: its own six; None: images as they are.
         imagenet_statistics: normalise images by ImageNet's statistics, for backbones trained on it.
         wandb_project, trackio_project: log there, too.
+        tensorboard: log to the folder `tensorboard` of the run, too.
     """
 
     type: str
@@ -96,6 +101,7 @@ class FinetuneRecipe:
     imagenet_statistics: bool = False
     wandb_project: str | None = None
     trackio_project: str | None = None
+    tensorboard: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(

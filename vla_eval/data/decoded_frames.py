@@ -15,7 +15,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vla_eval.config.renamed import warn_renamed
 from vla_eval.core import ImageArray
 from vla_eval.data.frame_cache import (
-    FRAMES_FOLDER,
     EpisodeRows,
     FrameSource,
     channels_first,
@@ -26,7 +25,6 @@ from vla_eval.data.rewards import rewards_of
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, RewardKind
 from vla_eval.policies.steps.levels import in_numbers
-from vla_eval.storage.cache import cache_dir
 
 Storage = Literal["disk", "ram"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
@@ -90,8 +88,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         self._files: dict[str, Path] = {}
         self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share
         if storage == "disk":
-            folder = (cache or cache_dir()) / FRAMES_FOLDER
-            self._files = frames_on_disk(frame_source, folder)
+            self._files = frames_on_disk(frame_source, cache)
             self._open()
         else:
             arrays = frames_in_ram(frame_source)

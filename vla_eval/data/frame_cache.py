@@ -24,6 +24,7 @@ from vla_eval.core import ImageArray
 from vla_eval.data.opening import UNREADABLE, reason
 from vla_eval.data.tables import MIB, available_ram_bytes
 from vla_eval.errors import DatasetError, StorageFullError
+from vla_eval.storage.cache import cached
 
 FORMAT_VERSION = 1  # raised when the files' layout changes: old ones are then not found any more
 FRAMES_FOLDER = "frames"  # in the user's cache
@@ -161,7 +162,7 @@ def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
     return {camera: np.concatenate(list(decode_camera(source, camera))) for camera in source.shapes}
 
 
-def frames_on_disk(source: FrameSource, folder: Path) -> dict[str, Path]:
+def frames_on_disk(source: FrameSource, cache: Path | None) -> dict[str, Path]:
     """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet.
 
     The folder appears by a rename, so half a cache is never seen; of several processes that ask at once
@@ -169,18 +170,19 @@ def frames_on_disk(source: FrameSource, folder: Path) -> dict[str, Path]:
 
     Args:
         source: what to decode.
-        folder: the cache; a folder named after the dataset's digest is made in it.
+        cache: a folder; one named after the dataset's digest is made in it. None: the user's cache.
 
     Raises:
         DatasetError: there is not enough room, or a video cannot be read.
         StorageFullError: the disk became full on the way.
     """
-    final = folder / dataset_digest(source)
+    name = f"{FRAMES_FOLDER}/{dataset_digest(source)}"
+    final = cached(name) if cache is None else cache / name
     paths = {camera: final / f"{camera}.npy" for camera in source.shapes}
     if final.is_dir():
         return paths
-    folder.mkdir(parents=True, exist_ok=True)
-    with _one_builder(folder / f"{final.name}.lock"):
+    final.parent.mkdir(parents=True, exist_ok=True)
+    with _one_builder(final.with_name(f"{final.name}.lock")):
         if not final.is_dir():
             _build(source, final)
     return paths

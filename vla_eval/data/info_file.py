@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from vla_eval.errors import DatasetError
+from vla_eval.errors import DatasetError, some_of
 from vla_eval.strict_json import Count, Positive, Source, as_dataclass, read_file, read_json, shown
 
 INFO_FILE = Path("meta/info.json")
@@ -143,3 +143,18 @@ def _is_template(template: str, allowed: frozenset[str]) -> bool:
         if place not in allowed or conversion is not None or not is_plain:
             return False
     return True
+
+
+def one_dataset(root: Path) -> Path:
+    """Return the folder itself, or the one dataset in it: `record --out DIR` makes DIR/TASK."""
+    if not root.is_dir():
+        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
+    if (root / INFO_FILE).is_file():
+        return root
+    held = sorted(path for path in root.iterdir() if (path / INFO_FILE).is_file())
+    if len(held) > 1:
+        raise DatasetError(
+            f"{root}: expected one dataset, found {len(held)}: {some_of(path.name for path in held)}. Name "
+            f"one, for example --dataset {held[0]}, or make one of them (`mikasa-vla dataset mix`)."
+        )
+    return held[0] if held else root

@@ -8,6 +8,7 @@ from vla_eval.config.files import Recipe, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import load_prompts, sentences_of
 from vla_eval.data.demonstrations import ONE_BY_ONE
+from vla_eval.data.encoder_check import check_encoder
 from vla_eval.data.recording_jobs import TaskPlan
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, GroupKey
 from vla_eval.policies.checkpoint_notes import checkpoint_hashes
@@ -37,11 +38,12 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
 
     Raises:
         UnknownNameError: a task, expert or prompt set does not exist.
-        RecipeError: the expert's recipe is wrong.
+        RecipeError: the expert's recipe is wrong, or the video encoder refuses its settings.
         MissingInstructionError: a task has no instruction.
         TaskArgumentError: see `check_arguments`.
         CheckpointError: the expert's weights are not there.
     """
+    check_encoder(recipe.encoder)
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)

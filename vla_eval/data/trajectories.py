@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.decoded_frames import frame_layout, read_columns
-from vla_eval.data.frame_cache import FRAMES_FOLDER, frames_on_disk
+from vla_eval.data.frame_cache import frames_on_disk
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError, did_you_mean
 from vla_eval.features import (
@@ -29,7 +29,6 @@ from vla_eval.features import (
     SUCCESS_KEY,
     RewardKind,
 )
-from vla_eval.storage.cache import cache_dir
 
 FIELDS = (PROPRIO_KEYS["joints"], ACTION_KEY, REWARD_KEY, SUCCESS_KEY, DONE_KEY)
 
@@ -118,7 +117,7 @@ class Trajectories(Sequence[Trajectory]):
         self._columns = {name: columns[name].numpy() for name in FIELDS}
         frames = frame_layout(dataset, columns).frames
         self._episodes = frames.episodes
-        files = frames_on_disk(frames, (cache or cache_dir()) / FRAMES_FOLDER)
+        files = frames_on_disk(frames, cache)
         self._frames: list[ImageArray] = [
             np.load(files[name], mmap_mode="r", allow_pickle=False) for name in CAMERA_KEYS.values()
         ]

@@ -19,7 +19,7 @@ from mani_skill import ASSET_DIR
 from mani_skill.utils.building.actors import ycb
 
 from vla_eval.errors import MissingDependencyError, TaskArgumentError
-from vla_eval.storage.cache import cache_dir
+from vla_eval.storage.cache import cached
 from vla_eval.tasks.mug import (
     BOTTOM_POSE,
     BOTTOM_RADIUS_M,
@@ -75,7 +75,7 @@ def _read_from(root: Path) -> None:
 
 def _stand_in() -> Path:
     """Return the folder that stands in for ManiSkill's; write it if it is not there."""
-    root = cache_dir() / "official_mug"
+    root = cached("official_mug")
     if root.is_dir():
         return root
     draft = root.with_name(f"{root.name}.{os.getpid()}.tmp")

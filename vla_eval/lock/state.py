@@ -92,11 +92,19 @@ def code_folders() -> tuple[str, ...]:
     ]
     elsewhere = {os.path.realpath(os.path.dirname(file)) for file in files if file}
     elsewhere -= {"/", os.path.realpath(".")}
-    compiled = os.path.join(tempfile.gettempdir(), f"torchinductor_{getpass.getuser()}")
+    compiled = os.path.join(tempfile.gettempdir(), f"torchinductor_{_user()}")
     named = [os.environ[name] for name in COMPILED_VARIABLES if os.environ.get(name)]
     searched = (*(place or "." for place in sys.path), sys.prefix, os.path.dirname(os.__file__))
     found = {*elsewhere, *map(os.path.realpath, (*searched, compiled, *named))}
     return tuple(sorted(found - {_cache_of_modules()}))
+
+
+def _user() -> str:
+    """Return the user's name; in a container that knows only a number, torch and we use that."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return os.environ.setdefault("LOGNAME", str(os.getuid()))
 
 
 def _cache_of_modules() -> str:

@@ -15,7 +15,7 @@ from mani_skill import PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 
-from vla_eval.storage.cache import cache_dir
+from vla_eval.storage.cache import cached
 from vla_eval.tasks.camera_mesh import (
     GRID_M,
     VISIBLE_FILE,
@@ -44,7 +44,7 @@ def changed_urdf(name: str, change: MeshChange) -> Path:
     digest = hashlib.sha256(f"{name} {GRID_M} {_PANDA_DIR}".encode() + source_urdf.read_bytes())
     digest.update(stl)
     digest.update(Path(__file__).with_name(VISIBLE_FILE).read_bytes())
-    folder = cache_dir() / "robots" / digest.hexdigest()[:16]
+    folder = cached(f"robots/{digest.hexdigest()[:16]}")
     urdf = folder / f"panda_v3_{name}.urdf"
     if urdf.exists():
         return urdf

@@ -42,7 +42,7 @@ from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
 from vla_eval.training.description import describe_model
 from vla_eval.training.estimate import unfilled_model, with_adapters
-from vla_eval.training.job import load_finetune_recipe
+from vla_eval.training.request import load_finetune_recipe
 from vla_eval.training.sample_cost import sample_cost
 
 N_STEPS = 20

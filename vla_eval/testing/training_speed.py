@@ -18,9 +18,9 @@ from vla_eval.policies.vla_memory.fields import SEGMENT_PADDING_KEY
 from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.estimate import estimate
-from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.loop import autocast_dtype
 from vla_eval.training.lora import peft_config
+from vla_eval.training.request import load_finetune_recipe
 from vla_eval.training.segments import preprocessed
 from vla_eval.training.stages import EPISODE_STEPS
 

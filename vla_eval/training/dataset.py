@@ -11,13 +11,13 @@ from vla_eval.data.check import require_checked
 from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.imported import ImportFacts
-from vla_eval.data.info_file import INFO_FILE
+from vla_eval.data.info_file import one_dataset
 from vla_eval.data.manifest import DatasetFacts, read_manifest
 from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.replay_report import require_passed
 from vla_eval.data.tables import read_columns
-from vla_eval.errors import DatasetError, some_of
+from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.seeding import SeedRange, seed_ranges
 
@@ -79,7 +79,7 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
     Raises:
         DatasetError: it is not, or the folder holds several.
     """
-    root = _one_dataset(root)
+    root = one_dataset(root)
     facts = check_complete(root)
     was_replayed = _was_replayed(root, facts)
     if not was_replayed and not allow_unreplayed:
@@ -160,18 +160,3 @@ def _to_replay(root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts) -> 
         return f"Run mikasa-vla replay {root}"
     names = ", ".join(source.name for source in facts.sources if not source.was_replayed)
     return f"Of what it was mixed of, {names} had not been replayed: replay these and mix again"
-
-
-def _one_dataset(root: Path) -> Path:
-    """Return the folder itself, or the one dataset in it: `record --out DIR` makes DIR/TASK."""
-    if not root.is_dir():
-        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
-    if (root / INFO_FILE).is_file():
-        return root
-    held = sorted(path for path in root.iterdir() if (path / INFO_FILE).is_file())
-    if len(held) > 1:
-        raise DatasetError(
-            f"{root}: expected one dataset, found {len(held)}: {some_of(path.name for path in held)}. Name "
-            f"one, for example --dataset {held[0]}, or make one of them (`mikasa-vla dataset mix`)."
-        )
-    return held[0] if held else root

@@ -21,9 +21,9 @@ from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.failures import chosen_episodes
-from vla_eval.training.job import default_out, load_finetune_recipe
 from vla_eval.training.lora import check_lora_targets
 from vla_eval.training.policy_config import policy_config, used_frames
+from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import newest_step
 
 EEF_NUMBERS = 10  # of the state that recordings have
@@ -87,7 +87,7 @@ def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
     check_lora_targets(recipe)
-    out = Path(config.out) if config.out is not None else default_out(config)
+    out = run_folder_of(config)
     found, missing, passes = _estimate(config, recipe, options)
     done = newest_step(out)
     kind = "full" if recipe.lora is None else f"LoRA of rank {recipe.lora.rank}"

@@ -1,68 +1,52 @@
 """Fine-tune: recipe and dataset in, a run folder with checkpoints out. The same call resumes it."""
 
 import contextlib
+import functools
+import hashlib
 import os
+import secrets
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.errors import VlaEvalError
-from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
+from vla_eval.policies.checkpoint import checkpoint_sha256
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.estimate import RateWatch, estimate
+from vla_eval.training.extension import check_steps
 from vla_eval.training.failures import about_failures
-from vla_eval.training.held_out import HeldOut, shared_seeds_warning
+from vla_eval.training.held_out import METRIC_KEY, HeldOut, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
+from vla_eval.training.request import FinetuneSummary, compared_fields, request_sha256
 from vla_eval.training.run_folder import (
     LOG_FILE,
     METRICS_FILE,
+    REQUEST_KEY,
     RUN_FILE,
     newest_step,
     open_folder,
     read_metrics,
+    read_record,
+    whole_checkpoints,
 )
-from vla_eval.training.trackers import Log, log_to_wandb, trackio_run
+from vla_eval.training.trackers import Services, services
 from vla_eval.training.waiting import about_decisions
 
 LOCK_FILE = "finetune.lock"
+RUN_ID = "run_id"  # of `finetune.json`
 OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
 Say = Callable[[str], None]
 """Takes a line for a person."""
 IsStopping = Callable[[], bool]
 """Says whether to stop early."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FinetuneSummary:
-    """The result of a call.
-
-    Attributes:
-        out: the run folder.
-        step: of its newest checkpoint; 0: there is none.
-        is_finished: it is the last step, and evaluated if it should be; False: `is_stopping` said yes.
-    """
-
-    out: Path
-    step: int
-    is_finished: bool
-
-    @property
-    def checkpoint(self) -> Path:
-        """The checkpoint that an evaluation takes.
-
-        Raises:
-            CheckpointError: there is none: training was stopped before the first.
-        """
-        return find_checkpoint(self.out)
 
 
 def finetune(
@@ -88,18 +72,20 @@ def finetune(
     if job.device == "cpu":
         keep_freed_memory()
     _describe(job, say)
-    with _opened(job, command) as resume_from:
-        job = replace(job, resume_from=resume_from)
+    with _opened(job, config, command) as resume_from:
+        job = replace(job, resume_from=resume_from, run_id=_run_id(job.out))
         say(f"run: {job.out}" + (f", resuming from step {job.first_step}" if job.resume_from else ""))
-        project = job.recipe.trackio_project if _is_first_process() else None
-        with trackio_run(project, name=job.out.resolve().name, settings=to_data(job.recipe)) as track:
-            held_out = _held_out(job, say, track, is_stopping)
+        with services(job, say) if _is_first_process() else contextlib.nullcontext(Services(say)) as tracked:
+            held_out = _held_out(job, say, tracked, is_stopping)
             if held_out is not None:
                 held_out.catch_up(read_metrics(job.out))
-            is_finished = train(job, _listeners(job, say, track, held_out, is_stopping))
+            is_finished = train(job, _listeners(job, say, tracked, held_out, is_stopping))
             if held_out is not None and held_out.missing(read_metrics(job.out)):
                 is_finished = False
-    return FinetuneSummary(out=job.out, step=newest_step(job.out), is_finished=is_finished)
+    summary = FinetuneSummary(out=job.out, step=newest_step(job.out), is_finished=is_finished)
+    if is_finished and job.first_step == summary.step:
+        say(str(summary))
+    return summary
 
 
 def _describe(job: TrainingJob, say: Say) -> None:
@@ -127,7 +113,7 @@ def _describe(job: TrainingJob, say: Say) -> None:
 
 
 def _listeners(
-    job: TrainingJob, say: Say, track: Log, held_out: HeldOut | None, is_stopping: IsStopping
+    job: TrainingJob, say: Say, tracked: Services, held_out: HeldOut | None, is_stopping: IsStopping
 ) -> Listeners:
     """Return what gets the progress: a person, a tracker of metrics, the evaluation of checkpoints."""
     steps = job.recipe.steps
@@ -150,9 +136,10 @@ def _listeners(
             f"step {int(line['step'])}/{steps}  loss {line['loss']:.4f}  lr {line['lr']:.2e}  "
             f"{seconds:.3f} s/step, {(steps - line['step']) * seconds / 60:.0f} min left"
         )
-        track(line)
+        tracked.log(line)
 
     def evaluate(checkpoint: Path) -> None:
+        tracked.save(checkpoint)
         if held_out is not None and held_out.is_due(int(checkpoint.name)):
             held_out.evaluate(checkpoint)
 
@@ -165,14 +152,13 @@ def _listeners(
     )
 
 
-def _held_out(job: TrainingJob, say: Say, track: Log, is_stopping: IsStopping) -> HeldOut | None:
+def _held_out(job: TrainingJob, say: Say, tracked: Services, is_stopping: IsStopping) -> HeldOut | None:
     if job.held_out is None or job.held_out_task is None or not _is_first_process():
         return None
 
     def report(line: Mapping[str, float | str]) -> None:
         append_metrics(job.out / METRICS_FILE, line)
-        track(line)
-        log_to_wandb(line)
+        tracked.log(line, METRIC_KEY)
 
     return HeldOut(
         settings=job.held_out,
@@ -185,13 +171,18 @@ def _held_out(job: TrainingJob, say: Say, track: Log, is_stopping: IsStopping) -
     )
 
 
+def _run_id(out: Path) -> str:
+    """Return what names the run to services; runs of earlier versions have no such name."""
+    known = read_record(out).get(RUN_ID)
+    return str(known or hashlib.sha256(os.fsencode(out.resolve())).hexdigest()[:8])
+
+
 def _is_first_process() -> bool:
     return os.environ.get("RANK", "0") == "0"  # of several that accelerate has started
 
 
-def _open(job: TrainingJob, command: str) -> Path | None:
-    section = to_data(job.recipe)
-    del section["trackio_project"]  # may be changed when a run is resumed
+def _open(job: TrainingJob, config: FinetuneConfig, command: str) -> Path | None:
+    section = compared_fields(job.recipe)
     del section["failed_episodes"]  # its outcome is recorded below
     chosen = {"episodes_left_out": list(job.dataset.left_out)} if job.dataset.left_out else {}
     base = job.recipe.base_checkpoint
@@ -208,12 +199,20 @@ def _open(job: TrainingJob, command: str) -> Path | None:
         "tasks": job.dataset.tasks,
         "environment": collect_environment(),
         "command": command,
+        REQUEST_KEY: request_sha256(config, job.recipe),
+        RUN_ID: secrets.token_hex(4),
     }
-    return open_folder(job.out, settings, record, ignore=frozenset({LOCK_FILE}))
+    return open_folder(
+        job.out,
+        settings,
+        record,
+        check_steps=functools.partial(check_steps, job, config),
+        ignore=frozenset({LOCK_FILE}),
+    )
 
 
 @contextlib.contextmanager
-def _opened(job: TrainingJob, command: str) -> Iterator[Path | None]:
+def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[Path | None]:
     """Open the run folder; a mistake found before the first step leaves none behind.
 
     Yields:
@@ -223,14 +222,13 @@ def _opened(job: TrainingJob, command: str) -> Iterator[Path | None]:
     def make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
-    if not _is_first_process():  # the first one has the lock
-        make(job.out)
-        yield _open(job, command)
+    if not _is_first_process():  # the first one has the lock, and checks
+        yield next(reversed(whole_checkpoints(job.out)), None)
         return
     with starting(
         job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a fine-tuning", make=make
     ) as started:
-        resume_from = _open(job, command)
+        resume_from = _open(job, config, command)
     try:
         yield resume_from
     except VlaEvalError:

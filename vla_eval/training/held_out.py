@@ -8,6 +8,7 @@ finishes it first and then resumes.
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
@@ -22,8 +23,10 @@ from vla_eval.policies.checkpoint import MODEL_FOLDER
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.run_folder import whole_checkpoints
+
+if TYPE_CHECKING:  # it imports lerobot; a finished training is known without
+    from vla_eval.training.dataset import TrainingDataset
 
 EVALUATIONS_FOLDER = "evaluations"
 METRIC_KEY = "held_out"
@@ -142,7 +145,7 @@ class _UntilStopped(Silence):
         return self._is_stopping()
 
 
-def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: TrainingDataset) -> str:
+def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "TrainingDataset") -> str:
     """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
 
     Raises:
@@ -182,7 +185,7 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
     return task_spec(task).id
 
 
-def shared_seeds_warning(dataset: TrainingDataset) -> str | None:
+def shared_seeds_warning(dataset: "TrainingDataset") -> str | None:
     """Return a warning if demonstrations are of seeds that tables are made from; None if none is.
 
     Recording refuses such seeds; a dataset from elsewhere, or of an earlier version, may have them.
@@ -197,7 +200,7 @@ def shared_seeds_warning(dataset: TrainingDataset) -> str | None:
     )
 
 
-def _seeds_of(dataset: TrainingDataset) -> set[int]:
+def _seeds_of(dataset: "TrainingDataset") -> set[int]:
     """Return the seeds that demonstrations were tried at; none for an import, whose seeds are not ours."""
     mixture = read_mixture(dataset.root)
     if mixture is not None:

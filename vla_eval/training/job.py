@@ -11,10 +11,7 @@ from typing import Any  # lerobot is untyped
 from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from vla_eval.config.decoding import decode
-from vla_eval.config.files import Recipe, to_data
-from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig, merge_fields
-from vla_eval.config.policy import load_policy
+from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.data.opening import decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
@@ -27,6 +24,7 @@ from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.held_out import check_held_out
 from vla_eval.training.lora import check_lora_targets, peft_config
 from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
+from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import TRAIN_FOLDER
 
 
@@ -47,6 +45,7 @@ class TrainingJob:
         held_out: evaluation of checkpoints during training; None: there is none.
         held_out_task: on which task.
         resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
+        run_id: names the run to services, also when it is resumed; None: it has no folder yet.
     """
 
     name: str
@@ -62,6 +61,7 @@ class TrainingJob:
     held_out: HeldOutConfig | None
     held_out_task: str | None
     resume_from: Path | None = None
+    run_id: str | None = None
 
     @property
     def first_step(self) -> int:
@@ -153,7 +153,7 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         frames=used_frames(policy, dataset),
         base=find_checkpoint(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None,
         device=device,
-        out=Path(config.out) if config.out is not None else default_out(config),
+        out=run_folder_of(config),
         run_seed=config.run_seed,
         held_out=held_out,
         held_out_task=task,
@@ -166,30 +166,6 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
             "from decoded frames alone. Leave the field out."
         )
     return job
-
-
-def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
-    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
-
-    Raises:
-        RecipeError: the policy has none, or a field is wrong.
-    """
-    recipe = load_policy(config.policy)
-    if recipe.value.finetune is None:
-        raise RecipeError(
-            f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
-            f"`mikasa-vla list policies` shows the recipes."
-        )
-    data = merge_fields(to_data(recipe.value.finetune), config.finetune)
-    value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
-    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
-
-
-def default_out(config: FinetuneConfig) -> Path:
-    """Return the run folder of a fine-tuning that names none."""
-    return (
-        Path("runs") / f"{Path(config.policy).stem}-{Path(config.dataset).resolve().name}-{config.run_seed}"
-    )
 
 
 def lerobot_config(job: TrainingJob) -> Any:
@@ -221,7 +197,11 @@ def lerobot_config(job: TrainingJob) -> Any:
         optimizer=job.policy.get_optimizer_preset(),
         scheduler=job.policy.get_scheduler_preset(),
         rename_map=dict(recipe.rename_cameras),
-        wandb=WandBConfig(enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none"),
+        wandb=WandBConfig(  # not used here: for `lerobot-train --resume`
+            enable=recipe.wandb_project is not None,
+            project=recipe.wandb_project or "none",
+            run_id=job.run_id,
+        ),
         peft=peft_config(recipe),
     )
     config.checkpoint_path = job.resume_from

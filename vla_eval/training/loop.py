@@ -27,7 +27,6 @@ from lerobot.common.train_utils import (
     load_training_batch_size,
     load_training_num_processes,
 )
-from lerobot.common.wandb_utils import WandBLogger
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.factory import make_dataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
@@ -40,7 +39,6 @@ from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import local_readers
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
-from vla_eval.lock.switch import let_connect
 from vla_eval.policies.lerobot_device import amp_dtype
 from vla_eval.policies.steps.levels import in_numbers
 from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device
@@ -99,15 +97,12 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
     with _logging(job.out / LOG_FILE, accelerator), local_files_only(job):
         training = _Training(job, accelerator, listeners.on_model)
         is_main = accelerator.is_main_process
-        if recipe.wandb_project is not None:
-            let_connect("finetune.wandb_project", "git")
-        wandb = WandBLogger(training.config) if recipe.wandb_project is not None and is_main else None
         silent = not (is_main and sys.stderr.isatty())
         is_saved = is_finished = True
         for step in tqdm(range(job.first_step + 1, recipe.steps + 1), desc="Training", disable=silent):
             if _is_asked_to_stop(accelerator, listeners):
                 if not is_saved:
-                    _save(training, step - 1, listeners, wandb)
+                    _save(training, step - 1, listeners)
                 is_finished = False
                 break
             started = time.perf_counter()
@@ -116,10 +111,10 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
             if step % recipe.log_every_steps == 0:
                 line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
                 if is_main:
-                    _report(line, job.out / METRICS_FILE, listeners, wandb)
+                    _report(line, job.out / METRICS_FILE, listeners)
             is_saved = step % recipe.save_every_steps == 0 or step == recipe.steps
             if is_saved:
-                _save(training, step, listeners, wandb)
+                _save(training, step, listeners)
         logging.info("End of training" if is_finished else "Stopped, as asked")
         accelerator.end_training()
     return is_finished
@@ -211,14 +206,12 @@ def _is_asked_to_stop(accelerator: Accelerator, listeners: Listeners) -> bool:
     return bool(asked.item())
 
 
-def _save(training: _Training, step: int, listeners: Listeners, wandb: Any) -> None:
+def _save(training: _Training, step: int, listeners: Listeners) -> None:
     job, accelerator = training.job, training.accelerator
     folder = write_checkpoint(job, step, accelerator, training.parts(), training.scaler)
     if folder is not None:
         drop_extra_checkpoints(job.out, save_every_steps=job.recipe.save_every_steps)
         listeners.on_checkpoint(folder)
-        if wandb is not None:
-            wandb.log_policy(folder)
     accelerator.wait_for_everyone()
 
 
@@ -291,11 +284,9 @@ def _leave_signals_to_the_parent(_worker: int) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _report(line: Mapping[str, float], file: Path, listeners: Listeners, wandb: Any) -> None:
+def _report(line: Mapping[str, float], file: Path, listeners: Listeners) -> None:
     logging.info(line)
     append_metrics(file, line)
-    if wandb is not None:
-        wandb.log_dict(dict(line), int(line["step"]))
     listeners.on_metrics(line)
     if not math.isfinite(line["loss"]):
         raise TrainingError(

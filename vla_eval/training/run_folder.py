@@ -1,6 +1,6 @@
 """The folder of a fine-tuning: what it was started with, its metrics, and where it resumes.
 
-    finetune.json   recipe, dataset's digest, run seed, environment
+    finetune.json   recipe, dataset's digest, run seed, environment; whether its number of steps was changed
     metrics.jsonl   one line per logged step
     train/          lerobot's: checkpoints/000100/{pretrained_model,training_state}, checkpoints/last
     evaluations/    run folders of evaluations on held-out seeds, if asked for
@@ -13,10 +13,11 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from vla_eval.config.finetuning import LOGGERS
 from vla_eval.errors import TrainingError
 from vla_eval.policies.checkpoint import LAST, step_folders
 from vla_eval.storage.durable import replace_file
@@ -31,6 +32,10 @@ PARTIAL_PREFIX = ".partial-"
 NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 """What systems of files without links answer: exFAT, buckets, some shares."""
 COMPARED = "settings"  # what results depend on; the rest is for the record
+RECIPE, STEPS = "finetune", "steps"
+REQUEST_KEY = "request_sha256"  # see `request.request_sha256`
+STEPS_CHANGED = "steps_changed"
+"""Of `finetune.json`: each time a run was extended, or shortened before its end."""
 
 
 logger = logging.getLogger(__name__)
@@ -41,6 +46,7 @@ def open_folder(
     settings: Mapping[str, JsonValue],
     record: Mapping[str, JsonValue],
     *,
+    check_steps: Callable[[int, int], None],
     ignore: frozenset[str] = frozenset(),
 ) -> Path | None:
     """Make the folder of a run, or check that the one that is there is of the same run.
@@ -49,6 +55,8 @@ def open_folder(
         path: the folder.
         settings: what results depend on; must be what it was.
         record: further facts, written once.
+        check_steps: is called if nothing but the number of steps differs, with the number that there was and
+            the steps that are done; raises an error unless it may change.
         ignore: files that may lie in a folder which is otherwise empty.
 
     Returns:
@@ -65,14 +73,58 @@ def open_folder(
         return None
     if not file.is_file():
         raise TrainingError(f"{path}: holds other files and no {RUN_FILE}. Use another --out.")
-    changes = find_changes(_settings(file), settings, prefix="")
-    if changes:
+    known = read_record(path)
+    changes = find_changes(_settings(known, file), settings, prefix="")
+    if [change.path for change in changes] == [f"{RECIPE}.{STEPS}"]:
+        _change_steps(path, known, settings, record, check_steps)
+    elif changes:
         listed = "\n".join(f"  {change}" for change in changes)
         raise TrainingError(
             f"{path}: this fine-tuning was started with other settings:\n{listed}\nUse another --out, or "
             f"restore the old settings to resume."
         )
     return newest_checkpoint(path)
+
+
+def _change_steps(
+    path: Path,
+    known: dict[str, Any],  # Any: JSON
+    settings: Mapping[str, JsonValue],
+    record: Mapping[str, JsonValue],
+    check_steps: Callable[[int, int], None],
+) -> None:
+    """Let a run have another number of steps, and write down that it was changed."""
+    before, done = known[COMPARED][RECIPE].get(STEPS), newest_step(path)
+    if type(before) is not int:
+        raise _source(str(path / RUN_FILE), "the description of a fine-tuning").refuse(
+            f"{STEPS} {shown(before)}", "expected a whole number"
+        )
+    if done:
+        check_steps(before, done)
+    entry = {"before": before, "at": done, **{name: record[name] for name in ("environment", "command")}}
+    data = {"format_version": FORMAT_VERSION, **known, COMPARED: settings, REQUEST_KEY: record[REQUEST_KEY]}
+    data[STEPS_CHANGED] = [*known.get(STEPS_CHANGED, ()), entry]
+    replace_file(path / RUN_FILE, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
+
+
+def read_record(path: Path) -> dict[str, Any]:  # Any: JSON
+    """Return what a run folder's `finetune.json` holds; nothing if there is none.
+
+    Raises:
+        TrainingError: it is damaged.
+    """
+    file, what = path / RUN_FILE, "the description of a fine-tuning"
+    if not file.is_file():
+        return {}
+    source = _source(str(file), what)
+    data = read_json(_read(file, what), source)
+    read_version(data, "format_version", FORMAT_VERSION, source)
+    changes = data.get(STEPS_CHANGED, [])
+    if not isinstance(changes, list) or not all(
+        isinstance(change, dict) and type(change.get("before")) is int for change in changes
+    ):
+        raise source.refuse(f"{STEPS_CHANGED} {shown(changes)}", "expected a list of changes, with `before`")
+    return data
 
 
 def newest_checkpoint(path: Path) -> Path | None:
@@ -98,9 +150,13 @@ def whole_checkpoints(path: Path) -> list[Path]:
 
 
 def drop_extra_checkpoints(path: Path, *, save_every_steps: int) -> None:
-    """Remove all checkpoints but the newest that were written only because a training was asked to stop."""
+    """Remove all checkpoints but the newest that were written only because a training was asked to stop.
+
+    One that was the last of a training that has been extended stays.
+    """
+    ends = {change["before"] for change in read_record(path).get(STEPS_CHANGED, ())}
     for folder in whole_checkpoints(path)[:-1]:
-        if int(folder.name) % save_every_steps:
+        if int(folder.name) % save_every_steps and int(folder.name) not in ends:
             partial = folder.with_name(f"{PARTIAL_PREFIX}{folder.name}")
             os.replace(folder, partial)  # a kill leaves nothing that looks like a checkpoint
             shutil.rmtree(partial)
@@ -155,16 +211,15 @@ def point(link: Path, target: str) -> None:
         logger.warning("%s: there can be no link here (%s). The highest step is used.", link, exc.strerror)
 
 
-def _settings(file: Path) -> dict[str, Any]:  # Any: JSON
-    """Return what the run of this `finetune.json` was started with."""
-    what = "the description of a fine-tuning"
-    source = _source(str(file), what)
-    data = read_json(_read(file, what), source)
-    read_version(data, "format_version", FORMAT_VERSION, source)
-    settings = data.get(COMPARED)
-    if not isinstance(settings, dict):
-        raise source.refuse(f"{COMPARED} {shown(settings)}", "expected a mapping")
-    return settings
+def _settings(record: dict[str, Any], file: Path) -> dict[str, Any]:  # Any: JSON
+    """Return what the run of this `finetune.json` was started with, loggers left out."""
+    settings = record.get(COMPARED)
+    if not isinstance(settings, dict) or not isinstance(settings.get(RECIPE), dict):
+        raise _source(str(file), "the description of a fine-tuning").refuse(
+            f"{COMPARED} {shown(settings)}", f"expected a mapping that holds {RECIPE}"
+        )
+    recipe = {name: value for name, value in settings[RECIPE].items() if name not in LOGGERS}
+    return {**settings, RECIPE: recipe}
 
 
 def _read(file: Path, what: str) -> bytes:

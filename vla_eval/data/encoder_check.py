@@ -1,0 +1,67 @@
+"""Whether the video encoder takes a recipe's settings, found before the first seed. Knows no datasets."""
+
+import io
+from typing import Any
+
+import av
+
+from vla_eval.errors import RecipeError, did_you_mean
+from vla_eval.features import EncoderSettings
+
+SOFTWARE = ("h264", "hevc", "libsvtav1", "libaom-av1")
+OF_A_DEVICE = (
+    *("h264_videotoolbox", "hevc_videotoolbox", "h264_nvenc", "hevc_nvenc", "h264_vaapi", "h264_qsv"),
+    "auto",
+)
+"""With those above, all that lerobot 0.6.1 takes. Workers may be on a machine that has the device."""
+ALIASES = {"av1": "libsvtav1"}  # lerobot's
+SIDE_PX, FPS = 128, 20  # of what tasks render
+N_COLOURS = 3
+
+
+def check_encoder(settings: EncoderSettings) -> None:
+    """Encode one frame, unless the encoder belongs to a device.
+
+    Raises:
+        RecipeError: there is no such encoder, or it does not take the format or the quality.
+    """
+    name = ALIASES.get(settings.vcodec, settings.vcodec)
+    known = (*SOFTWARE, *OF_A_DEVICE)
+    if name not in known:
+        raise RecipeError(
+            f"encoder.vcodec is '{name}', expected one of {', '.join(known)}.{did_you_mean(name, known)}"
+        )
+    if name in OF_A_DEVICE:
+        return
+    try:
+        formats = [one.name for one in av.Codec(name, "w").video_formats or () if _n_parts(one) == N_COLOURS]
+    except av.codec.codec.UnknownCodecError as exc:
+        raise RecipeError(
+            f"encoder.vcodec: PyAV has no encoder '{name}' on this machine. Choose another one of "
+            f"{', '.join(SOFTWARE)}."
+        ) from exc
+    if settings.pix_fmt not in formats:
+        raise RecipeError(
+            f"encoder.pix_fmt: '{name}' takes {', '.join(formats)}; found '{settings.pix_fmt}'. Choose one "
+            "of these, or another encoder.vcodec. yuv444p keeps the colour of every pixel."
+        )
+    try:
+        _encode_one_frame(name, settings)
+    except av.FFmpegError as exc:
+        raise RecipeError(
+            f"encoder: '{name}' does not take pix_fmt {settings.pix_fmt} with crf {settings.crf} and g "
+            f"{settings.g} ({exc}). Change the section `encoder`, or leave it out."
+        ) from exc
+
+
+def _n_parts(pixel_format: "av.VideoFormat") -> int:
+    return len(pixel_format.components)
+
+
+def _encode_one_frame(name: str, settings: EncoderSettings) -> None:
+    options = {"g": str(settings.g), "crf": str(settings.crf)}
+    with av.open(io.BytesIO(), "w", format="mp4") as container:
+        stream: Any = container.add_stream(name, FPS, options=options)  # Any: a VideoStream
+        stream.pix_fmt, stream.width, stream.height = settings.pix_fmt, SIDE_PX, SIDE_PX
+        container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
+        container.mux(stream.encode())

@@ -1,0 +1,132 @@
+"""What a fine-tuning is asked for, and whether its folder has all of it. Waits for no torch."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vla_eval.config.decoding import decode
+from vla_eval.config.files import Recipe, digest_of, to_data
+from vla_eval.config.finetuning import (
+    LOGGERS,
+    FinetuneConfig,
+    FinetuneRecipe,
+    HeldOutConfig,
+    merge_fields,
+)
+from vla_eval.config.policy import load_policy
+from vla_eval.data.imported import IMPORT_FILE
+from vla_eval.data.info_file import one_dataset
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE
+from vla_eval.errors import RecipeError
+from vla_eval.policies.checkpoint import checkpoint_sha256, file_sha256, find_checkpoint
+from vla_eval.tasks.catalog import task_spec
+from vla_eval.training.held_out import HeldOut
+from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_metrics, read_record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneSummary:
+    """The result of a call.
+
+    Attributes:
+        out: the run folder.
+        step: of its newest checkpoint; 0: there is none.
+        is_finished: it is the last step, and evaluated if it should be; False: `is_stopping` said yes.
+    """
+
+    out: Path
+    step: int
+    is_finished: bool
+
+    @property
+    def checkpoint(self) -> Path:
+        """The checkpoint that an evaluation takes.
+
+        Raises:
+            CheckpointError: there is none: training was stopped before the first.
+        """
+        return find_checkpoint(self.out)
+
+    def __str__(self) -> str:
+        """Return a line for a person, of a training that is finished."""
+        return f"finished: {self.out} has all of its {self.step} steps. More: --steps (docs/finetuning.md)"
+
+
+def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
+
+    Raises:
+        RecipeError: the policy has none, or a field is wrong.
+    """
+    recipe = load_policy(config.policy)
+    if recipe.value.finetune is None:
+        raise RecipeError(
+            f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
+            f"`mikasa-vla list policies` shows the recipes."
+        )
+    data = merge_fields(to_data(recipe.value.finetune), config.finetune)
+    value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
+    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+
+
+def run_folder_of(config: FinetuneConfig) -> Path:
+    """Return the run folder of a fine-tuning."""
+    if config.out is not None:
+        return Path(config.out)
+    return (
+        Path("runs") / f"{Path(config.policy).stem}-{Path(config.dataset).resolve().name}-{config.run_seed}"
+    )
+
+
+def compared_fields(recipe: FinetuneRecipe) -> dict[str, Any]:  # Any: plain data
+    """Return the recipe's fields that weights may depend on."""
+    return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
+
+
+def request_sha256(config: FinetuneConfig, recipe: FinetuneRecipe) -> str:
+    """Return a digest of all that the weights depend on: recipe, seed, base, and what the dataset records.
+
+    Where it is as it was, so are the settings of the run. Where it is not, they may be all the same.
+
+    Raises:
+        VlaEvalError: there is no such dataset or base.
+    """
+    folder = one_dataset(Path(config.dataset))
+    files = [folder / name for name in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE)]  # digests of all others
+    dataset = [file_sha256(file) for file in files if file.is_file()]
+    base = checkpoint_sha256(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None
+    return digest_of([compared_fields(recipe), config.run_seed, dataset, folder.resolve().name, base])
+
+
+def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
+    """Return the run that a configuration asks for if it is finished; None: look closer.
+
+    Raises:
+        VlaEvalError: a mistake in the recipe, or no such dataset or base; the run's record is damaged.
+    """
+    recipe, out = load_finetune_recipe(config).value, run_folder_of(config)
+    step = newest_step(out)
+    if step != recipe.steps:
+        return None
+    record = read_record(out)
+    if record.get(REQUEST_KEY) != request_sha256(config, recipe):
+        return None
+    if config.held_out is not None:
+        tasks = record.get("tasks")
+        task = config.held_out.task or (tasks[0] if isinstance(tasks, list) and len(tasks) == 1 else "")
+        if not task or _held_out(config.held_out, str(task), out, step).missing(read_metrics(out)):
+            return None
+    return FinetuneSummary(out=out, step=step, is_finished=True)
+
+
+def _held_out(settings: HeldOutConfig, task: str, out: Path, last_step: int) -> HeldOut:
+    """Return evaluations that are only looked for, not run."""
+    return HeldOut(
+        settings=settings,
+        task=task_spec(task).id,
+        out=out,
+        last_step=last_step,
+        on_metrics=lambda _line: None,
+        say=lambda _line: None,
+        is_stopping=lambda: True,
+    )
