@@ -34,6 +34,8 @@ NEEDED: dict[tuple[str, ...], str] = {
     ("replay",): "recorded",
     ("dataset", "convert"): "recorded --to npz --out new",
     ("dataset", "mix"): "recorded --out new",
+    ("dataset", "check"): "recorded",
+    ("dataset", "adopt"): "recorded",
     ("dataset", "check-leak"): "recorded",
     ("dataset", "card"): "recorded",
     ("dataset", "push"): "recorded nobody/nothing",
