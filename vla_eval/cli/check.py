@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import sys
 from typing import Any
 
 from vla_eval.errors import RecipeError
@@ -75,8 +76,12 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
         raise RecipeError(
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
-    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met)
+    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, say=_print_said)
 
 
 def _print_met(requirement: str) -> None:
     print(f"ok  {requirement}", flush=True)
+
+
+def _print_said(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

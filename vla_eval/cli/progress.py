@@ -163,6 +163,8 @@ class Progress:
             self._bar.write(f"left out: {pair}")
         for warning in plan.warnings:
             self._bar.write(f"warning: {warning}")
+        for note in plan.notes:
+            self._bar.write(f"note: {note}")
         if n_finished == n_episodes:
             self._bar.write(f"{self._out}: all {n_episodes} episodes are there")
             return

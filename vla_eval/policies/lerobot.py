@@ -46,7 +46,6 @@ from vla_eval.policies.lerobot_episodes import (
 from vla_eval.policies.lerobot_inputs import (
     InputMap,
     InputOptions,
-    check_control_mode,
     check_training,
     default_cameras,
     input_map,
@@ -61,6 +60,7 @@ from vla_eval.policies.lerobot_memory import (
 )
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
 from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.trained_with import Asked, differences, refuse_differences
 from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.specs import PolicySpec
 
@@ -263,7 +263,8 @@ def make_lerobot(
     )
     with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
         facts = read_facts(loaded.folder)
-        check_control_mode(facts, context.env, policy=context.name)
+        # First what is wrong by itself: another control mode has other dimensions, too.
+        refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
         inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
         check_training(
             facts,

@@ -23,6 +23,7 @@ from vla_eval.features import (
     proprioception,
 )
 from vla_eval.policies.checkpoint import TrainingFacts
+from vla_eval.policies.trained_with import Asked, differences, refuse_differences
 from vla_eval.specs import EnvSpec
 
 ACTION_KEY = "action"
@@ -120,23 +121,6 @@ def input_map(
     return InputMap(cameras=cameras, state=kind)
 
 
-def check_control_mode(facts: TrainingFacts | None, env: EnvSpec, *, policy: str) -> None:
-    """Raise `SpecMismatchError` if the policy's actions are for another control mode than the environment's.
-
-    Args:
-        facts: what a fine-tuning of ours has noted; None for a checkpoint of another program.
-        env: what the environment offers.
-        policy: its name, for messages.
-    """
-    found = env.action.control_mode
-    if facts is not None and facts.control_mode != found:
-        raise SpecMismatchError(
-            f"policy '{policy}': control mode: expected {facts.control_mode}, found {found} in {env.task}: "
-            f"the policy was trained on actions of the former. Evaluate it with "
-            f"--set env.{CONTROL_MODE}={facts.control_mode}."
-        )
-
-
 def check_training(
     facts: TrainingFacts | None,
     inputs: InputMap,
@@ -169,32 +153,9 @@ def check_training(
         for field, size in seen.items():
             trained = shapes[renamed.get(field, field)]
             if trained != size and renamed.get(field, field) == field:
-                problems.append(f"size of {field}: expected {trained}, found {size}")
-    else:
-        problems += _facts_problems(facts, inputs, seen, env)
-    if problems:
-        raise SpecMismatchError(
-            f"policy '{policy}' would not see on {env.task} what it saw in training:\n"
-            + "\n".join(f"  {problem}" for problem in problems)
-            + "\nCorrect `cameras` or `state` in the recipe's args, set env.image_size, or fine-tune on a "
-            "dataset of this form."
-        )
-
-
-def _facts_problems(
-    facts: TrainingFacts, inputs: InputMap, seen: Mapping[str, tuple[int, int]], env: EnvSpec
-) -> list[str]:
-    pairs: list[tuple[str, object, object]] = [
-        ("images and their order", tuple(facts.images), tuple(seen)),
-        *((f"size of {f}", tuple(facts.images[f]), size) for f, size in seen.items() if f in facts.images),
-        ("control steps per second", facts.fps, env.control_hz),
-        ("action dimensions", facts.action_names, env.action.dims),
-    ]
-    if inputs.state is not None:
-        pairs.append(("state", facts.state, inputs.state))
-    return [
-        f"{what}: expected {trained}, found {found}" for what, trained, found in pairs if trained != found
-    ]
+                problems.append(f"size of {field}: expected {trained}, found {size}. Set env.image_size.")
+    problems += differences(facts, Asked(env, seen, inputs.state))
+    refuse_differences(problems, policy=policy, task=env.task)
 
 
 def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:

@@ -19,13 +19,16 @@ from vla_eval.testing.check_policy import check_policy
 N_SLOTS = 2  # as many episodes as the check runs side by side
 
 
-def check_recipe(policy: str, *, task: str, report: Callable[[str], None]) -> list[str]:
+def check_recipe(
+    policy: str, *, task: str, report: Callable[[str], None], say: Callable[[str], None] = lambda _line: None
+) -> list[str]:
     """Check a policy by its name, its recipe's file or its checkpoint's folder.
 
     Args:
         policy: what `eval --policy` takes.
         task: the task whose cameras, states and actions it is given.
         report: called with each requirement that is met, as soon as that is known.
+        say: gets what differs from the policy's training and is no requirement, line by line.
 
     Returns:
         The requirements, all of which are met.
@@ -42,8 +45,10 @@ def check_recipe(policy: str, *, task: str, report: Callable[[str], None]) -> li
         slots_per_worker=N_SLOTS,
         simulator="fake",
     )
-    jobs = make_plan(config).jobs
-    group = jobs[0].group
+    plan = make_plan(config)
+    for line in (*(f"warning: {one}" for one in plan.warnings), *(f"note: {one}" for one in plan.notes)):
+        say(line)
+    group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
     facts = EnvFacts(shown.spec, shown.n_candidates)
     made = [make_policy(group, facts)]  # given to the check first: weights take long to load

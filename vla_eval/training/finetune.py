@@ -16,7 +16,7 @@ from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.estimate import RateWatch, estimate
 from vla_eval.training.failures import about_failures
-from vla_eval.training.held_out import HeldOut, shared_seeds_warning
+from vla_eval.training.held_out import HeldOut, asked_warnings, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
@@ -116,6 +116,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
     warning = shared_seeds_warning(dataset)
     if warning is not None:
         say(warning)
+    for line in asked_warnings(job.facts, job.held_out_task, policy=job.name):
+        say(f"warning: {line}")
     if not masks_padding(job.policy):
         say(
             "padded actions: this policy does not mask them; chunks that go beyond an episode's end are left "

@@ -13,15 +13,18 @@ from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
+from vla_eval.config.prompts import instruction_for
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
-from vla_eval.policies.checkpoint import MODEL_FOLDER
+from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts
+from vla_eval.policies.trained_with import Asked, about_sentence, differences, refuse_differences
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.interface import env_spec, offered_by
 from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.run_folder import whole_checkpoints
 
@@ -180,6 +183,40 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: Tra
             f"held_out.task: {dataset.name} {names}; say which one to evaluate on (`mikasa-vla list tasks`)."
         )
     return task_spec(task).id
+
+
+def check_asked(settings: HeldOutConfig, task: str, facts: TrainingFacts, *, policy: str) -> None:
+    """Refuse an evaluation that gives a policy something else than it is trained with.
+
+    Args:
+        settings: of the evaluation.
+        task: the task's id.
+        facts: what the policy is trained with.
+        policy: its name, for the message.
+
+    Raises:
+        SpecMismatchError: it does, in a way that every evaluation would refuse after hours of training.
+    """
+    env = offered_by(task_spec(task), settings.env)
+    sizes = {(camera.height_px, camera.width_px) for camera in env.cameras}
+    images = dict.fromkeys(facts.images, sizes.pop())
+    refuse_differences(differences(facts, Asked(env, images)), policy=policy, task=task)
+
+
+def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> list[str]:
+    """Return what a person should know of evaluations before the training, line by line.
+
+    Args:
+        facts: what the policy is trained with.
+        task: the task of the held-out evaluation; None: there is none.
+        policy: its name.
+    """
+    if task is not None:
+        asked = instruction_for(task_spec(task))
+        sentence = about_sentence(facts.sentences, asked, policy=policy, task=task)
+        return [] if sentence is None else [sentence]
+    env = env_spec(control_mode=facts.control_mode)
+    return [f"every evaluation would refuse this policy: {line}" for line in differences(facts, Asked(env))]
 
 
 def shared_seeds_warning(dataset: TrainingDataset) -> str | None:
