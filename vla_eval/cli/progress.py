@@ -183,6 +183,10 @@ class Progress:
         renderer = device.get("render_device")
         self._bar.doing(f"rendering on {renderer}" if renderer else "simulating")
 
+    def on_warning(self, line: str) -> None:
+        """Say it at once."""
+        self._bar.write(f"warning: {line}")
+
     def on_record(self, record: EpisodeRecord) -> None:
         """Count the record; say at once what went wrong."""
         self._lines.on_record(record)

@@ -11,8 +11,8 @@ from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.errors import SpecMismatchError, some_of
 from vla_eval.features import StateKind
 from vla_eval.policies.checkpoint import TrainingFacts
+from vla_eval.policies.sentence_reading import quoted
 from vla_eval.specs import EnvSpec
-from vla_eval.strict_json import shown
 
 WORD = re.compile(r"(\{\w+\})")  # of an instruction: each episode puts its own in its place
 
@@ -122,8 +122,8 @@ def about_sentence(trained: Sentences | None, sentence: str, *, policy: str, tas
     of = task if trained.get(task) else some_of(name for name in trained if name)
     return (
         f"policy '{policy}' is asked on {task} with a sentence that it was never trained with: "
-        f"{shown(sentence)}; trained with, {of or 'of tasks without a name'}: "
-        f"{some_of(shown(one) for one in dict.fromkeys(known))}. If you do not test a paraphrase, put the "
+        f"{quoted(sentence)}; trained with, {of or 'of tasks without a name'}: "
+        f"{some_of(quoted(one) for one in dict.fromkeys(known))}. If you do not test a paraphrase, put the "
         "trained sentence into a file in ./prompts/ and name it in prompt_set."
     )
 

@@ -14,6 +14,7 @@ from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -51,14 +52,20 @@ def check_recipe(
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
     facts = EnvFacts(shown.spec, shown.n_candidates)
-    made = [make_policy(group, facts)]  # given to the check first: weights take long to load
-    return check_policy(
+    first = make_policy(group, facts)
+    made = [first]  # given to the check first: weights take long to load
+    met = check_policy(
         lambda: made.pop() if made else make_policy(group, facts),
         facts.spec,
-        observe=shown.observe if made[0].spec.privileged else None,
+        observe=shown.observe if first.spec.privileged else None,
         instruction=group.instruction,
         report=report,
     )
+    if isinstance(first, ReadingPolicy):
+        watch = SentenceWatch(group.part)
+        for line in (line for one in first.readings.values() for line in watch.lines(one, group.key.task)):
+            say(f"warning: {line}")
+    return met
 
 
 class _Shown:

@@ -11,6 +11,7 @@ from vla_eval.config.files import to_data
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
+from vla_eval.policies.sentence_reading import SentenceReading, SentenceWatch
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
@@ -132,12 +133,19 @@ def _listeners(
     steps = job.recipe.steps
 
     watches: list[RateWatch] = []
+    sentences = SentenceWatch(job.name)
 
     def describe(model: Any) -> None:  # Any: a torch module of lerobot's
         found = estimate(model, job.policy, job.recipe, device=job.device)
         watches.append(RateWatch(found, job.first_step, say))
         for line in found.model.lines():
             say(line)
+
+    def name_sentence(reading: SentenceReading) -> None:
+        tasks = [task for task, own in job.dataset.sentences.items() if reading.sentence in own]
+        for line in (line for task in tasks for line in sentences.lines(reading, task)):
+            if _is_first_process():
+                say(f"warning: {line}")
 
     def time_step(step: int, seconds: float) -> None:
         if _is_first_process():
@@ -157,6 +165,7 @@ def _listeners(
 
     return Listeners(
         on_model=describe,
+        on_sentence=name_sentence,
         on_metrics=report,
         on_checkpoint=evaluate,
         on_step=time_step,

@@ -5,8 +5,9 @@ It runs while the training waits, since both need the same device. A training th
 finishes it first and then resumes.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vla_eval.config.dataset import EVALUATION_SEEDS
@@ -19,7 +20,7 @@ from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
-from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts
+from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, checkpoint_name
 from vla_eval.policies.trained_with import Asked, about_sentence, differences, refuse_differences
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
@@ -46,6 +47,7 @@ class HeldOut:
         on_metrics: takes one line of metrics.
         say: gets lines for a person.
         is_stopping: an evaluation ends early once it says yes, without a figure; `catch_up` resumes it.
+        said: warnings of earlier checkpoints' evaluations, without the checkpoint's name.
     """
 
     settings: HeldOutConfig
@@ -55,6 +57,7 @@ class HeldOut:
     on_metrics: Callable[[Mapping[str, float | str]], None]
     say: Callable[[str], None]
     is_stopping: Callable[[], bool]
+    said: set[str] = field(default_factory=set)
 
     @property
     def identity(self) -> str:
@@ -91,7 +94,7 @@ class HeldOut:
         """
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
-        stops = _UntilStopped(self.is_stopping)
+        stops = _UntilStopped(self.is_stopping, functools.partial(self._warn, checkpoint))
         config = self._config(checkpoint)
         if evaluate(config, out=folder, allow_environment_change=True, observer=stops).was_stopped:
             return
@@ -117,6 +120,14 @@ class HeldOut:
         self.say(f"step {step}/{self.last_step}  {self.task}, held-out seeds: {rate}{errors}")
         self.on_metrics(line)
 
+    def _warn(self, checkpoint: Path, line: str) -> None:
+        """Say what an evaluation warns of, once for all checkpoints."""
+        name = checkpoint_name(checkpoint)
+        told = line.replace(name, name.removesuffix(f"-{checkpoint.name}"))
+        if told not in self.said:
+            self.said.add(told)
+            self.say(f"warning: {told}")
+
     def _config(self, checkpoint: Path) -> EvalConfig:
         settings = self.settings
         return EvalConfig(
@@ -135,10 +146,14 @@ class HeldOut:
 
 
 class _UntilStopped(Silence):
-    """Stops an evaluation with the training that it is of."""
+    """Stops an evaluation with the training that it is of, and passes on its warnings."""
 
-    def __init__(self, is_stopping: Callable[[], bool]) -> None:
-        self._is_stopping = is_stopping
+    def __init__(self, is_stopping: Callable[[], bool], warn: Callable[[str], None]) -> None:
+        self._is_stopping, self._warn = is_stopping, warn
+
+    def on_warning(self, line: str) -> None:
+        """Pass it on."""
+        self._warn(line)
 
     def on_tick(self) -> bool:
         """Return whether to stop."""
