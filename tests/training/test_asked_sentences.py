@@ -35,6 +35,7 @@ tokenizer = tiny_trainings.tokenizer
 LOOK, FOLLOW = "look, wait, choose", "follow the ball"  # of the fixture `recorded`, in turn
 FAKE = ["--set", "simulator=fake", "--set", "env.horizon_steps=6", "--workers", "2", "--episodes", "2"]
 WORDS = {"width": 16, "heads": 2, "layers": 1, "context_steps": 20, "chunk_size": 3, "n_action_steps": 2}
+HELD_OUT = HeldOutConfig(every_steps=2, episodes=1, simulator="fake")
 OTHER, PERMUTED = "red before blue", "blue before red"
 
 
@@ -144,12 +145,10 @@ class TestOtherSentences:
     def test_an_evaluation_before_the_training_names_what_its_checkpoints_will_be_asked(
         self, recorded: Path, tmp_path: Path
     ) -> None:
-        held_out = HeldOutConfig(every_steps=2, episodes=1, simulator="fake")
+        config = dataclasses.replace(act(recorded, tmp_path / "run"), held_out=HELD_OUT)
         lines: list[str] = []
         with pytest.raises(StopIteration):
-            finetune(
-                dataclasses.replace(act(recorded, tmp_path / "run"), held_out=held_out), say=raising(lines)
-            )
+            finetune(config, say=raising(lines))
         (line,) = [line for line in lines if line.startswith("warning: policy")]
         assert "policy 'act' is asked on RememberColor3-v0 with a sentence that it was never trained" in line
 
@@ -157,7 +156,7 @@ class TestOtherSentences:
     def test_an_evaluation_that_every_checkpoint_would_refuse_is_refused_before_the_training(
         self, recorded: Path, tmp_path: Path, change: dict[str, Any]
     ) -> None:
-        held_out = HeldOutConfig(every_steps=2, episodes=1, simulator="fake", env=change)
+        held_out = dataclasses.replace(HELD_OUT, env=change)
         with pytest.raises(Exception, match=r"expected .*128|held_out.env.control_mode: expected"):
             finetune(dataclasses.replace(act(recorded, tmp_path / "run"), held_out=held_out))
         assert not (tmp_path / "run").exists()
@@ -174,9 +173,8 @@ class TestOtherSentences:
             finetune(act(recorded, tmp_path / "run"), say=raising(lines))
         (line,) = [line for line in lines if line.startswith("warning:")]
         assert "every evaluation would refuse this policy: control steps per second: expected 10.0" in line
-        held_out = HeldOutConfig(every_steps=2, episodes=1, simulator="fake")
         with pytest.raises(SpecMismatchError, match=r"control steps per second: expected 10\.0, found 20\.0"):
-            finetune(dataclasses.replace(act(recorded, tmp_path / "run"), held_out=held_out))
+            finetune(dataclasses.replace(act(recorded, tmp_path / "run"), held_out=HELD_OUT))
 
 
 def raising(lines: list[str]) -> Any:
@@ -245,14 +243,20 @@ class TestCutSentences:
         mix_datasets([recorded, write_second_task(recorded, sentence="look and touch")], data)
         config = pi0(data, tmp_path / "run", tokenizer)
         policy = {**config.finetune["policy"], "tokenizer_max_length": 1}  # a sentence's first letters
-        config = dataclasses.replace(config, finetune={**config.finetune, "policy": policy, "batch_size": 16})
+        config = dataclasses.replace(
+            config,
+            finetune={**config.finetune, "policy": policy, "batch_size": 16},
+            held_out=dataclasses.replace(HELD_OUT, env={"horizon_steps": 6}, workers=1, task=TASK),
+        )
+        monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
         lines: list[str] = []
         with tiny_paligemma("pi0"):
             finetune(config, say=lines.append)
-            assert sorted(warned("\n".join(lines))) == ["cut", "cut", "cut", "same"]
+            # Three sentences in training; that of the evaluation once for both checkpoints.
+            assert sorted(warned("\n".join(lines))) == ["cut", "cut", "cut", "cut", "other", "same"]
+            assert sum("held-out seeds" in line for line in lines) == 2
             assert main(["check", str(tmp_path / "run")]) == 0
         assert warned(capsys.readouterr().err) == ["other", "cut"]
-        monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
         arguments = ["eval", "--policy", str(tmp_path / "run"), "--task", TASK, *FAKE]
         assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
         assert warned(capsys.readouterr().err) == ["other", "cut"]

@@ -119,7 +119,7 @@ class SentenceWatch:
     def _same(self, one: SentenceReading, other: SentenceReading) -> str:
         return (
             f"policy '{self._policy}' reads one and the same of two tasks, {self._named(one)} and "
-            f"{self._named(other)}: {quoted(one.kept)}. It can tell them apart by what it sees alone. Use "
+            f"{self._named(other)}: {quoted(one.kept)}. It can distinguish them by what it sees alone. Use "
             "sentences that differ in what is read."
         )
 

@@ -157,11 +157,12 @@ def _spoken(
     root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts, meta: Any
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
     columns, names = read_columns(root, ("episode_index", "task_index")), meta.tasks.index
-    pairs = np.unique(np.stack([columns["episode_index"], columns["task_index"]], axis=1), axis=0)
+    pairs = np.unique(columns["episode_index"] * len(names) + columns["task_index"])
     sources = facts.sources if isinstance(facts, MixtureFacts) else ()
     tasks = [one.task for one in sources for _ in range(one.n_episodes)] or [facts.task] * meta.total_episodes
     sentences: list[list[str]] = [[] for _ in tasks]
-    for episode, sentence in pairs.tolist():
+    for pair in pairs.tolist():
+        episode, sentence = divmod(pair, len(names))
         sentences[episode].append(str(names[sentence]))
     return tuple((task or "", tuple(own)) for task, own in zip(tasks, sentences, strict=True))
 
