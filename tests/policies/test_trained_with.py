@@ -1,7 +1,9 @@
 """What a policy was trained with is compared fact by fact with what it is asked."""
 
 import dataclasses
+import itertools
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,6 +11,8 @@ import pytest
 from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.errors import CheckpointError, SpecMismatchError
 from vla_eval.policies.checkpoint import FACTS_FILE, TrainingFacts, read_facts, write_facts
+from vla_eval.policies.lerobot_inputs import _gripper_problems
+from vla_eval.policies.steps.gripper import ENCODINGS, Gripper
 from vla_eval.policies.trained_with import (
     Asked,
     about_sentence,
@@ -152,3 +156,16 @@ def test_sentences_of_another_form_are_refused(damaged: str, tmp_path: Path) -> 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     write_facts(tmp_path, FACTS)
     assert read_facts(tmp_path) == FACTS
+
+
+def test_a_gripper_that_is_decoded_otherwise_than_it_was_encoded_is_a_problem() -> None:
+    def loaded(before: Gripper, behind: Gripper) -> Any:
+        steps = {"preprocessor": [SimpleNamespace(), SimpleNamespace(gripper=before)]}
+        steps["postprocessor"] = [SimpleNamespace(gripper=behind)]
+        return SimpleNamespace(**{name: SimpleNamespace(steps=own) for name, own in steps.items()})
+
+    every = [Gripper(encoding=encoding) for encoding in ENCODINGS]
+    for before, behind in itertools.product([*every, Gripper(decoding="binary")], repeat=2):
+        problems = _gripper_problems(loaded(before, behind))
+        assert len(problems) == (before != behind)
+        assert all(repr(before) in line and repr(behind) in line for line in problems)

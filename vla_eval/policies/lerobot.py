@@ -278,8 +278,7 @@ def make_lerobot(
         check_training(
             facts,
             inputs,
-            loaded.config,
-            loaded.preprocessor,
+            loaded,
             context.env,
             policy=context.name,
         )

@@ -23,6 +23,7 @@ from vla_eval.features import (
     proprioception,
 )
 from vla_eval.policies.checkpoint import TrainingFacts
+from vla_eval.policies.lerobot_loading import LoadedPolicy
 from vla_eval.policies.trained_with import Asked, differences, refuse_differences
 from vla_eval.specs import EnvSpec
 
@@ -124,8 +125,7 @@ def input_map(
 def check_training(
     facts: TrainingFacts | None,
     inputs: InputMap,
-    config: Any,
-    preprocessor: Any,
+    loaded: LoadedPolicy,
     env: EnvSpec,
     *,
     policy: str,
@@ -136,8 +136,7 @@ def check_training(
         facts: what a fine-tuning of ours has noted; None for a checkpoint of another program, of which
             only what its configuration and statistics say is compared.
         inputs: how observations become inputs.
-        config: lerobot's configuration of the policy.
-        preprocessor: lerobot's pipeline, whose statistics are looked at.
+        loaded: the policy, whose configuration, statistics and gripper are looked at.
         env: what the environment offers.
         policy: its name, for messages.
 
@@ -146,7 +145,8 @@ def check_training(
     """
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     seen = {field: sizes[camera] for camera, field in inputs.cameras.items()}
-    problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env)
+    config, preprocessor = loaded.config, loaded.preprocessor
+    problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env) + _gripper_problems(loaded)
     if facts is None:
         shapes = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
         renamed = _rename_map(preprocessor)
@@ -167,6 +167,22 @@ def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:
         f"field of view of {camera.name}: expected {trained:.4f} rad, found {camera.fov_rad:.4f} rad"
         for camera in env.cameras
         if camera.name in inputs.cameras and abs(camera.fov_rad - trained) > MAX_FOV_DIFFERENCE_RAD
+    ]
+
+
+def _gripper_problems(loaded: LoadedPolicy) -> list[str]:
+    """Compare how the gripper of training targets was encoded with how that of predictions is decoded."""
+    grippers = [
+        step.gripper
+        for pipeline in (loaded.preprocessor, loaded.postprocessor)
+        for step in pipeline.steps
+        if hasattr(step, "gripper")
+    ]
+    return [
+        f"gripper: expected {grippers[0]}, as before the policy, found {found} behind it. Fetch the complete "
+        "checkpoint."
+        for found in grippers
+        if found != grippers[0]
     ]
 
 

@@ -157,7 +157,8 @@ def _spoken(
     root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts, meta: Any
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
     columns, names = read_columns(root, ("episode_index", "task_index")), meta.tasks.index
-    pairs = np.unique(columns["episode_index"] * len(names) + columns["task_index"])
+    episodes, indices = (columns[name].astype(np.int64) for name in ("episode_index", "task_index"))
+    pairs = np.unique(episodes * len(names) + indices)
     sources = facts.sources if isinstance(facts, MixtureFacts) else ()
     tasks = [one.task for one in sources for _ in range(one.n_episodes)] or [facts.task] * meta.total_episodes
     sentences: list[list[str]] = [[] for _ in tasks]
