@@ -105,7 +105,7 @@ def test_every_other_sentence_is_named_beside_those_that_were_trained(sentence: 
     line = told(sentence, FACTS.sentences)
     assert line is not None
     assert line.startswith(f"policy 'p' is asked on {COLOR} with a sentence that it was never trained with: ")
-    assert f"{sentence!r}; trained with, {COLOR}: 'lift it', 'lift it, please'" in line
+    assert f"{sentence!r}. Those of its training ({COLOR}): 'lift it', 'lift it, please'." in line
     assert "prompt_set" in line
 
 
@@ -113,14 +113,14 @@ def test_the_sentence_of_another_task_is_not_this_ones() -> None:
     both = {COLOR: ("lift it",), TOUCH: ("touch it",)}
     assert told("touch it", both, TOUCH) is None
     line = told("lift it", both, TOUCH)
-    assert line is not None and f"trained with, {TOUCH}: 'touch it'." in line
+    assert line is not None and f"its training ({TOUCH}): 'touch it'." in line
 
 
 def test_a_task_that_was_not_trained_may_be_asked_with_any_trained_sentence() -> None:
     assert told("lift it", {COLOR: ("lift it",)}, TOUCH) is None
     assert told("lift it", {"": ("lift it",)}, TOUCH) is None
     line = told("touch it", {COLOR: ("lift it",)}, TOUCH)
-    assert line is not None and f"trained with, {COLOR}: 'lift it'." in line
+    assert line is not None and f"its training ({COLOR}): 'lift it'." in line
 
 
 def test_words_that_differ_per_episode_stand_for_any() -> None:

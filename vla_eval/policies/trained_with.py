@@ -122,7 +122,7 @@ def about_sentence(trained: Sentences | None, sentence: str, *, policy: str, tas
     of = task if trained.get(task) else some_of(name for name in trained if name)
     return (
         f"policy '{policy}' is asked on {task} with a sentence that it was never trained with: "
-        f"{quoted(sentence)}; trained with, {of or 'of tasks without a name'}: "
+        f"{quoted(sentence)}. Those of its training ({of or 'of tasks that are not named'}): "
         f"{some_of(quoted(one) for one in dict.fromkeys(known))}. If you do not test a paraphrase, put the "
         "trained sentence into a file in ./prompts/ and name it in prompt_set."
     )
