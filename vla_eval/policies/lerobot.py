@@ -275,11 +275,5 @@ def make_lerobot(
         # First what is wrong by itself: another control mode has other dimensions, too.
         refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
         inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
-        check_training(
-            facts,
-            inputs,
-            loaded,
-            context.env,
-            policy=context.name,
-        )
+        check_training(facts, inputs, loaded, context.env, policy=context.name)
         return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)

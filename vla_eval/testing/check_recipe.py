@@ -9,9 +9,10 @@ from dataclasses import replace
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.core import Observation
+from vla_eval.core import Observation, Policy
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
+from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceWatch
@@ -61,11 +62,15 @@ def check_recipe(
         instruction=group.instruction,
         report=report,
     )
-    if isinstance(first, ReadingPolicy):
-        watch = SentenceWatch(group.part)
-        for line in (line for one in first.readings.values() for line in watch.lines(one, group.key.task)):
-            say(f"warning: {line}")
+    _say_what_is_read(first, group, say)
     return met
+
+
+def _say_what_is_read(policy: Policy, group: EpisodeGroup, say: Callable[[str], None]) -> None:
+    watch = SentenceWatch(group.part)
+    for reading in policy.readings.values() if isinstance(policy, ReadingPolicy) else ():
+        for line in watch.lines(reading, group.key.task):
+            say(f"warning: {line}")
 
 
 class _Shown:

@@ -133,19 +133,12 @@ def _listeners(
     steps = job.recipe.steps
 
     watches: list[RateWatch] = []
-    sentences = SentenceWatch(job.name)
 
     def describe(model: Any) -> None:  # Any: a torch module of lerobot's
         found = estimate(model, job.policy, job.recipe, device=job.device)
         watches.append(RateWatch(found, job.first_step, say))
         for line in found.model.lines():
             say(line)
-
-    def name_sentence(reading: SentenceReading) -> None:
-        tasks = [task for task, own in job.dataset.sentences.items() if reading.sentence in own]
-        for line in (line for task in tasks for line in sentences.lines(reading, task)):
-            if _is_first_process():
-                say(f"warning: {line}")
 
     def time_step(step: int, seconds: float) -> None:
         if _is_first_process():
@@ -165,12 +158,25 @@ def _listeners(
 
     return Listeners(
         on_model=describe,
-        on_sentence=name_sentence,
+        on_sentence=_sentences(job, say),
         on_metrics=report,
         on_checkpoint=evaluate,
         on_step=time_step,
         is_stopping=is_stopping,
     )
+
+
+def _sentences(job: TrainingJob, say: Say) -> Callable[[SentenceReading], None]:
+    """Return what says which sentences are cut, and which tasks become one."""
+    watch = SentenceWatch(job.name)
+
+    def name(reading: SentenceReading) -> None:
+        tasks = [task for task, own in job.dataset.sentences.items() if reading.sentence in own]
+        for line in (line for task in tasks for line in watch.lines(reading, task)):
+            if _is_first_process():
+                say(f"warning: {line}")
+
+    return name
 
 
 def _held_out(job: TrainingJob, say: Say, track: Log, is_stopping: IsStopping) -> HeldOut | None:
