@@ -55,6 +55,7 @@ def plan(n_episodes: int) -> Plan:
         normalization={},
         servers={},
         task_versions={},
+        sentences={},
         training_seeds={},
         policy_names=("p",),
         shared={},

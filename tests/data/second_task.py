@@ -24,29 +24,29 @@ TASK, SENTENCE = "ShellGameTouch-v0", "touch the cup"
 
 
 @functools.cache
-def _frames(state: StateKind) -> TemporaryDirectory[str]:
+def _frames(state: StateKind, sentence: str) -> TemporaryDirectory[str]:
     """Encode the videos once per process."""
     folder = TemporaryDirectory()
     Path(folder.name).rmdir()  # lerobot wants to make it
     write_synthetic_dataset(
-        Path(folder.name), n_episodes=2, n_frames=13, state=state, seed=1, instructions=[SENTENCE]
+        Path(folder.name), n_episodes=2, n_frames=13, state=state, seed=1, instructions=[sentence]
     )
     return folder
 
 
-def write_second_task(recorded: Path, *, state: StateKind = "eef") -> Path:
+def write_second_task(recorded: Path, *, state: StateKind = "eef", sentence: str = SENTENCE) -> Path:
     """Write 2 episodes of 13 and 14 frames, of seeds 2000 and 2001, beside a recorded dataset."""
     root = recorded.parent / TASK
-    shutil.copytree(_frames(state).name, root)
+    shutil.copytree(_frames(state, sentence).name, root)
     (root / MIKASA_FOLDER).mkdir()
     like = zip(read_manifest(recorded)[:2], (2000, 2001), strict=True)
-    episodes = [dataclasses.replace(e, task=TASK, instruction=SENTENCE, seed=seed) for e, seed in like]
+    episodes = [dataclasses.replace(e, task=TASK, instruction=sentence, seed=seed) for e, seed in like]
     write_lines(root / MANIFEST_FILE, episodes)
     write_lines(root / FAILED_FILE, [])
     facts = dataclasses.replace(
         read_facts(recorded),
         task=TASK,
-        instruction=SENTENCE,
+        instruction=sentence,
         state=state,
         n_episodes=2,
         n_frames=27,

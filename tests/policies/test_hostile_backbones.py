@@ -32,6 +32,7 @@ from vla_eval.policies.lerobot_loading import (
     make_empty_policy,
     read_config,
 )
+from vla_eval.policies.tokens_read import Readings
 from vla_eval.testing.tiny_models import (
     Family,
     tiny_paligemma,
@@ -184,8 +185,10 @@ class TestEveryField:
                 self._loaded = LoadedPolicy(
                     folder=tmp_path, config=config, policy=policy, preprocessor=None, postprocessor=None
                 )
+                self._readings = Readings()
 
-        episode: Any = types.SimpleNamespace(seed=lambda: 0)
+        start = types.SimpleNamespace(instruction="lift it")
+        episode: Any = types.SimpleNamespace(seed=lambda: 0, start=start)
         with pytest.raises(CheckpointError, match="would be unpickled"):
             Lazy()._infer([episode])
 

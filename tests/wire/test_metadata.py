@@ -63,6 +63,14 @@ def test_training_seeds_are_read_and_written_and_no_part_of_the_identity() -> No
     assert found.identity() == read(OURS).identity()  # earlier versions did not say them
 
 
+def test_sentences_are_read_and_written_and_no_part_of_the_identity() -> None:
+    sentences = {"RememberColor3-v0": ["lift it", "lift it, please"], "": ["touch it"]}
+    found = read({**OURS, "sentences": sentences})
+    assert found.sentences == {"RememberColor3-v0": ("lift it", "lift it, please"), "": ("touch it",)}
+    assert unpackb(packb(found.to_wire())) == {**OURS, "sentences": sentences}
+    assert found.identity() == read(OURS).identity()  # earlier versions did not say them
+
+
 @pytest.mark.parametrize(
     "seeds", [[1], {"t": 1}, {"t": [1, 2]}, {"t": [[1]]}, {"t": [[1, "2"]]}, {"t": [[-1, 2]]}]
 )
@@ -118,6 +126,9 @@ def test_what_else_a_server_says_is_part_of_its_identity() -> None:
         ("cameras", {"base_camera": {"height_px": 1, "width_px": 1}}),
         ("cameras", {"base_camera": {"key": "observation/image", "height_px": -1, "width_px": 1}}),
         ("state_layouts", {"joints": [1]}),
+        ("sentences", ["lift it"]),
+        ("sentences", {"t": "lift it"}),
+        ("sentences", {"t": [1]}),
         ("needs_every_frame", 1),
         ("batch_max", 0),
         ("batch_max", 10**9),

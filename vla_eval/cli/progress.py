@@ -163,6 +163,8 @@ class Progress:
             self._bar.write(f"left out: {pair}")
         for warning in plan.warnings:
             self._bar.write(f"warning: {warning}")
+        for note in plan.notes:
+            self._bar.write(f"note: {note}")
         if n_finished == n_episodes:
             self._bar.write(f"{self._out}: all {n_episodes} episodes are there")
             return
@@ -180,6 +182,10 @@ class Progress:
         """Say that the first simulator is there, and what renders its images."""
         renderer = device.get("render_device")
         self._bar.doing(f"rendering on {renderer}" if renderer else "simulating")
+
+    def on_warning(self, line: str) -> None:
+        """Say it at once."""
+        self._bar.write(f"warning: {line}")
 
     def on_record(self, record: EpisodeRecord) -> None:
         """Count the record; say at once what went wrong."""

@@ -52,6 +52,7 @@ class EvaluationEffort:
         n_workers: processes.
         copies: learned policies -> bytes of their weights; each worker loads its own copy.
         warnings: what a person should know before the first episode.
+        notes: what could not be compared.
     """
 
     n_episodes: int
@@ -63,6 +64,7 @@ class EvaluationEffort:
     n_workers: int
     copies: dict[str, int]
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def seconds(self, rates: AssumedRates) -> float:
         """Return how long it takes at these rates, all workers busy to the end."""
@@ -121,6 +123,7 @@ def evaluation_effort(
         n_workers=worker_count(config, plan, n_jobs=queue.n_batches),
         copies={policy: _n_bytes(folder) for policy, folder in checkpoints.items()},
         warnings=tuple(plan.warnings),
+        notes=tuple(plan.notes),
     )
 
 
@@ -146,6 +149,8 @@ def _lines(config: EvalConfig, out: Path, effort: EvaluationEffort, rates: Assum
         )
     for warning in effort.warnings:
         yield f"warning: {warning}"
+    for note in effort.notes:
+        yield f"note: {note}"
     yield f"time, estimated: {effort.seconds(rates) / 3600:.2g} h"
     yield (
         f"assumptions: {rates.steps_per_second:g} control steps per second and worker, "

@@ -24,10 +24,11 @@ from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.phases import ReadyPhase, phases, with_servers
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.sharding import plan_shard
-from vla_eval.evaluation.worker import Finished, worker_main
+from vla_eval.evaluation.worker import Finished, SentenceRead, worker_main
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
+from vla_eval.policies.sentence_reading import SentenceWatch
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
@@ -60,6 +61,9 @@ class EvaluationObserver(Protocol):
     def on_device(self, device: Mapping[str, str]) -> None:
         """Called when a worker's simulator is there, with the facts about its device."""
 
+    def on_warning(self, line: str) -> None:
+        """Called with what a person should know and the plan could not say: once per line."""
+
     def on_record(self, record: EpisodeRecord) -> None:
         """Called with each record once it is durable."""
 
@@ -77,6 +81,9 @@ class Silence:
         """Do nothing."""
 
     def on_device(self, device: Mapping[str, str]) -> None:
+        """Do nothing."""
+
+    def on_warning(self, line: str) -> None:
         """Do nothing."""
 
     def on_record(self, record: EpisodeRecord) -> None:
@@ -259,6 +266,8 @@ def _run(
             elif isinstance(event, DeviceFound):
                 bookkeeper.folder.note_device(event.device)
                 bookkeeper.observer.on_device(event.device)
+            elif isinstance(event, SentenceRead):
+                bookkeeper.note_sentence(event)
             else:
                 # Before records are handed out: their steps are no longer among those under way.
                 if bookkeeper.unstored or time.monotonic() >= next_load:
@@ -286,6 +295,7 @@ class _Bookkeeper:
     keys: set[EpisodeKey] = field(default_factory=set)  # of the episodes that were stored in this call
     kinds: set[str] = field(default_factory=set)  # of machines that are unlike this one
     unstored: list[StoredEpisode] = field(default_factory=list)
+    sentences: dict[str, SentenceWatch] = field(default_factory=dict)  # by `EpisodeGroup.part`
 
     def __enter__(self) -> Self:
         return self
@@ -327,6 +337,12 @@ class _Bookkeeper:
             self.n_results += record.error is None
             self.n_errors += record.error is not None
             self.observer.on_record(record)
+
+    def note_sentence(self, found: SentenceRead) -> None:
+        """Say what was cut of a sentence, and which tasks became one; all workers find it."""
+        watch = self.sentences.setdefault(found.part, SentenceWatch(found.part))
+        for line in watch.lines(found.reading, found.task):
+            self.observer.on_warning(line)
 
     def _note_kind(self, kind: MachineKind | None) -> None:
         if kind is not None and kind.name not in self.kinds:

@@ -21,10 +21,16 @@ from vla_eval.evaluation.inference_choice import (
     chosen_inference,
     has_weights,
 )
-from vla_eval.policies.checkpoint_notes import checkpoint_hashes, normalization_notes, training_seeds
+from vla_eval.policies.checkpoint_notes import (
+    checkpoint_hashes,
+    normalization_notes,
+    training_seeds,
+    training_sentences,
+)
 from vla_eval.policies.execution_fields import ignored_fields
 from vla_eval.policies.registry import check_adapter
 from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
+from vla_eval.policies.trained_with import Sentences, about_nothing_known, about_sentence
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.shard import Shard
@@ -46,6 +52,8 @@ class Plan:
             `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         servers: policy behind a socket -> what its server says of itself.
+        sentences: policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was
+            trained with, see `Sentences`; None where that is not known.
         training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
             demonstrations it was trained on, where known.
         task_versions: task id -> version of the task's rules.
@@ -62,6 +70,7 @@ class Plan:
     recipe_hashes: Mapping[str, str]
     normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
     servers: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    sentences: Mapping[str, Sentences | None]
     training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]]
     task_versions: Mapping[str, int]
     policy_names: tuple[str, ...]
@@ -74,7 +83,24 @@ class Plan:
     @property
     def warnings(self) -> list[str]:
         """What a person should know before the first episode."""
-        return [*self.ignored, *seen_in_training((job.key for job in self.jobs), self.training_seeds)]
+        asked = dict.fromkeys((one.part, one.key.task, one.instruction) for one in self._groups)
+        other = [
+            about_sentence(self.sentences.get(part), sentence, policy=part, task=task)
+            for part, task, sentence in asked
+        ]
+        seen = seen_in_training((job.key for job in self.jobs), self.training_seeds)
+        return [*self.ignored, *seen, *(line for line in other if line is not None)]
+
+    @property
+    def notes(self) -> list[str]:
+        """What could not be compared."""
+        parts = dict.fromkeys(group.part for group in self._groups)
+        unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
+        return [about_nothing_known(part) for part in unknown]
+
+    @property
+    def _groups(self) -> list[EpisodeGroup]:
+        return list({id(job.group): job.group for job in self.jobs}.values())
 
 
 def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None) -> Plan:
@@ -111,6 +137,7 @@ def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None)
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
+        sentences=_sentences(policies, servers),
         training_seeds={
             **_noted(policies, training_seeds),
             **{name: server.training_seeds for name, server in servers.items() if server.training_seeds},
@@ -190,6 +217,23 @@ def _ignored(groups: Sequence[EpisodeGroup]) -> tuple[str, ...]:
         chunking = group.rollout.chunking
         said.update(dict.fromkeys(ignored_fields(group.adapter, group.args, chunking=chunking)))
     return tuple(said)
+
+
+def _sentences(
+    policies: Sequence[PolicyEntry], servers: Mapping[str, ServerMetadata]
+) -> dict[str, Sentences | None]:
+    """Return what each policy with weights was trained with, see `Plan.sentences`."""
+    here: dict[str, Sentences | None] = {
+        policy.part(index): training_sentences(recipe.value.adapter, recipe.value.args)
+        for policy in policies
+        for index, recipe in enumerate(policy.recipes)
+        if has_weights(recipe.value)
+    }
+    has_none = [
+        name for name, server in servers.items() if server.weights_known and not server.weights_sha256
+    ]
+    there = {name: server.sentences for name, server in servers.items() if name not in has_none}
+    return {**here, **there}
 
 
 def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:

@@ -29,6 +29,7 @@ from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
+from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
@@ -36,7 +37,7 @@ from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
-from vla_eval.workers.messages import DeviceFound, Failed, describe_error
+from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_error
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,15 @@ class Finished:
     timings: tuple[EpisodeTiming, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SentenceRead(Notice):
+    """A policy, by its `EpisodeGroup.part`, was asked on a task with a sentence for the first time."""
+
+    part: str
+    task: str
+    reading: SentenceReading
+
+
 class EnvFacts(NamedTuple):
     """What a policy gets to know of an environment before it is made."""
 
@@ -60,10 +70,10 @@ class EnvFacts(NamedTuple):
 
 
 class _StepCount:
-    """Counts control steps for the parent; implements `StepObserver`."""
+    """Counts control steps for the parent, and says when a policy has inferred; implements `StepObserver`."""
 
-    def __init__(self, heartbeat: Heartbeat) -> None:
-        self._heartbeat = heartbeat
+    def __init__(self, heartbeat: Heartbeat, has_inferred: Callable[[], None]) -> None:
+        self._heartbeat, self._has_inferred = heartbeat, has_inferred
 
     def wants_images(self, _step: int) -> bool:
         return False
@@ -72,7 +82,7 @@ class _StepCount:
         pass
 
     def on_inference(self, _episode: EpisodeStart, _step: int, _chunk: ActionChunk) -> None:
-        pass
+        self._has_inferred()
 
     def on_step(self, _episode: EpisodeStart, _action: FloatArray, _result: StepResult) -> None:
         self._heartbeat.count()
@@ -82,7 +92,7 @@ class EpisodeRunner:
     """Runs episodes of one group, keeping environment and policy."""
 
     def __init__(
-        self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None], capture: EpisodeCapture | None = None
+        self, heartbeat: Heartbeat, tell: Callable[[Notice], None], capture: EpisodeCapture | None = None
     ) -> None:
         """Start with nothing made."""
         self._capture = capture
@@ -91,6 +101,7 @@ class EpisodeRunner:
         self._env: SimEnv | None = None
         self._env_settings: EnvSettings | None = None
         self._policy: Policy | None = None
+        self._n_told = 0  # sentences that the parent knows of
 
     def answer(self, job: EpisodeBatch) -> Finished | Failed:
         """Run the episodes; whatever goes wrong becomes a `Failed`."""
@@ -131,13 +142,22 @@ class EpisodeRunner:
         # By the episode of slot 0, even if it has a result already and is not in the batch.
         seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
         tapes = self._capture.tapes(batch.jobs) if self._capture else None
-        observers: list[StepObserver] = [_StepCount(self._heartbeat), *([tapes] if tapes else [])]
+        count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
+        observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         if self._capture and tapes:
             self._capture.write(batch.jobs, tapes, named, env=env.spec, heartbeat=self._heartbeat)
         return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
+
+    def _tell_sentences(self, group: EpisodeGroup, policy: Policy) -> None:
+        """Tell the parent what the policy has read of sentences that are new."""
+        known = policy.readings if isinstance(policy, ReadingPolicy) else {}
+        if len(known) > self._n_told:
+            for reading in list(known.values())[self._n_told :]:
+                self._tell(SentenceRead(part=group.part, task=group.key.task, reading=reading))
+            self._n_told = len(known)
 
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group

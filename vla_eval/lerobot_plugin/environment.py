@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.config.prompts import instruction_for
-from vla_eval.control_modes import control_mode_of
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
@@ -26,7 +25,6 @@ from vla_eval.features import (
     ACTION_KEY,
     CAMERA_KEYS,
     FPS,
-    IMAGE_SIZE_PX,
     STATE_KEY,
     STATE_NAMES,
     StateKind,
@@ -34,8 +32,7 @@ from vla_eval.features import (
 )
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import IMAGE_SIZE, checked_image_size, env_spec
-from vla_eval.tasks.spec import TaskSpec
+from vla_eval.tasks.interface import offered_by
 
 SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments
 PIXELS, AGENT_POS = "pixels", "agent_pos"
@@ -72,7 +69,7 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         self._result: StepResult | None = None
         self.task = row.id
         self.task_description = instruction_for(row, prompt_set)
-        offered = _offered(row, settings.kwargs)
+        offered = offered_by(row, settings.kwargs)
         self._max_episode_steps = int(settings.kwargs.get("horizon_steps", row.horizon_steps))
         self.render_mode = "rgb_array"
         image = gym.spaces.Box(0, 255, _image_shape(offered), np.uint8)
@@ -140,15 +137,6 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         }
 
 
-def _offered(row: TaskSpec, env_kwargs: Mapping[str, Any]) -> EnvSpec:
-    """Return what the task offers with these arguments, without making its environment."""
-    return env_spec(
-        row,
-        control_mode=control_mode_of(env_kwargs),
-        image_size_px=checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=row.id),
-    )
-
-
 def _image_shape(offered: EnvSpec) -> tuple[int, int, int]:
     camera = offered.cameras[0]
     return (camera.height_px, camera.width_px, 3)
@@ -209,7 +197,7 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
         for task in self._tasks():
             task_spec(task)
         if not self.features:
-            offered = _offered(task_spec(self._tasks()[0]), self.env_kwargs)
+            offered = offered_by(task_spec(self._tasks()[0]), self.env_kwargs)
             self.features = _features(_state_kind(self.state), offered)
 
     @property

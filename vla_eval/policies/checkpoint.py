@@ -60,6 +60,9 @@ class TrainingFacts:
         seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
             another episode, and earlier versions did not note them.
         tasks: all tasks of the demonstrations; empty where they are not known.
+        sentences: task, empty if not known -> the sentences of its demonstrations; None: not noted, as by
+            earlier versions.
+        gripper_open: the gripper's number that opens it; None: not noted.
     """
 
     run: str
@@ -74,6 +77,8 @@ class TrainingFacts:
     run_seed: int
     seeds: dict[str, tuple[SeedRange, ...]] | None = None
     tasks: tuple[str, ...] = ()
+    sentences: dict[str, tuple[str, ...]] | None = None
+    gripper_open: float | None = None
 
 
 def find_checkpoint(path: Path) -> Path:

@@ -11,6 +11,7 @@ from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.policies.checkpoint import (
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
+    TrainingFacts,
     checkpoint_sha256,
     find_checkpoint,
     read_facts,
@@ -111,11 +112,29 @@ def training_seeds(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[See
     Raises:
         CheckpointError: what the checkpoint says of its training is damaged.
     """
+    facts = _facts(adapter, args)
+    return {} if facts is None else facts.seeds or {}
+
+
+def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[str, ...]] | None:
+    """Return task id -> the sentences that a policy was trained with; None where they are not known.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Raises:
+        CheckpointError: what the checkpoint says of its training is damaged.
+    """
+    facts = _facts(adapter, args)
+    return None if facts is None else facts.sentences
+
+
+def _facts(adapter: str, args: Mapping[str, Any]) -> TrainingFacts | None:
     checkpoint = args.get("checkpoint")
     if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
-        return {}
-    facts = read_facts(find_checkpoint(Path(checkpoint)))
-    return {} if facts is None else facts.seeds or {}
+        return None
+    return read_facts(find_checkpoint(Path(checkpoint)))
 
 
 def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:

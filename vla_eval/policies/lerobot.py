@@ -46,7 +46,6 @@ from vla_eval.policies.lerobot_episodes import (
 from vla_eval.policies.lerobot_inputs import (
     InputMap,
     InputOptions,
-    check_control_mode,
     check_training,
     default_cameras,
     input_map,
@@ -61,6 +60,9 @@ from vla_eval.policies.lerobot_memory import (
 )
 from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
 from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.sentence_reading import SentenceReading
+from vla_eval.policies.tokens_read import Readings
+from vla_eval.policies.trained_with import Asked, differences, refuse_differences
 from vla_eval.policies.vla_memory.fields import FrameMemory
 from vla_eval.specs import PolicySpec
 
@@ -122,6 +124,7 @@ class LeRobotPolicy:
         self._batch = batch and (n_slots > 1 or not self._remembers)
         self._n_slots = n_slots
         self._slots: dict[int, Episode] = {}
+        self._readings = Readings()
         self.spec = PolicySpec(
             name=name,
             reads="every" if self._remembers or self._earlier or len(self._deltas) > 1 else "last",
@@ -139,6 +142,11 @@ class LeRobotPolicy:
         """Release the frames and the memory of these slots."""
         for slot in slots:
             self._slots.pop(slot, None)
+
+    @property
+    def readings(self) -> Mapping[str, SentenceReading]:
+        """What the network was given of each sentence."""
+        return self._readings.known
 
     @property
     def proprioception(self) -> StateKind | None:
@@ -180,7 +188,8 @@ class LeRobotPolicy:
         policy, config = self._loaded.policy, self._loaded.config
         seeds = [episode.seed() for episode in rows]
         devices = cuda_devices(config.device)
-        with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting():
+        heard = self._readings.of(row.start.instruction for row in rows)
+        with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting(), heard:
             torch.manual_seed(seeds[0])
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}
@@ -263,14 +272,8 @@ def make_lerobot(
     )
     with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
         facts = read_facts(loaded.folder)
-        check_control_mode(facts, context.env, policy=context.name)
+        # First what is wrong by itself: another control mode has other dimensions, too.
+        refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
         inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
-        check_training(
-            facts,
-            inputs,
-            loaded.config,
-            loaded.preprocessor,
-            context.env,
-            policy=context.name,
-        )
+        check_training(facts, inputs, loaded, context.env, policy=context.name)
         return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)

@@ -23,6 +23,8 @@ from vla_eval.features import (
     proprioception,
 )
 from vla_eval.policies.checkpoint import TrainingFacts
+from vla_eval.policies.lerobot_loading import LoadedPolicy
+from vla_eval.policies.trained_with import Asked, differences, refuse_differences
 from vla_eval.specs import EnvSpec
 
 ACTION_KEY = "action"
@@ -120,28 +122,10 @@ def input_map(
     return InputMap(cameras=cameras, state=kind)
 
 
-def check_control_mode(facts: TrainingFacts | None, env: EnvSpec, *, policy: str) -> None:
-    """Raise `SpecMismatchError` if the policy's actions are for another control mode than the environment's.
-
-    Args:
-        facts: what a fine-tuning of ours has noted; None for a checkpoint of another program.
-        env: what the environment offers.
-        policy: its name, for messages.
-    """
-    found = env.action.control_mode
-    if facts is not None and facts.control_mode != found:
-        raise SpecMismatchError(
-            f"policy '{policy}': control mode: expected {facts.control_mode}, found {found} in {env.task}: "
-            f"the policy was trained on actions of the former. Evaluate it with "
-            f"--set env.{CONTROL_MODE}={facts.control_mode}."
-        )
-
-
 def check_training(
     facts: TrainingFacts | None,
     inputs: InputMap,
-    config: Any,
-    preprocessor: Any,
+    loaded: LoadedPolicy,
     env: EnvSpec,
     *,
     policy: str,
@@ -152,8 +136,7 @@ def check_training(
         facts: what a fine-tuning of ours has noted; None for a checkpoint of another program, of which
             only what its configuration and statistics say is compared.
         inputs: how observations become inputs.
-        config: lerobot's configuration of the policy.
-        preprocessor: lerobot's pipeline, whose statistics are looked at.
+        loaded: the policy, whose configuration, statistics and gripper are looked at.
         env: what the environment offers.
         policy: its name, for messages.
 
@@ -162,39 +145,17 @@ def check_training(
     """
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     seen = {field: sizes[camera] for camera, field in inputs.cameras.items()}
-    problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env)
+    config, preprocessor = loaded.config, loaded.preprocessor
+    problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env) + _gripper_problems(loaded)
     if facts is None:
         shapes = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
         renamed = _rename_map(preprocessor)
         for field, size in seen.items():
             trained = shapes[renamed.get(field, field)]
             if trained != size and renamed.get(field, field) == field:
-                problems.append(f"size of {field}: expected {trained}, found {size}")
-    else:
-        problems += _facts_problems(facts, inputs, seen, env)
-    if problems:
-        raise SpecMismatchError(
-            f"policy '{policy}' would not see on {env.task} what it saw in training:\n"
-            + "\n".join(f"  {problem}" for problem in problems)
-            + "\nCorrect `cameras` or `state` in the recipe's args, set env.image_size, or fine-tune on a "
-            "dataset of this form."
-        )
-
-
-def _facts_problems(
-    facts: TrainingFacts, inputs: InputMap, seen: Mapping[str, tuple[int, int]], env: EnvSpec
-) -> list[str]:
-    pairs: list[tuple[str, object, object]] = [
-        ("images and their order", tuple(facts.images), tuple(seen)),
-        *((f"size of {f}", tuple(facts.images[f]), size) for f, size in seen.items() if f in facts.images),
-        ("control steps per second", facts.fps, env.control_hz),
-        ("action dimensions", facts.action_names, env.action.dims),
-    ]
-    if inputs.state is not None:
-        pairs.append(("state", facts.state, inputs.state))
-    return [
-        f"{what}: expected {trained}, found {found}" for what, trained, found in pairs if trained != found
-    ]
+                problems.append(f"size of {field}: expected {trained}, found {size}. Set env.image_size.")
+    problems += differences(facts, Asked(env, seen, inputs.state))
+    refuse_differences(problems, policy=policy, task=env.task)
 
 
 def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:
@@ -206,6 +167,22 @@ def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:
         f"field of view of {camera.name}: expected {trained:.4f} rad, found {camera.fov_rad:.4f} rad"
         for camera in env.cameras
         if camera.name in inputs.cameras and abs(camera.fov_rad - trained) > MAX_FOV_DIFFERENCE_RAD
+    ]
+
+
+def _gripper_problems(loaded: LoadedPolicy) -> list[str]:
+    """Compare how the gripper of training targets was encoded with how that of predictions is decoded."""
+    grippers = [
+        step.gripper
+        for pipeline in (loaded.preprocessor, loaded.postprocessor)
+        for step in pipeline.steps
+        if hasattr(step, "gripper")
+    ]
+    return [
+        f"gripper: expected {grippers[0]}, as before the policy, found {found} behind it. Fetch the complete "
+        "checkpoint."
+        for found in grippers
+        if found != grippers[0]
     ]
 
 

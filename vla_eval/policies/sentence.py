@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_eval.errors import MissingInstructionError
+from vla_eval.policies.tokens_read import Heard, note
 
 TASK_KEY = "task"  # of a batch: one sentence per episode
 ROWS = 4096  # of the table; some fifty words of our tasks' sentences have one each, which a test checks
@@ -40,6 +41,9 @@ class SentenceEncoder(nn.Module):
             MissingInstructionError: one has no word.
         """
         rows = [word_rows(sentence) for sentence in sentences]
+        for sentence, own in zip(sentences, rows, strict=True):
+            kept = " ".join(sorted(WORD.findall(sentence.lower())))
+            note(Heard(text=sentence, ids=tuple(sorted(own)), n_tokens=len(own), limit=None, kept=kept))
         device = self.words.weight.device
         words = torch.tensor([row for own in rows for row in own], device=device)
         begins = torch.tensor([0, *accumulate(len(own) for own in rows[:-1])], device=device)

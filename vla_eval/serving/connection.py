@@ -16,11 +16,14 @@ from typing import Any, cast  # Any: what a client sends
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
+from vla_eval.core import EpisodeStart
 from vla_eval.errors import VlaEvalError, did_you_mean
+from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher, Inference
 from vla_eval.serving.observations import RequestError
 from vla_eval.serving.sessions import Session, SessionTable
 from vla_eval.strict_json import shown
+from vla_eval.wire.client import READING_KEY
 from vla_eval.wire.codec import CodecError, packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata
 
@@ -41,11 +44,13 @@ class Service:
     Attributes:
         sessions: all sessions.
         batcher: asks the policy.
+        sentences: looks at what clients ask it with.
         debug: whether errors are sent with their traceback.
     """
 
     sessions: SessionTable
     batcher: Batcher
+    sentences: AskedSentences
     debug: bool
 
 
@@ -64,6 +69,7 @@ class ClientConnection:
         self._replies: set[asyncio.Task[None]] = set()
         self._previous_seconds: float | None = None
         self._has_failed = False
+        self._told: set[str] = set()  # sentences of which this client knows what was read
 
     async def serve(self, metadata: ServerMetadata) -> None:
         """Say what is served, and answer until the connection ends; then drop its sessions."""
@@ -108,7 +114,7 @@ class ClientConnection:
         sessions, batcher = self._service.sessions, self._service.batcher
         session = sessions.session(self._number, request, address=self._address)
         if endpoint == "reset":
-            start = sessions.begin(session, request)
+            start = self._begin(session, request)
             self._answer_later(session, request, batcher.begin(start), begun)
         elif endpoint == "observe":
             if session.episode is None:
@@ -116,10 +122,15 @@ class ClientConnection:
             sessions.observe(session, request)
         else:
             if sessions.begins(session, request):
-                batcher.begin(sessions.begin(session, request))  # if it fails, so does the inference
+                batcher.begin(self._begin(session, request))  # if it fails, so does the inference
             assert session.episode is not None
             window = sessions.window(session, request)
             self._answer_later(session, request, batcher.infer(session.episode, window), begun)
+
+    def _begin(self, session: Session, request: Mapping[str, Any]) -> EpisodeStart:
+        start = self._service.sessions.begin(session, request)
+        self._service.sentences.begin(start)
+        return start
 
     def _answer_later(
         self,
@@ -129,7 +140,7 @@ class ClientConnection:
         begun: float,
     ) -> None:
         session.n_pending += 1
-        task = asyncio.create_task(self._answer(session, request, done, begun))
+        task = asyncio.create_task(self._answer(session, request, done, begun, session.episode))
         self._replies.add(task)
         task.add_done_callback(self._replies.discard)
 
@@ -139,12 +150,15 @@ class ClientConnection:
         request: Mapping[str, Any],
         done: _Done,
         begun: float,
+        start: EpisodeStart | None,
     ) -> None:
         """Send the reply to a request once the policy has answered."""
         try:
             result = await asyncio.wrap_future(cast("Future[Inference | None]", done))
             now = time.monotonic()
-            reply = self._reset_reply(begun, now) if result is None else self._chunk_reply(result)
+            reply = (
+                self._reset_reply(begun, now) if result is None else self._chunk_reply(result, session, start)
+            )
             echo = {key: request[key] for key in ("session_id", "step") if request.get(key) is not None}
             await self._socket.send(packb({**reply, **echo}))
             self._previous_seconds = time.monotonic() - begun
@@ -159,11 +173,17 @@ class ClientConnection:
     def _reset_reply(self, begun: float, now: float) -> dict[str, Any]:
         return {"status": "reset", "server_timing": {"reset_ms": 1000 * (now - begun)}}
 
-    def _chunk_reply(self, result: Inference) -> dict[str, Any]:
+    def _chunk_reply(self, result: Inference, session: Session, start: EpisodeStart | None) -> dict[str, Any]:
         timing = {"infer_ms": 1000 * result.infer_seconds, "queue_ms": 1000 * result.queue_seconds}
         if self._previous_seconds is not None:
             timing["prev_total_ms"] = 1000 * self._previous_seconds
-        return {"actions": result.chunk.actions, "server_timing": timing}
+        reply = {"actions": result.chunk.actions, "server_timing": timing}
+        reading = None if start is None else self._service.sentences.answered(start)
+        # Only to a client that begins with a `reset`: others speak openpi's words, which have no such key.
+        if reading is not None and session.was_reset and reading.sentence not in self._told:
+            self._told.add(reading.sentence)
+            reply[READING_KEY] = reading.to_wire()
+        return reply
 
     async def _fail(self, exc: Exception) -> None:
         """Send the error as text and close the connection."""

@@ -16,7 +16,7 @@ from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.policies.checkpoint import find_checkpoint, read_facts
-from vla_eval.policies.checkpoint_notes import checkpoint_hashes, training_seeds
+from vla_eval.policies.checkpoint_notes import checkpoint_hashes, training_seeds, training_sentences
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.execution_fields import ignored_fields
 from vla_eval.policies.recipe import load_policy_recipe
@@ -195,6 +195,7 @@ def _describe(
         supports=SUPPORTS,
         versions={name: version for name, version in versions.items() if version is not None},
         training_seeds=training_seeds(recipe.value.adapter, recipe.value.args) or None,
+        sentences=training_sentences(recipe.value.adapter, recipe.value.args),
     )
 
 

@@ -24,6 +24,7 @@ from websockets.http11 import Request, Response
 
 from vla_eval.bounds import MAX_SECONDS, check_bounds
 from vla_eval.errors import VlaEvalError
+from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher
 from vla_eval.serving.connection import ClientConnection, Service
 from vla_eval.serving.host import HostedPolicy
@@ -116,7 +117,12 @@ class PolicyServer:
             task=hosted.task,
             forget=self._batcher.forget,
         )
-        self._service = Service(sessions=self._sessions, batcher=self._batcher, debug=options.debug)
+        self._service = Service(
+            sessions=self._sessions,
+            batcher=self._batcher,
+            sentences=AskedSentences(hosted),
+            debug=options.debug,
+        )
         self._connections: set[ClientConnection] = set()
         self._numbers = itertools.count()
         self._is_stopping = False

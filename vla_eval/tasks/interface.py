@@ -3,10 +3,12 @@
 Knows nothing of simulators: a server of policies has none.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from vla_eval.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
-from vla_eval.control_modes import EE_DELTA_POSE, action_spec
+from vla_eval.control_modes import EE_DELTA_POSE, action_spec, control_mode_of
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
@@ -80,3 +82,14 @@ def env_spec(
         horizon_steps=1 if task is None else task.default_horizon_steps(0),
         control_hz=CONTROL_HZ,
     )
+
+
+def offered_by(task: TaskSpec, env_kwargs: Mapping[str, object]) -> EnvSpec:
+    """Return what a task offers with these arguments, without making its environment.
+
+    Raises:
+        TaskArgumentError: the image size is no possible one.
+        UnknownNameError: there is no such control mode.
+    """
+    size_px = checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=task.id)
+    return env_spec(task, control_mode=control_mode_of(env_kwargs), image_size_px=size_px)

@@ -9,11 +9,13 @@ from dataclasses import replace
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.core import Observation
+from vla_eval.core import Observation, Policy
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
+from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -46,19 +48,29 @@ def check_recipe(
         simulator="fake",
     )
     plan = make_plan(config)
-    for line in plan.warnings:
-        say(f"warning: {line}")
+    for line in (*(f"warning: {one}" for one in plan.warnings), *(f"note: {one}" for one in plan.notes)):
+        say(line)
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
     facts = EnvFacts(shown.spec, shown.n_candidates)
-    made = [make_policy(group, facts)]  # given to the check first: weights take long to load
-    return check_policy(
+    first = make_policy(group, facts)
+    made = [first]  # given to the check first: weights take long to load
+    met = check_policy(
         lambda: made.pop() if made else make_policy(group, facts),
         facts.spec,
-        observe=shown.observe if made[0].spec.privileged else None,
+        observe=shown.observe if first.spec.privileged else None,
         instruction=group.instruction,
         report=report,
     )
+    _say_what_is_read(first, group, say)
+    return met
+
+
+def _say_what_is_read(policy: Policy, group: EpisodeGroup, say: Callable[[str], None]) -> None:
+    watch = SentenceWatch(group.part)
+    for reading in policy.readings.values() if isinstance(policy, ReadingPolicy) else ():
+        for line in watch.lines(reading, group.key.task):
+            say(f"warning: {line}")
 
 
 class _Shown:

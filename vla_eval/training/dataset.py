@@ -36,6 +36,7 @@ class TrainingDataset:
         was_replayed: whether a replay has confirmed it.
         seeds: see `TrainingFacts`.
         meta: lerobot's description of it.
+        spoken: of each episode, its task (empty if it is not known) and its sentences.
         failed: numbers of the episodes in which the success rule never held; empty, too, if that is not
             stored.
         left_out: numbers of the episodes that are not trained on.
@@ -51,6 +52,7 @@ class TrainingDataset:
     was_replayed: bool
     seeds: dict[str, tuple[SeedRange, ...]] | None
     meta: Any
+    spoken: tuple[tuple[str, tuple[str, ...]], ...] = ()
     failed: tuple[int, ...] = ()
     left_out: tuple[int, ...] = ()
 
@@ -59,6 +61,16 @@ class TrainingDataset:
         """Numbers of the episodes that are trained on; None: all."""
         left_out = set(self.left_out)
         return [i for i in range(self.meta.total_episodes) if i not in left_out] if left_out else None
+
+    @property
+    def sentences(self) -> dict[str, tuple[str, ...]]:
+        """See `TrainingFacts`; of the episodes that are trained on."""
+        left_out = set(self.left_out)
+        found: dict[str, dict[str, None]] = {}
+        for number, (task, sentences) in enumerate(self.spoken):
+            if number not in left_out:
+                found.setdefault(task, {}).update(dict.fromkeys(sentences))
+        return {task: tuple(own) for task, own in found.items()}
 
     @property
     def lengths(self) -> list[int]:
@@ -112,6 +124,7 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> TrainingDataset:
         was_replayed=was_replayed,
         seeds=_seeds(root, facts),
         meta=opened.meta,
+        spoken=_spoken(root, facts, opened.meta),
         failed=_failed(root) if SUCCESS_KEY in opened.meta.features else (),
     )
 
@@ -140,6 +153,21 @@ def _seeds(
     if isinstance(facts, MixtureFacts):
         return facts.seeds
     return demonstrated_seeds(root) if isinstance(facts, DatasetFacts) else None
+
+
+def _spoken(
+    root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts, meta: Any
+) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    columns, names = read_columns(root, ("episode_index", "task_index")), meta.tasks.index
+    episodes, indices = (columns[name].astype(np.int64) for name in ("episode_index", "task_index"))
+    pairs = np.unique(episodes * len(names) + indices)
+    sources = facts.sources if isinstance(facts, MixtureFacts) else ()
+    tasks = [one.task for one in sources for _ in range(one.n_episodes)] or [facts.task] * meta.total_episodes
+    sentences: list[list[str]] = [[] for _ in tasks]
+    for pair in pairs.tolist():
+        episode, sentence = divmod(pair, len(names))
+        sentences[episode].append(str(names[sentence]))
+    return tuple((task or "", tuple(own)) for task, own in zip(tasks, sentences, strict=True))
 
 
 def _was_replayed(root: Path, facts: DatasetFacts | ImportFacts | MixtureFacts) -> bool:

@@ -14,13 +14,14 @@ from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.errors import VlaEvalError
 from vla_eval.policies.checkpoint import checkpoint_sha256
+from vla_eval.policies.sentence_reading import SentenceReading, SentenceWatch
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.estimate import RateWatch, estimate
 from vla_eval.training.extension import check_steps
 from vla_eval.training.failures import about_failures
-from vla_eval.training.held_out import METRIC_KEY, HeldOut, shared_seeds_warning
+from vla_eval.training.held_out import METRIC_KEY, HeldOut, asked_warnings, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
 from vla_eval.training.metrics import append_metrics
@@ -105,6 +106,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
     warning = shared_seeds_warning(dataset)
     if warning is not None:
         say(warning)
+    for line in asked_warnings(job.facts, job.held_out_task, policy=job.name):
+        say(f"warning: {line}")
     if not masks_padding(job.policy):
         say(
             "padded actions: this policy does not mask them; chunks that go beyond an episode's end are left "
@@ -145,11 +148,25 @@ def _listeners(
 
     return Listeners(
         on_model=describe,
+        on_sentence=_sentences(job, say),
         on_metrics=report,
         on_checkpoint=evaluate,
         on_step=time_step,
         is_stopping=is_stopping,
     )
+
+
+def _sentences(job: TrainingJob, say: Say) -> Callable[[SentenceReading], None]:
+    """Return what says which sentences are cut, and which tasks become one."""
+    watch = SentenceWatch(job.name)
+
+    def name(reading: SentenceReading) -> None:
+        tasks = [task for task, own in job.dataset.sentences.items() if reading.sentence in own]
+        for line in (line for task in tasks for line in watch.lines(reading, task)):
+            if _is_first_process():
+                say(f"warning: {line}")
+
+    return name
 
 
 def _held_out(job: TrainingJob, say: Say, tracked: Services, is_stopping: IsStopping) -> HeldOut | None:

@@ -5,8 +5,9 @@ It runs while the training waits, since both need the same device. A training th
 finishes it first and then resumes.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +15,18 @@ from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
+from vla_eval.config.prompts import instruction_for
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
-from vla_eval.policies.checkpoint import MODEL_FOLDER
+from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, checkpoint_name
+from vla_eval.policies.trained_with import Asked, about_sentence, differences, refuse_differences
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.interface import env_spec, offered_by
 from vla_eval.training.run_folder import whole_checkpoints
 
 if TYPE_CHECKING:  # it imports lerobot; a finished training is known without
@@ -46,6 +50,7 @@ class HeldOut:
         on_metrics: takes one line of metrics.
         say: gets lines for a person.
         is_stopping: an evaluation ends early once it says yes, without a figure; `catch_up` resumes it.
+        said: warnings of earlier checkpoints' evaluations, without the checkpoint's name.
     """
 
     settings: HeldOutConfig
@@ -55,6 +60,7 @@ class HeldOut:
     on_metrics: Callable[[Mapping[str, float | str]], None]
     say: Callable[[str], None]
     is_stopping: Callable[[], bool]
+    said: set[str] = field(default_factory=set)
 
     @property
     def identity(self) -> str:
@@ -91,7 +97,7 @@ class HeldOut:
         """
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
-        stops = _UntilStopped(self.is_stopping)
+        stops = _UntilStopped(self.is_stopping, functools.partial(self._warn, checkpoint))
         config = self._config(checkpoint)
         if evaluate(config, out=folder, allow_environment_change=True, observer=stops).was_stopped:
             return
@@ -117,6 +123,14 @@ class HeldOut:
         self.say(f"step {step}/{self.last_step}  {self.task}, held-out seeds: {rate}{errors}")
         self.on_metrics(line)
 
+    def _warn(self, checkpoint: Path, line: str) -> None:
+        """Say what an evaluation warns of, once for all checkpoints."""
+        name = checkpoint_name(checkpoint)
+        told = line.replace(name, name.removesuffix(f"-{checkpoint.name}"))
+        if told not in self.said:
+            self.said.add(told)
+            self.say(f"warning: {told}")
+
     def _config(self, checkpoint: Path) -> EvalConfig:
         settings = self.settings
         return EvalConfig(
@@ -135,10 +149,14 @@ class HeldOut:
 
 
 class _UntilStopped(Silence):
-    """Stops an evaluation with the training that it is of."""
+    """Stops an evaluation with the training that it is of, and passes on its warnings."""
 
-    def __init__(self, is_stopping: Callable[[], bool]) -> None:
-        self._is_stopping = is_stopping
+    def __init__(self, is_stopping: Callable[[], bool], warn: Callable[[str], None]) -> None:
+        self._is_stopping, self._warn = is_stopping, warn
+
+    def on_warning(self, line: str) -> None:
+        """Pass it on."""
+        self._warn(line)
 
     def on_tick(self) -> bool:
         """Return whether to stop."""
@@ -183,6 +201,40 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "Tr
             f"held_out.task: {dataset.name} {names}; say which one to evaluate on (`mikasa-vla list tasks`)."
         )
     return task_spec(task).id
+
+
+def check_asked(settings: HeldOutConfig, task: str, facts: TrainingFacts, *, policy: str) -> None:
+    """Refuse an evaluation that gives a policy something else than it is trained with.
+
+    Args:
+        settings: of the evaluation.
+        task: the task's id.
+        facts: what the policy is trained with.
+        policy: its name, for the message.
+
+    Raises:
+        SpecMismatchError: it does, in a way that every evaluation would refuse after hours of training.
+    """
+    env = offered_by(task_spec(task), settings.env)
+    sizes = {(camera.height_px, camera.width_px) for camera in env.cameras}
+    images = dict.fromkeys(facts.images, sizes.pop())
+    refuse_differences(differences(facts, Asked(env, images)), policy=policy, task=task)
+
+
+def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> list[str]:
+    """Return what a person should know of evaluations before the training, line by line.
+
+    Args:
+        facts: what the policy is trained with.
+        task: the task of the held-out evaluation; None: there is none.
+        policy: its name.
+    """
+    if task is not None:
+        asked = instruction_for(task_spec(task))
+        sentence = about_sentence(facts.sentences, asked, policy=policy, task=task)
+        return [] if sentence is None else [sentence]
+    env = env_spec(control_mode=facts.control_mode)
+    return [f"every evaluation would refuse this policy: {line}" for line in differences(facts, Asked(env))]
 
 
 def shared_seeds_warning(dataset: "TrainingDataset") -> str | None:

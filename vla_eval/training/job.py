@@ -12,16 +12,16 @@ from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
+from vla_eval.control_modes import action_spec
 from vla_eval.data.opening import decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
 from vla_eval.policies.lerobot_device import choose_device
 from vla_eval.policies.vla_memory.fields import SampleMemory
-from vla_eval.seeding import SeedRange
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.failures import chosen_episodes
-from vla_eval.training.held_out import check_held_out
+from vla_eval.training.held_out import check_asked, check_held_out
 from vla_eval.training.lora import check_lora_targets, peft_config
 from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
@@ -99,6 +99,7 @@ class TrainingJob:
     def facts(self) -> TrainingFacts:
         """What is written beside each checkpoint's weights."""
         dataset, features = self.dataset, self.dataset.meta.features
+        below = None if self.base is None else read_facts(self.base)
         return TrainingFacts(
             run=self.out.resolve().name,
             dataset=dataset.name,
@@ -110,21 +111,21 @@ class TrainingJob:
             action_names=tuple(features["action"]["names"]),
             control_mode=dataset.control_mode,
             run_seed=self.run_seed,
-            seeds=self._seeds,
+            seeds=_with_base(dataset.seeds, None if below is None else below.seeds),
             tasks=dataset.tasks,
+            sentences=_with_base(dataset.sentences, None if below is None else below.sentences),
+            gripper_open=action_spec(dataset.control_mode).gripper_open,
         )
 
-    @property
-    def _seeds(self) -> dict[str, tuple[SeedRange, ...]] | None:
-        """Seeds of the demonstrations, and of those that the weights it starts from were trained on."""
-        below = None if self.base is None else read_facts(self.base)
-        if below is None or below.seeds is None:
-            return self.dataset.seeds
-        own = self.dataset.seeds or {}
-        return {
-            task: tuple(dict.fromkeys((*below.seeds.get(task, ()), *own.get(task, ()))))
-            for task in {**below.seeds, **own}
-        }
+
+def _with_base[T](
+    own: dict[str, tuple[T, ...]] | None, below: dict[str, tuple[T, ...]] | None
+) -> dict[str, tuple[T, ...]] | None:
+    """Return by task what demonstrations have: these, and those that the weights it starts from are of."""
+    if below is None or own is None:
+        return own if below is None else below
+    both = {**below, **own}
+    return {task: tuple(dict.fromkeys((*below.get(task, ()), *own.get(task, ())))) for task in both}
 
 
 def training_job(config: FinetuneConfig) -> TrainingJob:
@@ -158,6 +159,8 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         held_out=held_out,
         held_out_task=task,
     )
+    if held_out is not None and task is not None:
+        check_asked(held_out, task, job.facts, policy=job.name)
     needs = "whole episodes" if job.whole_episodes else "rewards" if job.reward is not None else None
     needs = "earlier frames" if job.sample_memory is not None else needs
     if needs is not None and not recipe.decode_ahead:

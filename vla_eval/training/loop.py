@@ -40,7 +40,9 @@ from vla_eval.data.opening import local_readers
 from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
 from vla_eval.policies.lerobot_device import amp_dtype
+from vla_eval.policies.sentence_reading import SentenceReading
 from vla_eval.policies.steps.levels import in_numbers
+from vla_eval.policies.tokens_read import Readings
 from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
@@ -62,6 +64,7 @@ class Listeners:
 
     Attributes:
         on_model: called with the model before its optimizer is made.
+        on_sentence: called with what the policy has read of each sentence, after the first step that has it.
         on_metrics: called with each line of metrics.
         on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
         on_step: called with each step, counted from 1, and its seconds, loading included.
@@ -69,6 +72,7 @@ class Listeners:
     """
 
     on_model: Callable[[Any], None]
+    on_sentence: Callable[[SentenceReading], None]
     on_metrics: Callable[[Mapping[str, float]], None]
     on_checkpoint: Callable[[Path], None]
     on_step: Callable[[int, float], None]
@@ -106,7 +110,8 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
                 is_finished = False
                 break
             started = time.perf_counter()
-            training.do_step(step)
+            for reading in training.do_step(step):
+                listeners.on_sentence(reading)
             listeners.on_step(step, time.perf_counter() - started)
             if step % recipe.log_every_steps == 0:
                 line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
@@ -131,7 +136,7 @@ class _Training:
         with accelerator.main_process_first():  # the others find the decoded frames
             dataset = _dataset(job, self.config)
         self.images = getattr(dataset, "image_fields", dataset.meta.camera_keys)
-        self.tracker = new_tracker(job, dataset, accelerator)
+        self.tracker, self.readings = new_tracker(job, dataset, accelerator), Readings()
         set_seed(job.run_seed)
         model = make_model(job, dataset.meta)
         self.before, self.after = make_processors(job, model, dataset.meta)
@@ -156,23 +161,28 @@ class _Training:
         parts = {"policy": self.policy, "optimizer": self.optimizer, "scheduler": self.scheduler}
         return {**parts, "cfg": self.config, "preprocessor": self.before, "postprocessor": self.after}
 
-    def do_step(self, step: int) -> None:
-        """Do one gradient step, the `step`-th counted from 1."""
-        tracker, started = self.tracker, time.perf_counter()
+    def do_step(self, step: int) -> list[SentenceReading]:
+        """Do one gradient step, the `step`-th counted from 1.
+
+        Returns:
+            What was read of sentences that are new.
+        """
+        tracker, started, n_known = self.tracker, time.perf_counter(), len(self.readings.known)
         batch = next(self.batches)
         for key in () if self.job.takes_bytes else self.images:
             if key in batch:
                 batch[key] = in_numbers(batch[key])
-        batch = preprocessed(self.before, batch)
-        loaded = time.perf_counter()
-        seed_step(self.job.run_seed, step - 1, self.accelerator.process_index)
-        self.policy.train()
-        if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()
-        size, scale = self.job.recipe.micro_batch_size, self.scaler.scale
-        loss = add_gradient(
-            self.policy, batch, self.accelerator, size=size, autocast=self.autocast, scale=scale
-        )
+        with self.readings.of(batch.get("task") or ()):
+            batch = preprocessed(self.before, batch)
+            loaded = time.perf_counter()
+            seed_step(self.job.run_seed, step - 1, self.accelerator.process_index)
+            self.policy.train()
+            if torch.cuda.is_available():
+                torch.cuda.reset_peak_memory_stats()
+            size, scale = self.job.recipe.micro_batch_size, self.scaler.scale
+            loss = add_gradient(
+                self.policy, batch, self.accelerator, size=size, autocast=self.autocast, scale=scale
+            )
         tracker.grad_norm = self._update()
         tracker.loss, tracker.lr = loss.value.item(), self.optimizer.param_groups[0]["lr"]
         tracker.update_metrics(loss.parts)
@@ -180,6 +190,7 @@ class _Training:
         if torch.cuda.is_available():
             tracker.gpu_mem_gb = torch.cuda.max_memory_allocated() / (1 << 30)
         tracker.step()
+        return list(self.readings.known.values())[n_known:]
 
     def _update(self) -> float:
         """Change the weights by the gradient that was added up; return its norm."""

@@ -12,6 +12,8 @@ from vla_eval.strict_json import shown
 from vla_eval.wire.connection import Connection
 from vla_eval.wire.metadata import ServerMetadata
 
+READING_KEY = "sentence_read"
+"""Of an answer of this wire: what the policy has read of the sentence, where that is new."""
 RESET_STATUS = "reset"
 RESET_TEXT = "reset successful"  # of RoboArena's servers
 
@@ -42,6 +44,9 @@ class PolicyClient(Protocol):
     def take_infer(self, session: str) -> Any:
         """Return the actions of the answer, unchecked."""
 
+    def take_reading(self, session: str) -> Any:
+        """Return what the last answer said of how the sentence was read, unchecked; None: nothing."""
+
     def close(self) -> None:
         """Close the connection."""
 
@@ -71,6 +76,7 @@ class OpenpiClient:
         self._asked: dict[str, _Question] = {}
         self._arrived: dict[str, dict[str, Any]] = {}
         self._episodes: dict[str, str] = {}
+        self._readings: dict[str, Any] = {}
 
     @property
     def metadata(self) -> ServerMetadata:
@@ -131,7 +137,13 @@ class OpenpiClient:
             raise self._connection.refuse(
                 f"expected a map with 'actions', found {shown(error) if error else shown(sorted(answer))}"
             )
+        if READING_KEY in answer:
+            self._readings[session] = answer[READING_KEY]
         return answer["actions"]
+
+    def take_reading(self, session: str) -> Any:
+        """Return what a server of this wire said of the sentence, unchecked; None: nothing new."""
+        return self._readings.pop(session, None) if self._metadata.is_ours else None
 
     def close(self) -> None:
         """Close the connection."""

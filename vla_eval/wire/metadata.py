@@ -17,7 +17,7 @@ from vla_eval.strict_json import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")
-NOT_COMPARED = ("n_sessions", "training_seeds")
+NOT_COMPARED = ("n_sessions", "training_seeds", "sentences")
 
 MAX_ACTIONS = 10_000  # of one reply
 MAX_IMAGE_PX = 4096
@@ -57,6 +57,7 @@ class ServerMetadata:
         versions: package -> version, at the server.
         n_sessions: sessions that it has at the moment.
         training_seeds: task -> the seeds of the demonstrations that the policy was trained on.
+        sentences: task -> the sentences that the policy was trained with.
         other: what else it says.
     """
 
@@ -82,6 +83,7 @@ class ServerMetadata:
     versions: Mapping[str, str] | None = None
     n_sessions: int | None = None
     training_seeds: Mapping[str, tuple[SeedRange, ...]] | None = None
+    sentences: Mapping[str, tuple[str, ...]] | None = None
     other: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -107,12 +109,14 @@ class ServerMetadata:
         message: dict[str, Any] = {
             one.name: getattr(self, one.name)
             for one in fields(self)
-            if one.name not in ("weights_known", "other", "training_seeds")
+            if one.name not in ("weights_known", "other", "training_seeds", "sentences")
         }
         if self.training_seeds is not None:
             message["training_seeds"] = {
                 task: [[one.first, one.last] for one in seeds] for task, seeds in self.training_seeds.items()
             }
+        if self.sentences is not None:
+            message["sentences"] = {task: list(own) for task, own in self.sentences.items()}
         if not self.weights_known:
             del message["weights_sha256"]
         if self.cameras is not None:
@@ -126,8 +130,8 @@ class ServerMetadata:
     def identity(self) -> dict[str, Any]:
         """Return what is compared when a run is resumed, as JSON can hold it.
 
-        Left out are what the server does not say, the number of sessions, and the training seeds, which the
-        digest of the weights covers.
+        Left out are what the server does not say, the number of sessions, and seeds and sentences of the
+        training, which the digest of the weights covers.
         """
         message = {key: value for key, value in self.to_wire().items() if key not in NOT_COMPARED}
         unsaid = () if self.is_ours else [key for key, value in message.items() if value is None]
@@ -279,6 +283,7 @@ _READERS = {
     "versions": _Reader("a map of texts", _texts),
     "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),
     "training_seeds": _Reader("a map of lists of first and last seeds", _seeds),
+    "sentences": _Reader("a map of lists of texts", _layouts),
 }
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vla_eval.storage.run_file import JsonValue
-from vla_eval.workers.messages import DeviceFound, Failed
+from vla_eval.workers.messages import Failed, Notice
 
 
 class Job(Protocol):
@@ -53,5 +53,5 @@ class Answered[J: Job, A]:
     kind: MachineKind | None = None
 
 
-type Event[J: Job, A] = Answered[J, A] | DeviceFound | None
-"""What a pool yields: an answer, a device, or None on every tick."""
+type Event[J: Job, A] = Answered[J, A] | Notice | None
+"""What a pool yields: an answer, a notice, or None on every tick."""

@@ -1,4 +1,4 @@
-"""Messages of a worker beside its answers: failed, found a device. Knows nothing of what a job is."""
+"""Messages of a worker beside its answers: failed, found out something. Knows nothing of what a job is."""
 
 import traceback
 from collections.abc import Mapping
@@ -27,8 +27,14 @@ class Failed:
     refused: bool
 
 
+class Notice:
+    """What a worker has found out; it comes before the answer of the job, and answers none."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceFound:
+class DeviceFound(Notice):
     """The device that the environment runs on."""
 
     device: Mapping[str, str]

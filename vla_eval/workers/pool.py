@@ -25,7 +25,7 @@ from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
 from vla_eval.workers.load import Load
-from vla_eval.workers.messages import DeviceFound, Failed
+from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
 from vla_eval.workers.start import end_server, server_is_stopped, worker_context
 
@@ -143,14 +143,14 @@ class WorkerPool[J: Job, A]:
             worker.job = job
             worker.process.give(job)
 
-    def _look_at(self, index: int, worker: _Worker[J]) -> Iterator[Answered[J, A] | DeviceFound]:
+    def _look_at(self, index: int, worker: _Worker[J]) -> Iterator[Answered[J, A] | Notice]:
         """Read the messages of a busy worker; then check that it is alive, and within its time limit."""
         job = worker.job
         assert job is not None  # only busy ones are looked at
         error: EpisodeError | None
         try:
             for message in worker.process.read():
-                if isinstance(message, DeviceFound):
+                if isinstance(message, Notice):
                     yield message
                     continue
                 if worker.job is None or not isinstance(message, self._answers):

@@ -19,6 +19,7 @@ from vla_eval.policies.remote.actions import as_rows, converted
 from vla_eval.policies.remote.connecting import connect_client
 from vla_eval.policies.remote.fit import Fit, fit
 from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
+from vla_eval.policies.sentence_reading import SentenceReading, from_wire
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.wire.addresses import split_urls
 from vla_eval.wire.client import PolicyClient
@@ -56,6 +57,7 @@ class RemotePolicy:
         prefix = f"{os.getpid()}-{secrets.token_hex(SESSION_BYTES)}"
         self._sessions = {slot: f"{prefix}-{slot}" for slot in clients}
         self._instructions: dict[int, str] = {}
+        self.readings: dict[str, SentenceReading] = {}
 
     @property
     def spec(self) -> PolicySpec:
@@ -91,15 +93,20 @@ class RemotePolicy:
             for frame in earlier:
                 client.observe(session, self._fit.request(frame, instruction), step=frame.step)
             client.ask_infer(session, self._fit.request(last, instruction), step=last.step)
-        return [
-            self._chunk(self._clients[window.slot].take_infer(self._sessions[window.slot]))
-            for window in windows
-        ]
+        return [self._answer(window.slot) for window in windows]
 
     def close(self) -> None:
         """Close the connections."""
         for client in {id(client): client for client in self._clients.values()}.values():
             client.close()
+
+    def _answer(self, slot: int) -> ActionChunk:
+        client, session, sentence = self._clients[slot], self._sessions[slot], self._instructions[slot]
+        chunk = self._chunk(client.take_infer(session))
+        said = client.take_reading(session)
+        if said is not None and sentence not in self.readings:
+            self.readings[sentence] = from_wire(sentence, said, where=f"policy '{self._spec.name}'")
+        return chunk
 
     def _chunk(self, actions: Any) -> ActionChunk:
         rows = as_rows(actions)

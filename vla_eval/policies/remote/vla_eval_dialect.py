@@ -84,6 +84,9 @@ class VlaEvalClient:
             raise self._connection.refuse(f"expected 'actions', found {shown(sorted(payload))}")
         return payload["actions"]
 
+    def take_reading(self, session: str) -> Any:
+        """Return None: these servers say nothing of sentences."""
+
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()

@@ -16,7 +16,7 @@ from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered, Job
 from vla_eval.workers.local import LocalService
-from vla_eval.workers.messages import DeviceFound, Failed
+from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.pool import WorkerPool
 from vla_eval.workers.process import CLOSE_SECONDS, WorkerMain
 from vla_eval.workers.start import NEAR_VARIABLE, worker_context
@@ -82,7 +82,7 @@ class WorkerActor[J: Job, A]:
     def ready(self) -> None:
         """Return once the actor is there."""
 
-    def do(self, jobs: Sequence[J]) -> list[A | Failed | DeviceFound]:
+    def do(self, jobs: Sequence[J]) -> list[A | Failed | Notice]:
         """Do jobs of one setup key; return their answers, in order, and between them what was found."""
         events = [event for event in self._pool.run(JobList(jobs)) if event is not None]
         return [event.answer if isinstance(event, Answered) else event for event in events]

@@ -20,7 +20,7 @@ from vla_eval.workers.cluster.connect import on_machine
 from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machine, Machines
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
 from vla_eval.workers.load import Load
-from vla_eval.workers.messages import DeviceFound, Failed
+from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS
 
 TICK_SECONDS = 0.2
@@ -234,7 +234,7 @@ class ClusterPool[J: Job, A]:
         self._seconds_per_job = seconds if before is None else 0.9 * before + 0.1 * seconds
         given, worker.given = deque(worker.given), []
         for event in result:
-            if isinstance(event, DeviceFound):
+            if isinstance(event, Notice):
                 yield event
                 continue
             job = given.popleft().job
