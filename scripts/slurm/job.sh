@@ -24,10 +24,13 @@ if [ "$#" -lt 1 ]; then
   exit 1
 fi
 
+child=
+stopped=
+# 120 s before the time limit, and when the job is preempted: mikasa-vla finishes what it is writing.
+trap 'stopped=1; kill -TERM "$child" 2>/dev/null || true' TERM
 "${MIKASA_VLA:-.venv/bin/mikasa-vla}" "$@" &
 child=$!
-# 120 s before the time limit, and when the job is preempted: mikasa-vla finishes what it is writing.
-trap 'kill -TERM "$child" 2>/dev/null || true' TERM
+[ -z "$stopped" ] || kill -TERM "$child" # the signal came before there was a child to send it to
 code=0
 wait "$child" || code=$?
 while kill -0 "$child" 2>/dev/null; do # the signal has interrupted `wait`

@@ -88,6 +88,23 @@ def test_a_job_that_slurm_stops_ends_its_work_and_is_queued_again(
     assert (tmp_path / "scontrol").read_text() == "requeue 77\n"
 
 
+@pytest.mark.parametrize("delay_ms", range(0, 60, 6))
+def test_a_job_that_is_stopped_while_it_starts_leaves_no_program_behind(
+    tmp_path: Path, delay_ms: int
+) -> None:
+    pid = tmp_path / "pid"
+    program = write_program(tmp_path / "program", f"echo $$ > {pid}; exec sleep 20")
+    task = subprocess.Popen(["bash", JOB, "finetune"], env=environment(tmp_path, program))
+    time.sleep(delay_ms / 1000)
+    task.send_signal(signal.SIGTERM)
+
+    assert task.wait(15) != 0
+
+    if pid.exists() and pid.read_text().strip():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid.read_text()), 0)
+
+
 def test_without_an_array_the_script_says_how_to_submit_it(tmp_path: Path) -> None:
     variables = environment(tmp_path, tmp_path / "program")
     variables.pop("SLURM_ARRAY_TASK_ID", None)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from tests.data.second_task import SENTENCE as TOUCH
@@ -162,8 +163,7 @@ class TestOtherSentences:
         assert not (tmp_path / "run").exists()
 
     def test_another_frame_rate_is_named_before_the_training(self, recorded: Path, tmp_path: Path) -> None:
-        info = recorded / "meta/info.json"
-        info.write_text(info.read_text().replace('"fps": 20', '"fps": 10'))
+        at_10_hz(recorded)
         facts = dataclasses.replace(read_manifest_facts(recorded), files=digest_files(recorded))
         write_entry(recorded / RECORDING_FILE, facts)
         dataset = training_dataset(recorded, allow_unreplayed=True)
@@ -175,6 +175,19 @@ class TestOtherSentences:
         assert "every evaluation would refuse this policy: control steps per second: expected 10.0" in line
         with pytest.raises(SpecMismatchError, match=r"control steps per second: expected 10\.0, found 20\.0"):
             finetune(dataclasses.replace(act(recorded, tmp_path / "run"), held_out=HELD_OUT))
+
+
+def at_10_hz(root: Path) -> None:
+    """Let all tables of a dataset of 20 frames per second say 10."""
+    info = root / "meta/info.json"
+    info.write_text(info.read_text().replace('"fps": 20', '"fps": 10'))
+    for path in (*root.glob("data/*/*.parquet"), *root.glob("meta/episodes/*/*.parquet")):
+        table = pd.read_parquet(path)
+        times = [
+            name for name in table if name == "timestamp" or name.endswith(("from_timestamp", "to_timestamp"))
+        ]
+        table[times] *= 2
+        table.to_parquet(path)
 
 
 def raising(lines: list[str]) -> Any:
