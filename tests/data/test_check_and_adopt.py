@@ -187,6 +187,16 @@ class TestCheck:
         for words in ("expected the cameras", "It has 50 frames per second", "episode 0, frame 2: "):
             assert words in sentences
 
+    def test_version_2_1_names_lerobots_converter(self, tmp_path: Path) -> None:
+        (tmp_path / "meta").mkdir()
+        (tmp_path / "data/chunk-000").mkdir(parents=True)
+        info = {"codebase_version": "v2.1", "fps": 20, "features": {}, "total_episodes": 1}
+        (tmp_path / "meta/info.json").write_text(json.dumps(info))
+        (tmp_path / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "lift"}')
+        pd.DataFrame({"action": [0.0]}).to_parquet(tmp_path / "data/chunk-000/episode_000000.parquet")
+        with pytest.raises(DatasetError, match=r"version v2\.1.*convert_dataset_v21_to_v30"):
+            check(tmp_path)
+
     def test_npz_files_are_checked_too(self, tmp_path: Path) -> None:
         joints = np.zeros((3, 25), np.float32)
         np.savez(

@@ -11,8 +11,8 @@ import yaml
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.control_modes import JOINT_DELTA_POS
-from vla_eval.data.dataset_summary import IDLE_STD, DatasetSummary, draw_sheet, summarize
-from vla_eval.data.exact_statistics import about_still_dimensions
+from vla_eval.data.dataset_summary import DatasetSummary, draw_sheet, summarize
+from vla_eval.data.exact_statistics import RESOLUTION, about_still_dimensions
 from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
@@ -262,7 +262,7 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
     )
     if summary.action.idle:
         text += (
-            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {IDLE_STD:g}): "
+            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {RESOLUTION:g}): "
             f"expect imitation to be easier than with the paper's data."
         )
     return text

@@ -10,6 +10,7 @@ import numpy as np
 from vla_eval.core import FloatArray
 from vla_eval.data.completeness import check_complete
 from vla_eval.data.decoded_frames import frame_layout, read_columns
+from vla_eval.data.exact_statistics import RESOLUTION
 from vla_eval.data.frame_cache import decode_camera
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.manifest import (
@@ -27,7 +28,6 @@ from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.viz.contact_sheet import SheetRow, contact_sheet
 
 N_SHEET_EPISODES = 3
-IDLE_STD = 1e-3  # of actions in [-1, 1]: 0.1 mm or 0.0001 rad per step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +43,7 @@ class ActionStatistics:
     @property
     def idle(self) -> tuple[str, ...]:
         """The dimensions that hardly vary, which a normalisation by the standard deviation blows up."""
-        return tuple(name for name, std in zip(self.names, self.std, strict=True) if std < IDLE_STD)
+        return tuple(name for name, std in zip(self.names, self.std, strict=True) if std < RESOLUTION)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

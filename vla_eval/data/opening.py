@@ -21,7 +21,7 @@ from PIL.Image import DecompressionBombError
 
 from vla_eval.data.checks.agreement import check_meta, check_rows
 from vla_eval.data.folder_contents import check_folder
-from vla_eval.data.info_file import check_info
+from vla_eval.data.info_file import INFO_FILE, check_info
 from vla_eval.data.lerobot_tables import read_episodes, read_frames, read_statistics, read_tasks
 from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES
 from vla_eval.errors import DatasetError
@@ -45,13 +45,14 @@ def open_local_dataset(root: Path, **options: Any) -> LeRobotDataset:
         DatasetError: there is none, or files are missing, damaged, or do not belong together.
     """
     check_folder(root)
+    if (root / INFO_FILE).is_file():
+        check_info(root)  # first: the files of older versions have other names
     for pattern in NEEDED:
         if next(root.glob(pattern), None) is None:
             raise DatasetError(
                 f"{root}: there is no complete LeRobotDataset (v3): no {pattern}. Name the folder of one "
                 f"dataset; `mikasa-vla dataset pull` fetches one from the Hub."
             )
-    check_info(root)
     with local_readers():
         return _open(root, options)
 
