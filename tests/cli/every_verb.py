@@ -41,6 +41,8 @@ COMMANDS = {
     "view": f"view {{W}}/data/{TASK} --episode 0 --web",
     "dataset convert": f"dataset convert {{W}}/data/{TASK} --to npz --out {{W}}/npz",
     "dataset mix": f"dataset mix {{W}}/data/{TASK} {{W}}/data/RememberShape3-v0 --out {{W}}/mixed",
+    "dataset check": f"dataset check {{W}}/data/{TASK}",
+    "dataset adopt": f"dataset adopt {{W}}/data/{TASK}",
     "dataset check-leak": f"dataset check-leak {{W}}/data/{TASK}",
     "dataset card": f"dataset card {{W}}/data/{TASK}",
     "dataset push": f"dataset push {{W}}/data/{TASK} nobody/nothing",
@@ -64,10 +66,10 @@ COMMANDS = {
 }
 ENDLESS = {"serve": "Serving", "view": "Hosting"}
 """Commands that run until they are stopped, and a word that they print when they are ready."""
-REFUSED = {"dataset push", "dataset pull", "checkpoint fetch", "checkpoint merge"} | {
+REFUSED = {"dataset adopt", "dataset push", "dataset pull", "checkpoint fetch", "checkpoint merge"} | {
     name for name in COMMANDS if name.startswith("checkpoint convert")
 }
-"""Commands that find no network, or no checkpoint of the kind that they read."""
+"""Commands that find no network, no dataset without records, or no checkpoint of the kind that they read."""
 
 
 def verb_of(name: str) -> tuple[str, ...]:
