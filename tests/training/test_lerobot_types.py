@@ -32,7 +32,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, MissingDependencyError, SpecMismatchError, VlaEvalError
 from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
 from vla_eval.policies.lerobot_loading import LoadOptions, make_empty_policy
-from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED
+from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.verify import verify_checkpoint
 from vla_eval.rollout import RolloutSettings, rollout
@@ -44,7 +44,6 @@ DOCS = Path(__file__).parents[2] / "docs" / "lerobot_policies.md"
 SHORT = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
 ONE_IMAGE = "no: it takes one image, the datasets have two"
 ONE_KEY = "observation.image"
-ONE_CAMERA = ("tdmpc", "vqbet")
 pytestmark = pytest.mark.usefixtures("no_network")
 
 
@@ -95,7 +94,8 @@ def trained(kind: str, tiny: Tiny, dataset: Path, tmp_path: Path) -> Path:
 def saved_by_lerobot(kind: str, tiny: Tiny, folder: Path) -> Path:
     """Return a checkpoint of one image, as LeRobot saves it; TD-MPC takes no other name for it."""
     cls = PreTrainedConfig.get_choice_class(kind)
-    made = draccus.decode(cls, {"device": "cpu", "push_to_hub": False, **tiny.fields})
+    fields = {**tiny.fields, **tiny.files(folder)}
+    made = draccus.decode(cls, {"device": "cpu", "push_to_hub": False, **fields})
     config = with_features(made)
     image = config.input_features.pop("observation.images.base")
     config.input_features = {ONE_KEY: image, "observation.state": config.input_features["observation.state"]}
@@ -168,7 +168,7 @@ def test_the_table_says_what_becomes_of_each_type(
     assert table()[kind] == Outcome(found.trained, found.evaluated or "the same")
 
 
-@pytest.fixture(params=ONE_CAMERA)
+@pytest.fixture(params=sorted(ASKED_FOR_STEPS))
 def by_step(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
     with built(request.param) as tiny:
         yield saved_by_lerobot(request.param, tiny, tmp_path / "model")
