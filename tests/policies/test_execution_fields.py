@@ -17,6 +17,7 @@ from lerobot.configs import PreTrainedConfig
 
 from tests.policies import small_checkpoints
 from tests.policies.small_checkpoints import act_config, context_for, copied
+from tests.training.lerobot_tiny import lerobots_types
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
@@ -24,21 +25,15 @@ from vla_eval.evaluation.plan import make_plan
 from vla_eval.policies.checkpoint import CONFIG_FILE
 from vla_eval.policies.execution_fields import EXECUTION_FIELDS, ignored_fields, without_execution
 from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, config_class, load_checkpoint
-from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS, CUT_THEIR_CHUNK, chunk_size
+from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
+from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED, CUT_THEIR_CHUNK, chunk_size
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.specs import EnvSpec
 
 KNOWN_FIELDS = Path(__file__).with_name("lerobot_fields.txt")
 LOOP = ("select_action", "reset")
-WITHOUT_CHUNKS = {"gaussian_actor", *CANNOT_BE_ASKED_FOR_CHUNKS}
+WITHOUT_CHUNKS = {*ASKED_FOR_STEPS, *CANNOT_BE_ASKED}
 backbone, env, act = small_checkpoints.backbone, small_checkpoints.env, small_checkpoints.act
-
-
-def lerobots_types() -> list[str]:
-    config_class("act", where="a test")  # registers all
-    known = PreTrainedConfig.get_known_choices().items()
-    return sorted(kind for kind, cls in known if cls.__module__.startswith("lerobot.policies."))
 
 
 def fields_of(kind: str) -> set[str]:
@@ -113,7 +108,7 @@ def test_each_field_of_the_installed_lerobot_is_known() -> None:
 @pytest.mark.parametrize("kind", lerobots_types())
 def test_what_only_lerobots_own_loop_reads_is_translated_or_ignored_by_name(kind: str) -> None:
     if kind in WITHOUT_CHUNKS:
-        return  # refused
+        return  # refused, or asked by that loop
     of_its_loop = read_from(kind, *LOOP) - read_from(kind, "predict_action_chunk")
     of_inputs = {"input_features", "output_features"}
 
@@ -129,6 +124,24 @@ def test_types_that_cut_their_chunk_are_those_whose_inference_reads_the_number_o
     }
 
     assert cut - WITHOUT_CHUNKS == CUT_THEIR_CHUNK
+
+
+@pytest.mark.parametrize("kind", sorted(ASKED_FOR_STEPS))
+def test_what_is_kept_of_an_episode_is_what_the_types_own_reset_empties(kind: str) -> None:
+    (reset,) = (
+        node
+        for cls in ast.walk(code_of(kind))
+        if isinstance(cls, ast.ClassDef) and cls.name.endswith("Policy")
+        for node in cls.body
+        if isinstance(node, ast.FunctionDef) and node.name == "reset"
+    )
+    emptied = {
+        node.attr
+        for node in ast.walk(reset)
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+    }
+
+    assert emptied == set(ASKED_FOR_STEPS[kind])
 
 
 @pytest.mark.parametrize("kind", sorted(CUT_THEIR_CHUNK))

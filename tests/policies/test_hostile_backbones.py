@@ -32,6 +32,7 @@ from vla_eval.policies.lerobot_loading import (
     make_empty_policy,
     read_config,
 )
+from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED
 from vla_eval.policies.tokens_read import Readings
 from vla_eval.testing.tiny_models import (
     Family,
@@ -161,8 +162,16 @@ class TestEveryField:
         ],
     )
     def test_what_was_opened_once_is_refused_with_a_message(
-        self, tmp_path: Path, trace: Path, kind: str, field: str, payload: str, says: str
+        self,
+        tmp_path: Path,
+        trace: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        kind: str,
+        field: str,
+        payload: str,
+        says: str,
     ) -> None:
+        monkeypatch.delitem(CANNOT_BE_ASKED, kind, raising=False)  # the door is behind that refusal
         hostile = write_hostile(tmp_path / "all" / "author" / "hostile", payload, trace)
         data = {"type": kind, **FIELDS, field: str(hostile)}
         (tmp_path / "config.json").write_text(json.dumps(data))

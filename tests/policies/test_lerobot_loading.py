@@ -29,7 +29,7 @@ from vla_eval.policies.lerobot_loading import (
     make_empty_policy,
     read_config,
 )
-from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED
 from vla_eval.policies.run_seeds import load_policy_entries
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
@@ -156,7 +156,7 @@ class TestProcessors:
 
 
 class TestTypesThatHideFrames:
-    @pytest.mark.parametrize("kind", sorted(CANNOT_BE_ASKED_FOR_CHUNKS))
+    @pytest.mark.parametrize("kind", sorted(CANNOT_BE_ASKED))
     def test_they_are_refused_before_anything_is_loaded(
         self, act: Path, tmp_path: Path, env: EnvSpec, kind: str
     ) -> None:

@@ -138,8 +138,8 @@ class TestRefusals:
 
     def test_a_type_that_could_not_be_evaluated_is_not_trained(self, recorded: Path, tmp_path: Path) -> None:
         config = act(recorded, tmp_path / "o")
-        with pytest.raises(CheckpointError, match=r"'vqbet' cannot be evaluated"):
-            finetune(replace(config, finetune={**config.finetune, "type": "vqbet"}))
+        with pytest.raises(CheckpointError, match=r"'lingbot_va' cannot be evaluated"):
+            finetune(replace(config, finetune={**config.finetune, "type": "lingbot_va"}))
         assert not (tmp_path / "o").exists()
 
     def test_a_policy_with_nothing_to_train_is_refused(self, recorded: Path) -> None:

@@ -17,6 +17,9 @@ Three kinds of policies, told apart by their configuration:
   a tuple of tensors (B, …), infers for several episodes in one pass: see `lerobot_memory.py`.
 
 Any of them may be shown earlier frames as further images: see `vla_memory/`.
+
+Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
+they are asked for one action at each control step, with queues of each episode; see `lerobot_steps.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +61,14 @@ from vla_eval.policies.lerobot_memory import (
     remembers_in_rows,
     remembers_singly,
 )
-from vla_eval.policies.lerobot_types import DETERMINISTIC, chunk_size, history, noise_shape
+from vla_eval.policies.lerobot_steps import select_step
+from vla_eval.policies.lerobot_types import (
+    ASKED_FOR_STEPS,
+    DETERMINISTIC,
+    chunk_size,
+    history,
+    noise_shape,
+)
 from vla_eval.policies.plain_errors import plain_errors
 from vla_eval.policies.sentence_reading import SentenceReading
 from vla_eval.policies.tokens_read import Readings
@@ -100,6 +110,7 @@ class LeRobotPolicy:
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
         self._remembers = remembers(loaded.policy)
+        self._by_step = loaded.config.type in ASKED_FOR_STEPS
         self._earlier = _earlier_frames(loaded.config)
         self._deltas = history(loaded.config)
         self._masks_history = bool(getattr(loaded.config, "masks_history", False))
@@ -127,11 +138,14 @@ class LeRobotPolicy:
         self._readings = Readings()
         self.spec = PolicySpec(
             name=name,
-            reads="every" if self._remembers or self._earlier or len(self._deltas) > 1 else "last",
+            reads="every" if self._sees_every_frame() else "last",
             cameras=tuple(inputs.cameras),
             states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
         )
+
+    def _sees_every_frame(self) -> bool:
+        return self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
@@ -200,9 +214,23 @@ class LeRobotPolicy:
                 extra["memory"], memories = self._recall(rows)
             frames = [episode.read(self._deltas, masks_history=self._masks_history) for episode in rows]
             batch = self._loaded.preprocessor(batch_of(frames, rows))
-            actions = self._loaded.postprocessor(policy.predict_action_chunk(batch, **extra))
+            if self._by_step:
+                (episode,) = rows
+                self._check_shown(episode)
+                raw, *memories = select_step(policy, batch, episode.memory)
+            else:
+                raw = policy.predict_action_chunk(batch, **extra)
+            actions = self._loaded.postprocessor(raw)
         chunks = self._chunks(actions, len(rows))
         return [_Inferred(*one) for one in zip(chunks, memories, strict=True)]
+
+    def _check_shown(self, episode: Episode) -> None:
+        if len(episode.unseen) != 1:
+            raise InvalidActionError(
+                f"policy '{self.spec.name}' (type '{self._loaded.config.type}') is asked for one action at "
+                f"each control step; expected one new frame, found {len(episode.unseen)}. Ask it with "
+                "n_action_steps 1."
+            )
 
     def _recall(self, rows: Sequence[Episode]) -> tuple[Any, list[Any]]:
         """Return what the policy remembers now: of all rows, as it takes it, and of each."""

@@ -17,6 +17,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any  # lerobot is untyped: its configs, policies and processors are Any here
 
 import draccus
@@ -32,7 +33,7 @@ import vla_eval.policies.openvla.configuration_openvla
 import vla_eval.policies.sequence.configuration_sequence
 import vla_eval.policies.spatialvla.configuration_spatialvla
 import vla_eval.policies.vla_memory.configuration_vla_memory  # noqa: F401  as above
-from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError, unknown_name
+from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
 from vla_eval.policies.adapter_config import read_adapter_config
 from vla_eval.policies.checkpoint import (
     ADAPTER_CONFIG_FILE,
@@ -49,7 +50,7 @@ from vla_eval.policies.empty_weights import empty_weights
 from vla_eval.policies.execution_fields import without_execution
 from vla_eval.policies.foreign_code import no_foreign_code, only_data
 from vla_eval.policies.lerobot_processors import check_statistics, load_processors, own_tokenizers
-from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED_FOR_CHUNKS
+from vla_eval.policies.lerobot_types import CANNOT_BE_ASKED
 from vla_eval.policies.plain_errors import plain_errors, raise_plainly, says_what_is_missing
 from vla_eval.policies.saved_processor import refuse_built_in_normalization
 from vla_eval.policies.weight_file import WeightFile
@@ -154,12 +155,20 @@ def read_config(folder: Path, options: LoadOptions) -> Any:
             config = draccus.decode(cls, without_execution(data))
     except CheckpointError:
         raise
+    except OSError as exc:  # of a backbone that is not here
+        raise_plainly(exc, asked_for(cls, str(kind), data))
     except Exception as exc:  # draccus has no class of its own for all that can be wrong
         raise CheckpointError(
             f"{where}: not the configuration of a '{kind}' policy of the installed lerobot: {exc!s:.1000}"
         ) from exc
     check_features(config, where=where)
     return config
+
+
+def asked_for(cls: Any, kind: str, data: Mapping[str, Any]) -> Any:
+    """Return type and fields of a configuration that could not be made, for messages."""
+    defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+    return SimpleNamespace(**{**defaults, **data, "type": kind})
 
 
 def with_local_files(data: dict[str, Any], folder: Path, *, tokenizer: str | None) -> dict[str, Any]:
@@ -187,10 +196,10 @@ def config_class(kind: str, *, where: str) -> Any:
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
         )
-    if kind in CANNOT_BE_ASKED_FOR_CHUNKS:
+    if kind in CANNOT_BE_ASKED:
         raise CheckpointError(
             f"{where}: a LeRobot policy of type '{kind}' cannot be evaluated in this loop, which asks for "
-            f"whole chunks and hides no frame: {CANNOT_BE_ASKED_FOR_CHUNKS[kind]}. For it there is "
+            f"whole chunks and hides no frame: {CANNOT_BE_ASKED[kind]}. For it there is "
             "LeRobot's own loop: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
         )
     return PreTrainedConfig.get_choice_class(kind)
@@ -223,15 +232,13 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
     try:
         with no_foreign_code(config.type):
             return get_policy_class(config.type)(config, **kwargs)
-    except ImportError as exc:
-        raise MissingDependencyError(
-            f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
-        ) from exc
     except VlaEvalError:
         raise
+    except ImportError as exc:
+        raise_plainly(exc, config)
     except Exception as exc:  # the constructors raise what they like of a configuration that does not fit
         if isinstance(exc, OSError | RuntimeError) and says_what_is_missing(exc):
-            raise_plainly(exc, config.type)
+            raise_plainly(exc, config)
         of = "" if where is None else f"{where}: "
         raise CheckpointError(
             f"{of}a LeRobot policy of type '{config.type}' cannot be built as its configuration says: "

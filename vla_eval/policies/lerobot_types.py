@@ -11,14 +11,19 @@ from vla_eval.errors import SpecMismatchError
 DETERMINISTIC = frozenset({"act"})
 """Types that draw nothing at inference; a policy of your own says so by `draws_nothing = True`."""
 
-COLLECTS_FRAMES = "its `predict_action_chunk` reads the frames that its own `select_action` collected"
-CANNOT_BE_ASKED_FOR_CHUNKS = {
-    "lingbot_va": "it keeps what it has seen and done between chunks to itself, for one episode at a time",
-    "multi_task_dit": COLLECTS_FRAMES,
-    "tdmpc": COLLECTS_FRAMES,
-    "vqbet": COLLECTS_FRAMES,
+ASKED_FOR_STEPS = {
+    "multi_task_dit": ("_queues",),
+    "tdmpc": ("_queues", "_prev_mean"),
+    "vqbet": ("_queues",),
 }
-"""Types of lerobot 0.6 that cannot be asked for a chunk from frames given from outside, and why."""
+"""Types of lerobot 0.6 whose `predict_action_chunk` reads the frames that their own `select_action` collected
+-> what `reset` empties. They are asked for one action at a time; see `lerobot_steps.py`."""
+
+CANNOT_BE_ASKED = {
+    "gaussian_actor": "it has no chunks, and learns by reinforcement, not from demonstrations",
+    "lingbot_va": "it keeps what it has seen and done inside its networks, for one episode at a time",
+}
+"""Types of lerobot 0.6 that can be asked neither for a chunk nor for a step of one of several episodes."""
 
 CUT_THEIR_CHUNK = frozenset({"diffusion", "groot", "molmoact2", "pi0_fast"})
 """Types whose `predict_action_chunk` returns `n_action_steps` actions and no more."""
@@ -30,6 +35,8 @@ def chunk_size(config: Any) -> int:
     `n_action_steps` of the configuration is set to that where lerobot cuts the chunk by it: π0-FAST would
     even read the tokens of a whole chunk as those of a shorter one.
     """
+    if config.type in ASKED_FOR_STEPS:
+        return 1  # whatever its own queue holds
     deltas = config.action_delta_indices
     if not deltas:
         raise SpecMismatchError(
@@ -68,6 +75,8 @@ def history(config: Any) -> tuple[int, ...]:
     Of a policy that is trained to foresee (its indices reach beyond 0) that is the newest, as lerobot's
     own loop gives it.
     """
+    if config.type in ASKED_FOR_STEPS:
+        return ()  # it collects the others itself
     # A policy that keeps its own history may read other frames in training than when it acts.
     deltas = getattr(config, "inference_delta_indices", config.observation_delta_indices) or ()
     return () if any(delta > 0 for delta in deltas) else tuple(int(delta) for delta in deltas)

@@ -1,13 +1,14 @@
 """One message for whatever lerobot, torch and transformers raise of files that do not fit."""
 
 import contextlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn  # Any: lerobot is untyped
 
 import torch
 
-from vla_eval.errors import CheckpointError, VlaEvalError
+from vla_eval.errors import CheckpointError, MissingDependencyError, VlaEvalError
 from vla_eval.policies.checkpoint_json import FETCH_AGAIN
 
 
@@ -36,23 +37,46 @@ def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
         ) from exc
 
 
-def raise_plainly(exc: OSError | RuntimeError, kind: str) -> NoReturn:
-    """Say which file is missing, if that is what ended the making of a policy or of its processors.
+def raise_plainly(exc: ImportError | OSError | RuntimeError, config: Any) -> NoReturn:
+    """Say which package or file is missing, if that ended the making of a policy or of its processors.
+
+    Args:
+        exc: whatever lerobot or transformers raised.
+        config: of the policy; or its type and fields.
 
     Raises:
+        MissingDependencyError: a package is not installed.
         CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
         OSError, RuntimeError: as given, if it was something else.
     """
     if isinstance(exc.__cause__, VlaEvalError):
         raise exc.__cause__
+    if isinstance(exc, ImportError):
+        raise MissingDependencyError(
+            f"a LeRobot policy of type '{config.type}' needs a package that is not installed: {exc}"
+        ) from exc
     if not says_what_is_missing(exc):
         raise exc
     missing = exc if isinstance(exc, OSError) else exc.__cause__
+    on_hub = ", ".join(f"{name} ({value})" for name, value in names_on_hub(config).items())
+    of_config = f" Of the Hub, its configuration names {on_hub}." if on_hub else ""
     raise CheckpointError(
-        f"a LeRobot policy of type '{kind}' could not be built without the network: {missing} Give it a "
-        "local folder (`tokenizer`, if that is what is missing), or set HF_HUB_OFFLINE=0 once to let it "
-        "fetch the file."
+        f"a LeRobot policy of type '{config.type}' could not be built without the network: "
+        f"{missing}{of_config} Give it a local folder (in that field; `tokenizer`, if that is what is "
+        "missing), or set HF_HUB_OFFLINE=0 once to let it fetch the file."
     ) from exc
+
+
+def names_on_hub(config: Any) -> dict[str, str]:
+    """Return the fields of a configuration that name a repository of the Hub, `OWNER/NAME`."""
+    return {
+        name: value
+        for name, value in vars(config).items()
+        if name not in ("repo_id", "type")
+        and isinstance(value, str)
+        and re.fullmatch(r"[\w.-]+/[\w.-]+", value)
+        and not Path(value).exists()
+    }
 
 
 def says_what_is_missing(exc: BaseException) -> bool:

@@ -19,6 +19,7 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.checkpoint_json import get_count, get_text
 from vla_eval.policies.config_check import MAX_ACTIONS
+from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS
 from vla_eval.policies.remote.survey import moved, survey_address
 from vla_eval.wire.addresses import named_server
 
@@ -57,6 +58,9 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     config = read_json(folder / CONFIG_FILE)
     where = str(folder / CONFIG_FILE)
     n_action_steps = get_count(config, "n_action_steps", maximum=MAX_ACTIONS, where=where)
+    kind = get_text(config, "type", where=where)
+    if kind in ASKED_FOR_STEPS:  # its own queue holds that many
+        n_action_steps = None
     weights = weights_file(folder)
     is_big = weights is not None and weights.stat().st_size >= BIG_CHECKPOINT_BYTES
     return Recipe(
@@ -65,7 +69,7 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
         sha256=checkpoint_sha256(folder),
         value=PolicyRecipe(
             version=1,
-            description=f"A LeRobot checkpoint of type {get_text(config, 'type', where=where)}.",
+            description=f"A LeRobot checkpoint of type {kind}.",
             adapter=LEROBOT_ADAPTER,
             args={"checkpoint": str(folder)},
             default_n_action_steps=n_action_steps or 1,

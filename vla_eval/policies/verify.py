@@ -22,7 +22,8 @@ from vla_eval.policies.lerobot_loading import (
     read_weights,
 )
 from vla_eval.policies.lerobot_memory import remembers_singly
-from vla_eval.policies.lerobot_types import chunk_size, history, noise_shape
+from vla_eval.policies.lerobot_steps import select_step
+from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS, chunk_size, history, noise_shape
 from vla_eval.policies.vla_memory.fields import mask_field
 from vla_eval.policies.weights import check_fit
 
@@ -159,7 +160,11 @@ def _act(loaded: LoadedPolicy) -> Tensor:
         )
     loaded.policy.reset()
     batch = loaded.preprocessor(random_batch(config, history(config), draws))
-    actions: Tensor = loaded.postprocessor(loaded.policy.predict_action_chunk(batch, **extra))
+    if config.type in ASKED_FOR_STEPS:
+        raw = select_step(loaded.policy, batch, None).action
+    else:
+        raw = loaded.policy.predict_action_chunk(batch, **extra)
+    actions: Tensor = loaded.postprocessor(raw)
     return actions
 
 

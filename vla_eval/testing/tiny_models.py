@@ -155,6 +155,23 @@ def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] |
     return folder
 
 
+def write_tiny_clip(folder: Path) -> Path:
+    """Save a tiny CLIP with random weights, and its tokenizer, for the multi-task DiT; return its folder."""
+    from transformers import CLIPConfig, CLIPModel
+
+    write_tiny_tokenizer(folder)
+    sizes = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config: Any = CLIPConfig
+    model: Any = CLIPModel
+    made = config(
+        text_config={**sizes, "vocab_size": VOCABULARY, "eos_token_id": SPECIAL_TOKENS.index("<eos>")},
+        vision_config={**sizes, "image_size": 32, "patch_size": 16},
+        projection_dim=16,
+    )
+    model(made).save_pretrained(str(folder))
+    return folder
+
+
 def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast

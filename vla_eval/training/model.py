@@ -62,8 +62,8 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
                 f"the policy asks for weights that are not on this machine, and they could not be downloaded "
                 f"({exc.reason}). {WITHOUT}"
             ) from exc
-        except (OSError, RuntimeError) as exc:
-            raise_plainly(exc, config.type)
+        except (ImportError, OSError, RuntimeError) as exc:
+            raise_plainly(exc, config)
     config.pretrained_path = job.weights  # only now: lerobot's loaders leave out what does not fit
     if job.weights is not None:
         model = _filled(model, job, job.weights)
@@ -106,8 +106,8 @@ def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
             return Processors(
                 *make_pre_post_processors(policy_cfg=job.policy, pretrained_path=job.weights, **kwargs)
             )
-        except OSError as exc:
-            raise_plainly(exc, job.policy.type)
+        except (ImportError, OSError) as exc:
+            raise_plainly(exc, job.policy)
 
 
 def _plain_errors(job: TrainingJob, what: str) -> contextlib.AbstractContextManager[None]:

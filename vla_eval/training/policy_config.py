@@ -35,8 +35,8 @@ from vla_eval.policies.checkpoint import (
 )
 from vla_eval.policies.config_check import check_config
 from vla_eval.policies.foreign_code import only_data
-from vla_eval.policies.lerobot_loading import config_class, with_local_files
-from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.lerobot_loading import asked_for, config_class, with_local_files
+from vla_eval.policies.plain_errors import plain_errors, raise_plainly
 from vla_eval.policies.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.training.dataset import TrainingDataset
 
@@ -74,8 +74,12 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
             config = draccus.decode(cls, data)
     except CheckpointError:
         raise
+    except OSError as exc:  # of a backbone that is not here
+        raise_plainly(exc, asked_for(cls, recipe.type, data))
     except Exception as exc:  # draccus and the policies raise what they like
-        raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
+        raise RecipeError(
+            f"finetune.policy: not a configuration of '{recipe.type}': {exc} {exc.__cause__ or ''}"
+        ) from exc
     with plain_errors(recipe.base_checkpoint or "finetune.policy", recipe.type, "does not fit the dataset"):
         _set_features(config, recipe, dataset)
         if hasattr(config, "fit_to_control_mode"):
@@ -90,9 +94,15 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         if hasattr(config, "fit_to_rewards"):
             config.fit_to_rewards(_columns_trained_on(dataset))
         if not masks_padding(config):
-            # The sampler of lerobot's loop reads this; such a policy would learn to repeat the last action.
-            config.drop_n_last_frames = max(config.action_delta_indices)
+            _leave_out_tails(config)
     return config
+
+
+def _leave_out_tails(config: Any) -> None:
+    """Train on no chunk that reaches beyond its episode: the policy would learn to repeat the last action."""
+    longest = max(config.action_delta_indices)
+    if getattr(config, "drop_n_last_frames", None) != longest:  # GR00T computes it
+        config.drop_n_last_frames = longest  # the sampler of lerobot's loop reads this
 
 
 def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
