@@ -173,10 +173,20 @@ def test_a_mistyped_mode_or_the_dataset_s_own_is_one_message(
         assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("flag", [("--task", "RememberColor3-v0"), ("--state", "joints")])
+@pytest.mark.parametrize(
+    "flag",
+    [
+        ("--task", "RememberColor3-v0"),
+        ("--state", "joints"),
+        ("--image-size", "64"),
+        ("--gripper", "0", "1"),
+        ("--resample",),
+        ("--clip-actions",),
+    ],
+)
 def test_a_flag_that_another_mode_does_not_take_is_refused(
-    flag: tuple[str, str], recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flag: tuple[str, ...], recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mode = ("--control-mode", "pd_joint_pos")
     assert main(["dataset", "convert", str(recorded), *mode, *flag, "--out", str(tmp_path / "o")]) == 1
-    assert f"{flag[0]}: --control-mode keeps task and state of the recording" in capsys.readouterr().err
+    assert f"{flag[0]}: --control-mode keeps all else of the recording" in capsys.readouterr().err

@@ -212,6 +212,10 @@ class TestOneSentence:
         error = capsys.readouterr().err
         assert warned(error) == ["other", "other", "same"]
         assert f"'{OTHER}' ({TASK})" in error and f"'{PERMUTED}' ({SECOND})" in error
+        assert main([*arguments, "--episodes", "3"]) == 0  # resumed: the workers find it again
+        capsys.readouterr()
+        assert main(["report", str(tmp_path / "out")]) == 0
+        assert capsys.readouterr().out.count("reads one and the same of two tasks") == 1
 
     def test_a_server_says_it_to_its_log_and_to_an_evaluation(
         self,

@@ -342,6 +342,7 @@ class _Bookkeeper:
         """Say what was cut of a sentence, and which tasks became one; all workers find it."""
         watch = self.sentences.setdefault(found.part, SentenceWatch(found.part))
         for line in watch.lines(found.reading, found.task):
+            self.folder.note_sentence(line)
             self.observer.on_warning(line)
 
     def _note_kind(self, kind: MachineKind | None) -> None:

@@ -116,7 +116,9 @@ class SentenceWatch:
             "a shorter sentence, or train with a higher limit where the policy's configuration has one."
         )
 
-    def _same(self, one: SentenceReading, other: SentenceReading) -> str:
+    def _same(self, *pair: SentenceReading) -> str:
+        # By their sentences: which of them a worker reads first is chance.
+        one, other = sorted(pair, key=lambda reading: reading.sentence)
         return (
             f"policy '{self._policy}' reads one and the same of two tasks, {self._named(one)} and "
             f"{self._named(other)}: {quoted(one.kept)}. It can distinguish them by what it sees alone. Use "

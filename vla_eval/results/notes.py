@@ -190,6 +190,7 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
         for note in (*_incomplete(run), *_continued_elsewhere(run), *_seen_in_training(run))
     ]
     shards = _absent_shards(runs)
+    own += _unique(line for run in runs for session in run.sessions for line in session.sentences)
     return _told_together(notes) + own + shards + _environment_differences(runs) + _recipe_differences(runs)
 
 

@@ -81,6 +81,7 @@ class Session:
         options: see `RunDescription`.
         environment_changes: how the environment differed from the one the run was started in.
         plan_changes: by what the run grew: more episodes, runs, policies, tasks or n_action_steps.
+        sentences: lines on instructions that a policy's tokenizer cut, or took for that of another task.
     """
 
     started_at: str
@@ -88,6 +89,7 @@ class Session:
     options: Mapping[str, JsonValue]
     environment_changes: tuple[Change, ...] = ()
     plan_changes: tuple[Change, ...] = ()
+    sentences: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +160,11 @@ class RunFile:
         *earlier, current = self.sessions
         noted = (*current.environment_changes, *(c for c in changes if c not in current.environment_changes))
         return replace(self, sessions=(*earlier, replace(current, environment_changes=noted)))
+
+    def with_sentence(self, line: str) -> "RunFile":
+        """Return this with a line on an instruction noted in the current session."""
+        *earlier, current = self.sessions
+        return replace(self, sessions=(*earlier, replace(current, sentences=(*current.sentences, line))))
 
 
 def run_changed(changes: Sequence[Change], where: Path, *, remedy: str) -> RunChangedError:
@@ -239,8 +246,9 @@ def _session_fields(session: Session) -> dict[str, Any]:  # Any: JSON
     data = _fields(session)
     for name in ("environment_changes", "plan_changes"):
         data[name] = [change._asdict() for change in data[name]]
-    if not session.plan_changes:
-        del data["plan_changes"]  # so that earlier versions read a run that never grew
+    for name in ("plan_changes", "sentences"):
+        if not data[name]:
+            del data[name]  # so that earlier versions read a run without them
     return data
 
 

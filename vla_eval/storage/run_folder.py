@@ -240,6 +240,17 @@ class RunFolder:
             updated.save(self.path)
             self._run_file = updated
 
+    def note_sentence(self, line: str) -> None:
+        """Record what a policy's tokenizer made of an instruction; tables quote it.
+
+        Raises:
+            StorageFullError: it could not be recorded.
+        """
+        if any(line in session.sentences for session in self._run_file.sessions):
+            return
+        self._run_file = self._run_file.with_sentence(line)
+        self._run_file.save(self.path)
+
     def close(self) -> None:
         """Close the files and let other processes in; a second call does nothing."""
         if self._episodes is not None:
