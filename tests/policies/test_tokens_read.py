@@ -146,7 +146,7 @@ def test_words_in_another_order_are_one_sentence_to_a_policy_that_reads_no_order
     tasks = {"A": one, "B": other, "C": third}
     lines = [line for task, own in tasks.items() for line in watch.lines(known[own], task)]
     (line,) = lines
-    assert f"{one!r} (A) and {other!r} (B): 'before blue red'" in line
+    assert f"{other!r} (B) and {one!r} (A): 'before blue red'" in line
     torch.testing.assert_close(encoder([one]), encoder([other]))  # sums in another order
 
 
