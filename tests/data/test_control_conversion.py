@@ -179,6 +179,7 @@ def test_a_mistyped_mode_or_the_dataset_s_own_is_one_message(
         ("--task", "RememberColor3-v0"),
         ("--state", "joints"),
         ("--image-size", "64"),
+        ("--image-size", "0"),
         ("--gripper", "0", "1"),
         ("--resample",),
         ("--clip-actions",),

@@ -134,3 +134,7 @@ def test_a_conversion_writes_what_was_read(good: Path, tmp_path: Path) -> None:
     assert [one["task"] for one in samples] == known.sentences
     assert [episode.n_steps for episode in facts.episodes] == list(LENGTHS)
     assert facts.is_checked and facts.converted == ()
+    are_images = good.name == "image"
+    assert [one.endswith("stored as images, which become video (lossy)") for one in facts.kept] == (
+        [True] if are_images else []
+    )

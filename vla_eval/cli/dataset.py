@@ -138,16 +138,17 @@ def _changes(args: argparse.Namespace) -> "Changes":
         resample=args.resample,
         clip_actions=args.clip_actions,
     )
-    flags = [flag for flag, value in _asked_for(args) if value]
+    flags = _asked_for(args)
     if args.to == "npz" and flags:
         raise RecipeError(f"{flags[0]}: the paper's layout is written as the source is. Remove it.")
     return changes
 
 
-def _asked_for(args: argparse.Namespace) -> list[tuple[str, object]]:
-    """Return the flags that change data, with their values."""
+def _asked_for(args: argparse.Namespace) -> list[str]:
+    """Return those of the flags that change data that are given."""
     names = ("--task", "--state", "--image-size", "--gripper", "--resample", "--clip-actions")
-    return [(name, getattr(args, name.strip("-").replace("-", "_"))) for name in names]
+    values = {name: getattr(args, name.strip("-").replace("-", "_")) for name in names}
+    return [name for name, value in values.items() if value is not None and value is not False]
 
 
 def _convert_control_mode(args: argparse.Namespace) -> int:
@@ -158,9 +159,8 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
     from vla_eval.errors import RecipeError
 
     action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
-    for flag, value in _asked_for(args):
-        if value:
-            raise RecipeError(f"{flag}: --control-mode keeps all else of the recording. Remove it.")
+    for flag in _asked_for(args):
+        raise RecipeError(f"{flag}: --control-mode keeps all else of the recording. Remove it.")
     from vla_eval.data.control_conversion import convert_control_mode
 
     with stop_on_signals() as stop:

@@ -50,6 +50,9 @@ def lerobot_source(root: Path) -> Source:
     numbers, remarks = _numbers(root, columns, features)
     cameras = LEROBOT_CAMERAS[layout]
     used = {*cameras, *numbers, *OF_LEROBOT, STATE_KEY}
+    stored = [camera for camera in cameras if camera not in dataset.meta.video_keys]
+    if stored:
+        remarks = (*remarks, f"{' and '.join(stored)}: stored as images, which become video (lossy)")
     files = [file for file in sorted(root.rglob("*")) if file.suffix in (".parquet", ".mp4", ".json")]
     return Source(
         path=root,
