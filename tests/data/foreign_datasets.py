@@ -119,6 +119,9 @@ Change = Callable[[Tables, Known, st.DataObject], None]
 CHANGES: dict[str, Change] = {}
 """Name -> what it does to the tables and to what is known of them."""
 LAST = (
+    "numbers_that_are_not_finite",
+    "vectors_of_another_length",
+    "tasks_in_another_order",
     "columns_that_are_renamed",
     "columns_that_are_missing",
     "cameras_of_other_names",
@@ -126,7 +129,13 @@ LAST = (
     "rows_that_are_missing",
     "episodes_that_are_missing",
 )
-"""After the others, which change values of rows and columns that these move."""
+"""After the others and in this order: they move or replace what the others change."""
+
+
+def in_order(names: list[str]) -> list[str]:
+    return sorted(names, key=lambda name: LAST.index(name) if name in LAST else -1)
+
+
 ASKED: Mapping[str, Changes] = {
     "nothing": Changes(),
     "clip": Changes(clip_actions=True),
@@ -158,7 +167,7 @@ def numbers_that_are_not_finite(tables: Tables, known: Known, data: st.DataObjec
     # pandas writes NaN as no value.
     known.refusals += [
         f"{place(row)}: {field_name}",
-        f"a value in each row of {name}, found none in row {row}",
+        f"a value in each row of {name}",
     ]
 
 
@@ -244,7 +253,7 @@ def columns_that_are_renamed(tables: Tables, known: Known, data: st.DataObject) 
 @change
 def columns_that_are_missing(tables: Tables, known: Known, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(["action", "observation.state", "timestamp", "task_index", "index"]))
-    tables.frames = tables.frames.drop(columns=name)
+    tables.frames = tables.frames.drop(columns=name, errors="ignore")
     known.refusals.append(name)
 
 

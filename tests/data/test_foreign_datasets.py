@@ -13,12 +13,12 @@ from tests.data.foreign_datasets import (
     ASKED,
     CHANGES,
     FIRSTS,
-    LAST,
     LENGTHS,
     N_FRAMES,
     Known,
     Tables,
     good_data,
+    in_order,
     level_of,
     write_good,
 )
@@ -72,7 +72,7 @@ def test_any_dataset_is_read_right_or_refused_with_the_place(good: Path, data: s
     tables, known = Tables(root), good_data()
     names = data.draw(st.lists(st.sampled_from(sorted(CHANGES)), max_size=2, unique=True), label="changes")
     asked = ASKED[data.draw(st.sampled_from(sorted(ASKED)), label="asked")]
-    for name in sorted(names, key=lambda name: name in LAST):
+    for name in in_order(names):
         CHANGES[name](tables, known, data)
     tables.write()
     known = expect(known, asked)
