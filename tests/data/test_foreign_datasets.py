@@ -63,7 +63,7 @@ def read(root: Path, asked: Changes) -> Source:
     return prepare(find_source(root), asked)[0]
 
 
-@settings(max_examples=N_PAIRS, suppress_health_check=list(HealthCheck), deadline=None)
+@settings(max_examples=N_PAIRS, derandomize=True, suppress_health_check=list(HealthCheck), deadline=None)
 @given(data=st.data())
 def test_any_dataset_is_read_right_or_refused_with_the_place(good: Path, data: st.DataObject) -> None:
     root = good.with_name("copy")
@@ -98,7 +98,7 @@ def test_any_dataset_is_read_right_or_refused_with_the_place(good: Path, data: s
 
 
 @pytest.mark.parametrize("name", sorted(CHANGES))
-@settings(max_examples=N_SINGLE, suppress_health_check=list(HealthCheck), deadline=None)
+@settings(max_examples=N_SINGLE, derandomize=True, suppress_health_check=list(HealthCheck), deadline=None)
 @given(data=st.data())
 def test_each_difference_alone_has_its_answer(good: Path, name: str, data: st.DataObject) -> None:
     root = good.with_name("copy")
