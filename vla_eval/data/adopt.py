@@ -14,12 +14,12 @@ from vla_eval.control_modes import EE_DELTA_POSE
 from vla_eval.data.check import check_videos, demonstrations_of, has_our_fields
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import require_sound
+from vla_eval.data.completeness import RECORDS
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.changes import other_sentences
 from vla_eval.data.foreign.lerobot_files import names_of
-from vla_eval.data.imported import IMPORT_FILE, ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE
+from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
 from vla_eval.data.mixing import write_statistics
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
@@ -38,7 +38,7 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
         DatasetError: it has such records already, has other fields than ours, or breaks a rule.
     """
     check_folder(root)
-    for file in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE):
+    for file in RECORDS:
         if (root / file).exists():
             raise DatasetError(
                 f"{root}: {file} is there: the dataset has its records, and `mikasa-vla dataset check` says "

@@ -13,14 +13,14 @@ from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data.checks.agreement import episodes_by_video
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import Answer, find_breaches, require_sound
-from vla_eval.data.completeness import check_complete
+from vla_eval.data.completeness import RECORDS, check_complete
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.foreign.lerobot_files import OF_LEROBOT, names_of
 from vla_eval.data.frame_cache import channels_first
-from vla_eval.data.imported import IMPORT_FILE, ImportFacts
+from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, DatasetFacts
+from vla_eval.data.manifest import DatasetFacts
 from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.tables import read_columns
@@ -76,43 +76,34 @@ def check(path: Path) -> CheckReport:
     if not (path / INFO_FILE).is_file():
         return _of_source(path, "")
     facts = _own_facts(path)
-    kind = "" if facts is None else _kind(facts)
     dataset = open_local_dataset(path)
-    videos = tuple(check_videos(path, dataset.meta))
-    if kind or has_our_fields(dataset.meta.features):
-        demonstrations = demonstrations_of(dataset)
-        said = (*videos, *_statistics(dataset, demonstrations), *_known_or_found(facts, demonstrations))
+    demonstrations = demonstrations_of(dataset)
+    found = (*check_videos(path, dataset.meta), *_statistics(dataset, demonstrations))
+    if facts is not None or has_our_fields(dataset.meta.features):
+        kind = "a LeRobotDataset with the fields of this project, without its records"
         return CheckReport(
             path=path,
-            kind=kind or "a LeRobotDataset with the fields of this project, without its records",
+            kind=kind if facts is None else _kind(facts),
             demonstrations=demonstrations,
-            said=said,
-            next_step="" if kind else f"mikasa-vla dataset adopt {path}",
+            said=(*found, *_known_or_found(facts, demonstrations)),
+            next_step=f"mikasa-vla dataset adopt {path}" if facts is None else "",
         )
+    kind = "a LeRobotDataset"
     try:
-        report = _of_source(path, "a LeRobotDataset")
+        report = _of_source(path, kind)
     except DatasetError as exc:
-        demonstrations = demonstrations_of(dataset)
-        said = (Said(answer="refused", sentence=str(exc)), *_breaches(demonstrations))
-        report = CheckReport(
-            path=path, kind="a LeRobotDataset", demonstrations=demonstrations, said=said, next_step=""
-        )
-    statistics = _statistics(dataset, demonstrations_of(dataset))
-    return CheckReport(
-        path=path,
-        kind=report.kind,
-        demonstrations=report.demonstrations,
-        said=(*videos, *statistics, *report.said),
-        next_step=report.next_step,
-    )
+        said = (*found, Said(answer="refused", sentence=str(exc)), *_breaches(demonstrations))
+        return CheckReport(path=path, kind=kind, demonstrations=demonstrations, said=said, next_step="")
+    return dataclasses.replace(report, said=(*found, *report.said))
 
 
 def demonstrations_of(dataset: Any) -> Demonstrations:  # Any: LeRobotDataset
     """Return what is checked of a dataset by the names in its own `meta/info.json`."""
     meta = dataset.meta
+    all_columns = read_columns(dataset.root)
     columns = {
         name: rows
-        for name, rows in read_columns(dataset.root).items()
+        for name, rows in all_columns.items()
         if name not in OF_LEROBOT and rows.dtype.kind in "biuf"
     }
     names = {name: names_of(meta.features[name]) for name in columns}
@@ -126,9 +117,7 @@ def demonstrations_of(dataset: Any) -> Demonstrations:  # Any: LeRobotDataset
         lengths=lengths,
         columns=columns,
         dims={name: known for name, known in names.items() if known},
-        sentences=tuple(
-            str(sentences[int(index)]) for index in read_columns(dataset.root, ("task_index",))["task_index"]
-        ),
+        sentences=tuple(str(sentences[int(index)]) for index in all_columns["task_index"]),
         action=next((spec for spec in CONTROL_MODES.values() if spec.dims == names.get(ACTION_KEY)), None),
         image_sizes_px={
             camera: channels_first(meta.features[camera])[1:]
@@ -180,12 +169,12 @@ def require_checked(dataset: Any, facts: Facts) -> None:  # Any: LeRobotDataset
 
 
 def _own_facts(root: Path) -> Facts | None:
-    """Return what a dataset of this project says of itself; None for others.
+    """Return the records of a dataset of this project; None for others.
 
     Raises:
         DatasetError: it is not complete, or its files are not what they were.
     """
-    is_ours = any((root / file).exists() for file in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE))
+    is_ours = any((root / file).exists() for file in RECORDS)
     return check_complete(root) if is_ours else None
 
 

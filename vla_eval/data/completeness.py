@@ -11,6 +11,9 @@ from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, DatasetFacts, F
 from vla_eval.data.mixture import MixtureFacts, read_mixture
 from vla_eval.errors import DatasetError
 
+RECORDS = (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE)
+"""One of them is in every dataset of this project, written last."""
+
 
 def check_complete(root: Path) -> DatasetFacts | ImportFacts | MixtureFacts:
     """Return what a dataset says of itself, after comparing all of its files with their digests.

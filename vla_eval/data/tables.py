@@ -5,7 +5,8 @@ addresses that a column of images, sounds or videos holds. So no other reader is
 gets tables that were read here (`lerobot_tables.py`). Knows nothing of lerobot.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any  # pyarrow is untyped
 
@@ -93,19 +94,24 @@ def read_columns(root: Path, only: Sequence[str] | None = None) -> Columns:
 
 def _as_array(column: Any) -> NDArray[np.generic]:  # Any: pyarrow.ChunkedArray
     """Return a column that `check_values` has seen, in the type in which it is stored."""
-    values, shape = column, [len(column)]
-    while True:
-        if isinstance(values.type, pa.BaseExtensionType):
-            values = pa.chunked_array([chunk.storage for chunk in values.chunks], values.type.storage_type)
-        if not pa.types.is_nested(values.type) or pa.types.is_struct(values.type):
-            break
-        flat = pc.list_flatten(values)
-        shape.append(len(flat) // len(values) if len(values) else 0)
-        values = flat
+    levels = list(_levels(column))
+    values = levels[-1]
     if not any(is_kind(values.type) for is_kind in PLAIN_NUMBERS):
         return np.asarray(column.to_pylist())
-    array: NDArray[np.generic] = values.to_numpy().reshape(shape)
+    inner = [len(after) // len(before) if len(before) else 0 for before, after in pairwise(levels)]
+    array: NDArray[np.generic] = values.to_numpy().reshape([len(column), *inner])
     return array
+
+
+def _levels(column: Any) -> Iterator[Any]:  # Any: pyarrow.ChunkedArray
+    """Yield a column, and what its lists hold, level by level, as plain types."""
+    while True:
+        if isinstance(column.type, pa.BaseExtensionType):
+            column = pa.chunked_array([chunk.storage for chunk in column.chunks], column.type.storage_type)
+        yield column
+        if not pa.types.is_nested(column.type) or pa.types.is_struct(column.type):
+            return
+        column = pc.list_flatten(column)
 
 
 def rows_of_episode(columns: Columns, episode_index: int) -> Columns:
@@ -136,23 +142,17 @@ def check_columns(path: Path, table: Any, names: Sequence[str]) -> None:  # Any:
 def check_values(path: Path, table: Any, names: Sequence[str]) -> None:  # Any: pyarrow.Table
     """Raise `DatasetError` where a row has no value, or a list is of another length than the others."""
     for name in names:
-        column, level = table[name], 0
-        while True:
+        for level, column in enumerate(_levels(table[name])):
             if column.null_count:
                 place = pc.index(pc.is_null(column), True).as_py() * table.num_rows // len(column)
                 found = f"none in row {place} ({column.null_count} values are missing)"
                 raise refused(path, f"a value in each row of {name}", found)
-            if isinstance(column.type, pa.BaseExtensionType):
-                column = pa.chunked_array(
-                    [chunk.storage for chunk in column.chunks], column.type.storage_type
-                )
             if not pa.types.is_nested(column.type) or pa.types.is_struct(column.type):
                 break
             lengths = pc.unique(pc.list_value_length(column)).to_pylist()
             if len(lengths) > 1:
                 found = f"lengths {', '.join(map(str, sorted(lengths)[:5]))}"
                 raise refused(path, f"lists of one length in {name}, level {level}", found)
-            column, level = pc.list_flatten(column), level + 1
 
 
 def refused(path: Path, expected: str, found: str) -> DatasetError:

@@ -16,7 +16,7 @@ from vla_eval.control_modes import ABSOLUTE_MODES
 from vla_eval.core import ImageArray
 from vla_eval.data.checks.demonstrated import Demonstrations, Numbers
 from vla_eval.data.checks.rules import FINITE, require_sound
-from vla_eval.data.foreign.episodes import PER_STEP, Pictures, Source, SourceEpisode
+from vla_eval.data.foreign.episodes import PER_STEP, CameraImages, Source, SourceEpisode
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, DONE_KEY, FPS, IMAGE_SIZE_PX, SUCCESS_KEY
 from vla_eval.tasks.spec import TaskSpec
@@ -165,7 +165,7 @@ def _resampled(episode: SourceEpisode, per_frame: Fraction, *, is_absolute: bool
         deltas[:, -1] = actions[last, -1] if n_frames else 0
         numbers[ACTION_KEY] = deltas.astype(np.float32)
 
-    def read_images() -> Pictures:
+    def read_images() -> CameraImages:
         base, wrist = episode.read_images()
         return base[latest], wrist[latest]
 
@@ -201,7 +201,7 @@ def _scale_images(source: Source, changes: Changes) -> tuple[Source, str]:
         if any(one != size for one in episode.image_sizes_px):
             return episode  # a rule refuses it
 
-        def read_images() -> Pictures:
+        def read_images() -> CameraImages:
             base, wrist = (_scaled(images, wanted) for images in episode.read_images())
             return base, wrist
 

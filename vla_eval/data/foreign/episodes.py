@@ -15,7 +15,7 @@ from vla_eval.features import ACTION_KEY, DONE_KEY, PROPRIO_KEYS, REWARD_KEY, ST
 from vla_eval.specs import ActionSpec
 
 Layout = Literal["npz_joints", "npz_proprio", "lerobot_mikasa", "lerobot_official", "lerobot_suite90"]
-Pictures = tuple[ImageArray, ImageArray]
+CameraImages = tuple[ImageArray, ImageArray]
 """Base and wrist camera: (T, H, W, 3) uint8 RGB."""
 
 SOURCE_MODES = {7: EE_DELTA_POSE, 8: JOINT_DELTA_POS}
@@ -52,7 +52,7 @@ class SourceEpisode:
     numbers: Mapping[str, Numbers]
     sentences: tuple[str | None, ...]
     image_sizes_px: tuple[tuple[int, int], tuple[int, int]]
-    read_images: Callable[[], Pictures]
+    read_images: Callable[[], CameraImages]
     seed: int | None = None
 
     @property

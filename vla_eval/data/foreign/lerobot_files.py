@@ -16,8 +16,8 @@ from vla_eval.data.foreign.episodes import (
     PER_STEP,
     SOURCE_MODES,
     SOURCE_PROPRIO_KEY,
+    CameraImages,
     Layout,
-    Pictures,
     Source,
     SourceEpisode,
 )
@@ -199,7 +199,7 @@ def _episode(
     )
 
 
-def _images(dataset: Any, rows: EpisodeRows, cameras: tuple[str, str]) -> Pictures:
+def _images(dataset: Any, rows: EpisodeRows, cameras: tuple[str, str]) -> CameraImages:
     base, wrist = (
         _decoded(dataset, rows, camera)
         if camera in dataset.meta.video_keys

@@ -22,7 +22,7 @@ from vla_eval.data.foreign.episodes import (
     NUMBER_NAMES,
     SOURCE_MODES,
     SOURCE_PROPRIO_KEY,
-    Pictures,
+    CameraImages,
     Source,
     SourceEpisode,
 )
@@ -127,7 +127,7 @@ def _arrays(path: Path, names: Sequence[str]) -> Arrays:
     return arrays
 
 
-def _images(path: Path) -> Pictures:
+def _images(path: Path) -> CameraImages:
     rgb = _arrays(path, [RGB])[RGB]
     base, wrist = np.ascontiguousarray(rgb[..., :3]), np.ascontiguousarray(rgb[..., 3:])
     return base, wrist
