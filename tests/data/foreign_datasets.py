@@ -117,7 +117,7 @@ class Tables:
 
 Change = Callable[[Tables, Known, st.DataObject], None]
 CHANGES: dict[str, Change] = {}
-"""Name -> what it does to the tables and to what is known of them."""
+"""Name -> a function that changes the tables and what a reader must find in them."""
 LAST = (
     "numbers_that_are_not_finite",
     "vectors_of_another_length",

@@ -65,19 +65,23 @@ def lerobots_patterns() -> list[str]:
     return [str(pattern) for pattern in ast.literal_eval(found)]
 
 
+def refusals(folder: Path) -> list[str]:
+    """Return what each door says that a checkpoint goes through; all must refuse it."""
+    messages = []
+    for door in (plan, lambda path: verify_checkpoint(path, CPU), lambda path: load_checkpoint(path, CPU)):
+        with pytest.raises(CheckpointError) as raised:
+            door(folder)
+        messages.append(str(raised.value))
+    return messages
+
+
 class TestNormalisationAmongTheWeights:
     def test_each_door_names_lerobots_command(self, act: Path, tmp_path: Path) -> None:
         folder = as_before_processors(act, tmp_path / "old one")
         named = f"migrate_policy_normalization --pretrained-path {shlex.quote(str(folder))} --output-dir NEW"
 
-        for door in (
-            plan,
-            lambda path: verify_checkpoint(path, CPU),
-            lambda path: load_checkpoint(path, CPU),
-        ):
-            with pytest.raises(CheckpointError) as raised:
-                door(folder)
-            assert named in str(raised.value) and "before its processors" in str(raised.value)
+        for message in refusals(folder):
+            assert named in message and "before its processors" in message
 
     def test_that_command_makes_a_checkpoint_with_the_actions_of_the_original(
         self, act: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -126,12 +130,6 @@ class TestMissingFiles:
         (missing,) = folder.glob(name)
         missing.unlink()
 
-        for door in (
-            plan,
-            lambda path: verify_checkpoint(path, CPU),
-            lambda path: load_checkpoint(path, CPU),
-        ):
-            with pytest.raises(CheckpointError) as raised:
-                door(folder)
-            assert str(raised.value).startswith(f"{missing}: there is no such file")
-            assert "pretrained_model" in str(raised.value) and "hf download" in str(raised.value)
+        for message in refusals(folder):
+            assert message.startswith(f"{missing}: there is no such file")
+            assert "pretrained_model" in message and "hf download" in message
