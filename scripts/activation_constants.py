@@ -1,7 +1,7 @@
 """Measure what small policies keep for the backward pass, as a constant per number that their layers handle.
 
-`finetune --dry-run` estimates memory with these constants (`vla_eval/training/sample_cost.py`). Networks of
-the recipes' sizes with random weights, on a CPU, in two minutes. What autograd saves is counted for two
+`finetune --dry-run` estimates memory with these constants (`vla_eval/training/cost/sample_cost.py`). Networks
+of the recipes' sizes with random weights, on a CPU, in two minutes. What autograd saves is counted for two
 batches; the difference is that of the samples alone. Other sizes show whether the constant is one.
 """
 
@@ -15,12 +15,12 @@ import torch
 from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 
+from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.policies.lerobot_loading import make_unfilled_policy
 from vla_eval.testing.random_checkpoint import plain_statistics, stand_in_config
 from vla_eval.testing.training_speed import random_samples
+from vla_eval.training.cost.sample_cost import SAVED_PER_LINEAR_OF, count
 from vla_eval.training.job import load_finetune_recipe
-from vla_eval.training.sample_cost import SAVED_PER_LINEAR_OF, count
 
 FEW, MORE = 1, 3  # samples
 SEQUENCE_RECIPES = (

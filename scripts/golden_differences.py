@@ -59,9 +59,9 @@ def _set_in_turn() -> Iterator[Precision]:
 
 
 def _tolerances() -> dict[str, Differences]:
-    from tests.policies.octo import octo_golden
-    from tests.policies.openvla import openvla_golden
-    from tests.policies.spatialvla import spatialvla_golden
+    from tests.models.octo import octo_golden
+    from tests.models.openvla import openvla_golden
+    from tests.models.spatialvla import spatialvla_golden
 
     return {
         "openvla_oft": {"actions": openvla_golden.TOLERANCE},
@@ -72,8 +72,8 @@ def _tolerances() -> dict[str, Differences]:
 
 def openvla_oft(device: str, dtype: torch.dtype) -> Differences:
     """Compare normalised actions; the head stays in float32, as the policy keeps it."""
-    from tests.policies.openvla import openvla_golden as golden
-    from vla_eval.policies.openvla.network import Inputs
+    from tests.models.openvla import openvla_golden as golden
+    from vla_eval.models.openvla.network import Inputs
 
     network = golden.network().to(device, dtype)
     network.action_head.float()
@@ -84,8 +84,8 @@ def openvla_oft(device: str, dtype: torch.dtype) -> Differences:
 
 def spatialvla(device: str, dtype: torch.dtype) -> Differences:
     """Compare logits of a prompt, and the tokens that follow it."""
-    from tests.policies.spatialvla import spatialvla_golden as golden
-    from vla_eval.policies.spatialvla.generation import generated_tokens
+    from tests.models.spatialvla import spatialvla_golden as golden
+    from vla_eval.models.spatialvla.generation import generated_tokens
 
     network, values = golden.network().to(device, dtype), golden.values()
     inputs = _moved(golden.inputs([[0]], golden.prompts(0)), device)
@@ -99,7 +99,7 @@ def spatialvla(device: str, dtype: torch.dtype) -> Differences:
 
 def octo(device: str, dtype: torch.dtype) -> Differences:
     """Compare the chunk that is sampled from stored noise; bfloat16 by autocast, as in a training."""
-    from tests.policies.octo import octo_golden as golden
+    from tests.models.octo import octo_golden as golden
 
     values, network = golden.values(), golden.make_network(golden.original_weights()).to(device)
     window, noise = _moved(golden.window(values, "w1"), device), golden.sampling_noise(values, "w1")

@@ -6,7 +6,7 @@ from typing import Any  # lerobot is untyped
 
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, LoraRecipe
 from vla_eval.testing.random_checkpoint import published_sizes
-from vla_eval.training.estimate import estimate, unfilled_model
+from vla_eval.training.cost.estimate import estimate, unfilled_model
 from vla_eval.training.job import load_finetune_recipe
 from vla_eval.training.lora import check_lora_targets
 

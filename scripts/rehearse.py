@@ -95,7 +95,7 @@ def convert_original(name: str, options: Options) -> Result:
 
     find_tests()
     from tests.testing import published_originals as originals
-    from vla_eval.policies.checkpoint import WEIGHTS_FILE
+    from vla_eval.checkpoints.files import WEIGHTS_FILE
     from vla_eval.testing.rehearsed import limit_bytes
 
     source, out = options.folder / "published", options.folder / "ours"

@@ -14,7 +14,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, ObservationWindow
 from vla_eval.envs.maniskill import ManiSkillEnv
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_oracle
+from vla_eval.policies.controls.scripted import make_oracle
 
 CAMERAS = ("base_camera", "hand_camera")
 # Steps of the phases: the cue, the delay, the reveal, the oracle on its way, and at its goal.

@@ -11,7 +11,7 @@ and meets no other front face on the way. Each search adds what it finds, with `
 
 Needs `pip install embreex`; takes some 10 minutes of one core:
 
-    python scripts/visible_triangles.py PATH/TO/d415.stl vla_eval/tasks/d415_visible.bin
+    python scripts/visible_triangles.py PATH/TO/d415.stl vla_eval/tasks/arm/d415_visible.bin
 """
 
 import argparse

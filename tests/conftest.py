@@ -28,9 +28,9 @@ worker_context(
     preload=(
         "vla_eval.envs.maniskill",
         "vla_eval.evaluation.worker",
-        "vla_eval.policies.lerobot",
-        "vla_eval.data.recording_worker",
-        "vla_eval.data.replay_worker",
+        "vla_eval.policies.lerobot.policy",
+        "vla_eval.data.recording.worker",
+        "vla_eval.data.replaying.worker",
     )
 )
 

@@ -27,7 +27,7 @@ from vla_eval.errors import (
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
-from vla_eval.tasks.layout import places_from_right
+from vla_eval.tasks.objects.layout import places_from_right
 
 TASK = "RememberColor3-v0"
 HORIZON = 60

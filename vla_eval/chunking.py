@@ -22,9 +22,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vla_eval.bounds import MAX_STEPS, check_bounds
 from vla_eval.core import ActionChunk, FloatArray
 from vla_eval.errors import RecipeError, SpecMismatchError
+from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

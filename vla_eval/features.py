@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vla_eval.bounds import MAX_STEPS
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.core import FloatArray, StepResult
 from vla_eval.errors import RecipeError, SpecMismatchError
+from vla_eval.strict.bounds import MAX_STEPS
 
 MAX_CRF = 63  # of AV1; H.264 takes up to 51
 FPS = 20  # control steps per second; every frame is one control step

@@ -6,11 +6,11 @@ import pytest
 
 from vla_eval.cli.main import build_parser, main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError
+from vla_eval.strict.decoding import decode
 
 EVAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"
 FINETUNE = "policy: act\ndataset: d\n"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from vla_eval.cli.episode_bar import EpisodeBar
-from vla_eval.cli.progress import load_text
+from vla_eval.cli.terminal.episode_bar import EpisodeBar
+from vla_eval.cli.terminal.progress import load_text
 from vla_eval.workers.load import Load, MachineLoad
 
 

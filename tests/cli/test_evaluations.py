@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vla_eval.cli import evaluations
+from vla_eval.cli.shared import evaluations
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import FolderInUseError
 from vla_eval.evaluation.evaluate import EvaluationSummary

@@ -16,8 +16,8 @@ import vla_eval.serving.server
 import vla_eval.training.finetune
 import vla_eval.workers.pool
 from tests.cli.hostile_arguments import LONG, Case, cases, parsers
-from vla_eval.cli.arguments import seeds_argument
 from vla_eval.cli.main import build_parser, main
+from vla_eval.cli.shared.arguments import seeds_argument
 from vla_eval.errors import VlaEvalError
 
 TASK = "RememberColor3-v0"

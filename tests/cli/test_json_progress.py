@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from vla_eval.chunking import ChunkingSpec
-from vla_eval.cli.json_progress import EvaluationLines, JsonLines, PhaseLines
 from vla_eval.cli.main import main
+from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines, PhaseLines
 from vla_eval.config.environment import EnvSettings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.plan import Plan

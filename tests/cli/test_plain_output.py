@@ -195,8 +195,8 @@ def test_lines_for_programs_hold_no_control_character(
 BARS = """
 import sys
 from tqdm import tqdm
-from vla_eval.cli.episode_bar import EpisodeBar
-from vla_eval.cli.streams import standard_streams
+from vla_eval.cli.terminal.episode_bar import EpisodeBar
+from vla_eval.cli.terminal.streams import standard_streams
 with standard_streams():
     bar = EpisodeBar()
     bar.begin(n_done=0, n_total=2, title="task\\x1b[2J")

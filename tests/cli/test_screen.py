@@ -11,7 +11,7 @@ import pytest
 
 from vla_eval.cli.list import print_rows
 from vla_eval.cli.main import FIRST_STEPS, main
-from vla_eval.cli.screen import folded, print_markdown, screen_width, wrapped
+from vla_eval.cli.terminal.screen import folded, print_markdown, screen_width, wrapped
 
 NOTE = "- success once, one run: 95 % Wilson interval over its episodes; `--wide` shows every column."
 TABLE = f"| task | note |\n| ---- | ---- |\n| a | {'b' * 120} |"

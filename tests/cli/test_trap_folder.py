@@ -200,7 +200,7 @@ def test_a_folder_that_pythonpath_names_is_searched_also_if_it_is_the_working_di
     """As docs/policies.md has it: by the command, and by the worker process."""
     (tmp_path / "my_policy.py").write_text(
         "import os\nfrom pathlib import Path\n"
-        "from vla_eval.policies.scripted import make_cue_blind\n"
+        "from vla_eval.policies.controls.scripted import make_cue_blind\n"
         "def make(context):\n"
         "    Path(__file__).with_name(f'made-by-{os.getpid()}').touch()\n"
         "    return make_cue_blind(context)\n"

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from vla_eval.config.decoding import decode, load_yaml
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.strict.decoding import decode, load_yaml
 
 MINIMAL = "name: x\ntasks: [RememberColor3-v0]\npolicies: [random]\n"
 

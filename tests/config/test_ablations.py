@@ -11,10 +11,10 @@ from vla_eval.cli.main import main
 from vla_eval.config.files import list_recipes, load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe, load_policy
-from vla_eval.config.renamed import warn_renamed
 from vla_eval.errors import UnknownNameError
-from vla_eval.evaluation.grid import gpu_hours, load_model_table
-from vla_eval.policies.octo.configuration_octo import MikasaOctoConfig
+from vla_eval.evaluation.model_table import gpu_hours, load_model_table
+from vla_eval.models.octo.configuration_octo import MikasaOctoConfig
+from vla_eval.strict.renamed import warn_renamed
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 
 BOTH = ["observation.images.base", "observation.images.wrist"]

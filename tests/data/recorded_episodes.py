@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.manifest import RecordedEpisode
+from vla_eval.data.recording.demonstrations import Attempt
 
 TASK = "RememberColor3-v0"
 

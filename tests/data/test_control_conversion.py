@@ -12,21 +12,21 @@ import pytest
 from tests.data.recorded_episodes import entry_of
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode
 from vla_eval.config.environment import EnvSettings
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, JOINT_DELTA_POS, JOINT_POS
 from vla_eval.core import Observation, ObservationWindow
-from vla_eval.data.changed_actions import copy_with_actions
-from vla_eval.data.converted_episode import AimFollower, convert_episode
 from vla_eval.data.dataset_folder import open_recorded
-from vla_eval.data.demonstrations import NoisyEnv, attempt
+from vla_eval.data.derived.changed_actions import copy_with_actions
+from vla_eval.data.derived.converted_episode import AimFollower, convert_episode
 from vla_eval.data.manifest import RecordedEpisode, decode_actions, encode_actions, read_facts, read_manifest
-from vla_eval.data.recording_plan import plan_recording
+from vla_eval.data.recording.demonstrations import NoisyEnv, attempt
+from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.tables import read_columns
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_oracle
+from vla_eval.policies.controls.scripted import make_oracle
+from vla_eval.strict.decoding import decode
 from vla_eval.training.dataset import training_dataset
 
 TASK = "RememberColor3-v0"

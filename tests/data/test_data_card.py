@@ -11,12 +11,12 @@ from PIL import Image
 
 from tests.data.failed_episodes import let_fail
 from vla_eval.cli.main import main
-from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
 from vla_eval.data.dataset_folder import check_dataset
-from vla_eval.data.dataset_summary import ActionStatistics
 from vla_eval.data.foreign.changes import Changes
 from vla_eval.data.foreign.convert import convert_to_lerobot, find_source
 from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.sharing.card import CARD_FILE, SHEET_FILE, write_card
+from vla_eval.data.sharing.summary import ActionStatistics
 from vla_eval.errors import DatasetError
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.synthetic import write_synthetic_dataset

@@ -10,16 +10,6 @@ import pytest
 from tests.data.recorded_episodes import entry_of
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart
-from vla_eval.data.demonstrations import (
-    ONE_BY_ONE,
-    Attempt,
-    NoisyEnv,
-    attempt,
-    replay_actions,
-    replay_attempt,
-    states_digest,
-)
-from vla_eval.data.episode_check import check_rows, check_states, psnr_db
 from vla_eval.data.manifest import (
     MIKASA_FOLDER,
     RECORDING_FILE,
@@ -31,12 +21,22 @@ from vla_eval.data.manifest import (
     read_facts,
     to_json,
 )
-from vla_eval.data.replay_report import keep_report, require_passed
+from vla_eval.data.recording.demonstrations import (
+    ONE_BY_ONE,
+    Attempt,
+    NoisyEnv,
+    attempt,
+    replay_actions,
+    replay_attempt,
+    states_digest,
+)
+from vla_eval.data.replaying.episode_check import check_rows, check_states, psnr_db
+from vla_eval.data.replaying.report import keep_report, require_passed
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import DatasetError, RecordingError
 from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, SUCCESS_KEY, proprioception
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_oracle
+from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings
 
 TASK = "RememberColor3-v0"
@@ -195,7 +195,7 @@ class TestEpisodeCheck:
 
 class TestReplayReport:
     def report(self, dataset: Path, **fields: Any) -> ReplayReport:
-        from vla_eval.data.replay_report import manifest_sha256
+        from vla_eval.data.replaying.report import manifest_sha256
 
         default = ReplayReport(
             passed=True,

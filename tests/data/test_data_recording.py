@@ -7,11 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
-from vla_eval.config.decoding import decode
 from vla_eval.config.files import list_recipes, load_recipe
-from vla_eval.data.demonstrations import Attempt
 from vla_eval.data.exact_statistics import count_levels, image_statistics, vector_statistics
-from vla_eval.data.seed_queue import SeedQueue
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.seed_queue import SeedQueue
 from vla_eval.errors import RecipeError, RecordingError
 from vla_eval.features import (
     ACTION_KEY,
@@ -22,6 +21,7 @@ from vla_eval.features import (
     proprioception,
     rotation_columns,
 )
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 
 TASK = "RememberColor3-v0"

@@ -12,10 +12,10 @@ import pytest
 from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundError
 
 from vla_eval.cli.main import main
-from vla_eval.data import hub
 from vla_eval.data.completeness import check_complete
-from vla_eval.data.hub import pull_dataset, push_dataset
 from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.sharing import hub
+from vla_eval.data.sharing.hub import pull_dataset, push_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.lock.switch import let_write
 from vla_eval.testing.synthetic import write_synthetic_dataset

@@ -11,8 +11,8 @@ from vla_eval.cli.main import main
 from vla_eval.config.environment import EnvSettings
 from vla_eval.data.foreign.changes import Changes
 from vla_eval.data.foreign.convert import convert_to_lerobot, find_source
-from vla_eval.data.initial_states import InitialState, InitialStates, read_initial_states
-from vla_eval.data.leak import check_leak
+from vla_eval.data.sharing.initial_states import InitialState, InitialStates, read_initial_states
+from vla_eval.data.sharing.leak import check_leak
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError
 from vla_eval.features import proprioception
@@ -53,7 +53,7 @@ def test_first_frames_decide_where_the_arm_always_begins_alike(seeds: range, fou
 def test_seeds_that_nothing_distinguishes_are_an_error_and_no_all_clear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("vla_eval.data.leak.psnr_db", lambda one, other: 100.0)
+    monkeypatch.setattr("vla_eval.data.sharing.leak.psnr_db", lambda one, other: 100.0)
     with pytest.raises(DatasetError, match="neither the arm's state nor the first frames distinguish"):
         check_leak(fake_dataset([50]), task=TASK, seeds=range(1, 4))
 

@@ -11,8 +11,8 @@ import torch
 from tests.data.second_task import SENTENCE, TASK, write_second_task
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
-from vla_eval.data.card import write_card
 from vla_eval.data.completeness import check_complete
+from vla_eval.data.derived.mixing import mix_datasets
 from vla_eval.data.manifest import (
     MIXTURE_FILE,
     RECORDING_FILE,
@@ -21,10 +21,10 @@ from vla_eval.data.manifest import (
     read_facts,
     write_entry,
 )
-from vla_eval.data.mixing import mix_datasets
 from vla_eval.data.mixture import read_mixture
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.replay_report import manifest_sha256
+from vla_eval.data.replaying.report import manifest_sha256
+from vla_eval.data.sharing.card import write_card
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, RecipeError
 from vla_eval.seeding import SeedRange

@@ -23,25 +23,25 @@ from torch.utils.data import DataLoader
 from tests.data.hostile_datasets import Bait, addresses, hostile_columns
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode
-from vla_eval.data import recording as recording_module
-from vla_eval.data import replay as replay_module
 from vla_eval.data.dataset_folder import check_dataset, open_recorded
-from vla_eval.data.decoded_frames import DecodedFramesDataset
-from vla_eval.data.demonstrations import Attempt
-from vla_eval.data.initial_states import read_initial_states
-from vla_eval.data.leak import check_leak
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
-from vla_eval.data.recording import RecordedDataset, record
-from vla_eval.data.recording_folder import LOCK_FILE, STATE_FOLDER
-from vla_eval.data.recording_jobs import AttemptJob, ShardJob
-from vla_eval.data.recording_plan import plan_recording
-from vla_eval.data.recording_worker import RecordingRunner
-from vla_eval.data.replay_report import require_passed
-from vla_eval.data.shard_writer import ShardWriter
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.folder import LOCK_FILE, STATE_FOLDER
+from vla_eval.data.recording.jobs import AttemptJob, ShardJob
+from vla_eval.data.recording.plan import plan_recording
+from vla_eval.data.recording.record import RecordedDataset, record
+from vla_eval.data.recording.record import record as recording_module
+from vla_eval.data.recording.shard_writer import ShardWriter
+from vla_eval.data.recording.worker import RecordingRunner
+from vla_eval.data.replaying import replay as replay_module
+from vla_eval.data.replaying.report import require_passed
+from vla_eval.data.sharing.initial_states import read_initial_states
+from vla_eval.data.sharing.leak import check_leak
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, RunFolderError
 from vla_eval.storage.durable import FolderLock
+from vla_eval.strict.decoding import decode
 from vla_eval.training import held_out
 from vla_eval.training.dataset import training_dataset
 from vla_eval.workers.inside import Heartbeat

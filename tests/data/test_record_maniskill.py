@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from vla_eval.cli.main import main
-from vla_eval.data import recording as recording_module
-from vla_eval.data import replay as replay_module
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.manifest import read_manifest
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.replay_report import require_passed
-from vla_eval.data.shard_writer import Format, create_dataset
+from vla_eval.data.recording.record import record as recording_module
+from vla_eval.data.recording.shard_writer import Format, create_dataset
+from vla_eval.data.replaying import replay as replay_module
+from vla_eval.data.replaying.report import require_passed
 from vla_eval.features import ACTION_NAMES, CAMERA_KEYS, STATE_NAMES, EncoderSettings, dataset_features
 from vla_eval.tasks.interface import ACTION, CAMERAS, states
 from vla_eval.tasks.remember import COLORS

@@ -6,7 +6,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.rewards import rewards_of
 from vla_eval.errors import DatasetError
 

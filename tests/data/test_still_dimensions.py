@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data import exact_statistics
-from vla_eval.data.card import write_card
 from vla_eval.data.exact_statistics import (
     RESOLUTION,
     about_still_dimensions,
@@ -22,9 +21,10 @@ from vla_eval.data.exact_statistics import (
     vector_statistics,
 )
 from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.sharing.card import write_card
 from vla_eval.features import ACTION_KEY, STATE_KEY, STATE_NAMES
-from vla_eval.policies.steps.normalization import Normalization, Normalizer, mask_all_but
-from vla_eval.policies.steps.step_names import STATISTICS
+from vla_eval.models.shared.normalization import Normalization, Normalizer, mask_all_but
+from vla_eval.models.shared.step_names import STATISTICS
 
 N_FRAMES = 1000
 MODES = [mode for mode in NormalizationMode if mode != NormalizationMode.IDENTITY]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.data.failed_episodes import let_fail
-from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.foreign.npz_files import read_npz
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.trajectories import Trajectories, Trajectory
+from vla_eval.data.sharing.trajectories import Trajectories, Trajectory
 
 
 @pytest.fixture

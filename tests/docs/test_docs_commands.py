@@ -17,11 +17,11 @@ import yaml
 from vla_eval.cli.main import VERBS, build_parser, main
 from vla_eval.cli.show import task_arguments
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import find_recipe, load_recipe
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.evaluation.grid import is_model_table, load_model_table
+from vla_eval.evaluation.model_table import is_model_table, load_model_table
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 

@@ -57,7 +57,7 @@ def test_arguments_of_another_type_are_refused(kwargs: dict[str, Any], message: 
 
 
 def test_a_missing_ycb_mug_is_an_error_and_never_a_question(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vla_eval.tasks.mug.ASSET_DIR", "nowhere")
+    monkeypatch.setattr("vla_eval.tasks.objects.mug.ASSET_DIR", "nowhere")
     monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked for a download"))
     with pytest.raises(MissingDependencyError, match="download_asset ycb"):
         make("ShellGameTouch-v0", mug="ycb")

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
+from vla_eval.strict.decoding import decode
 
 TASK = "RememberColor3-v0"
 SHORT = {"horizon_steps": 12, "cue_steps": 1, "delay_steps": 1}  # so that an episode takes a millisecond

@@ -11,7 +11,7 @@ import yaml
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import build_parser, main
-from vla_eval.cli.model_table import EVAL_FLAGS, FINETUNE_FLAGS
+from vla_eval.cli.shared.model_table import EVAL_FLAGS, FINETUNE_FLAGS
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, merge_fields
@@ -19,7 +19,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import FolderInUseError, VlaEvalError
-from vla_eval.evaluation.grid import (
+from vla_eval.evaluation.model_table import (
     describe_effort,
     evaluations,
     finetunings,
@@ -29,8 +29,8 @@ from vla_eval.evaluation.grid import (
     narrow,
 )
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_oracle
-from vla_eval.results.published import paper_figures
+from vla_eval.policies.controls.scripted import make_oracle
+from vla_eval.results.published.literature import paper_figures
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.finetune import FinetuneSummary
@@ -258,7 +258,7 @@ def test_processes_share_a_table_and_leave_each_other_alone(
         if name == "second":
             raise FolderInUseError(f"{folder}: another process")
         monkeypatch.setattr(  # the other process comes to an end with the third meanwhile
-            "vla_eval.cli.model_table._is_finished", lambda one: one.row.name in (*begun, "third")
+            "vla_eval.cli.shared.model_table._is_finished", lambda one: one.row.name in (*begun, "third")
         )
         return FinetuneSummary(out=folder, step=5, is_finished=True)
 

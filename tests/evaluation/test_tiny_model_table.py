@@ -9,7 +9,7 @@ import yaml
 from tests.evaluation import test_model_table
 from tests.evaluation.test_model_table import PAPER, TASK
 from vla_eval.cli.main import main
-from vla_eval.evaluation.grid import load_model_table
+from vla_eval.evaluation.model_table import load_model_table
 
 cache_of_its_own = test_model_table.cache_of_its_own
 small = test_model_table.small

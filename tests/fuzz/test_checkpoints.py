@@ -20,17 +20,17 @@ from lerobot.processor import ProcessorStepRegistry
 from safetensors.numpy import save_file
 
 from tests.fuzz.json_cases import accepted_or_refused
+from vla_eval.checkpoints.adapter_config import read_adapter_config
+from vla_eval.checkpoints.files import checkpoint_sha256
+from vla_eval.checkpoints.foreign_code import no_foreign_code
+from vla_eval.checkpoints.loading import LoadOptions, config_class, make_empty_policy, read_config
+from vla_eval.checkpoints.notes import normalization_notes
+from vla_eval.checkpoints.processors import register_steps
+from vla_eval.checkpoints.safe_processors import load_processor, resolve_step
+from vla_eval.checkpoints.saved_processor import check_paths, read_saved_processor
 from vla_eval.errors import VlaEvalError
-from vla_eval.policies.adapter_config import read_adapter_config
-from vla_eval.policies.checkpoint import checkpoint_sha256
-from vla_eval.policies.checkpoint_notes import normalization_notes
-from vla_eval.policies.empty_weights import empty_weights
-from vla_eval.policies.foreign_code import no_foreign_code
-from vla_eval.policies.lerobot_loading import LoadOptions, config_class, make_empty_policy, read_config
-from vla_eval.policies.lerobot_processors import register_steps
-from vla_eval.policies.processor_door import load_processor, resolve_step
+from vla_eval.models.shared.empty_weights import empty_weights
 from vla_eval.policies.recipe import load_policy_recipe
-from vla_eval.policies.saved_processor import check_paths, read_saved_processor
 
 CONFIG, PREPROCESSOR, ADAPTER = "config.json", "policy_preprocessor.json", "adapter_config.json"
 NASTY = st.sampled_from(

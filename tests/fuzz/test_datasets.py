@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.fuzz.json_cases import BYTES, VALUES, near
-from vla_eval.data.card import write_card
-from vla_eval.data.dataset_rrd import EpisodeWish, write_dataset_rrds
-from vla_eval.data.decoded_frames import DecodedFramesDataset
 from vla_eval.data.foreign.convert import find_source
-from vla_eval.data.initial_states import read_initial_states
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.sharing.card import write_card
+from vla_eval.data.sharing.initial_states import read_initial_states
+from vla_eval.data.sharing.rrd import EpisodeWish, write_dataset_rrds
 from vla_eval.errors import VlaEvalError
 from vla_eval.testing.synthetic import write_synthetic_dataset
 

@@ -34,7 +34,7 @@ from vla_eval.data.manifest import (
     to_json,
 )
 from vla_eval.data.mixture import MixtureFacts, MixtureSource, read_mixture
-from vla_eval.data.shard_writer import SHARD_EPISODES, shard_episodes
+from vla_eval.data.recording.shard_writer import SHARD_EPISODES, shard_episodes
 
 EMPTY = FileDigest(n_bytes=0, sha256="e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
 EPISODE = RecordedEpisode(

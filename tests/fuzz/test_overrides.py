@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from tests.fuzz.recipe_cases import FRAGMENTS, ODD_SCALARS, outcome, plain, yaml_text
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, to_data
 from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.strict.decoding import decode
 
 BASES: dict[type[Any], dict[str, Any]] = {
     EvalConfig: {"name": "x", "tasks": ["RememberColor3-v0"], "policies": ["random"]},
@@ -80,8 +80,8 @@ def test_a_command_answers_with_one_message(
         raise KeyboardInterrupt  # nothing is run here
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("vla_eval.cli.progress.evaluate_with_progress", begun)
-    monkeypatch.setattr("vla_eval.data.recording.record", begun)
+    monkeypatch.setattr("vla_eval.cli.terminal.progress.evaluate_with_progress", begun)
+    monkeypatch.setattr("vla_eval.data.recording.record.record", begun)
 
     code = main([*command, *(f"--set={override}" for override in overrides)])
 

@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from tests.fuzz.recipe_cases import changed_recipe, damaged_text, outcome, shipped, yaml_text
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.decoding import decode, load_yaml
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, Recipe, load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe
-from vla_eval.data.recording_plan import plan_recording
+from vla_eval.data.recording.plan import plan_recording
 from vla_eval.evaluation.fingerprint import fingerprint
-from vla_eval.evaluation.grid import ModelTable, finetunings, is_model_table
+from vla_eval.evaluation.model_table import ModelTable, finetunings, is_model_table
 from vla_eval.evaluation.plan import make_plan
+from vla_eval.strict.decoding import decode, load_yaml
 
 TASK = "RememberColor3-v0"
 FEW_EPISODES = 1000  # a longer plan takes seconds and is no other
@@ -103,7 +103,7 @@ class TestCommandLine:
         def begun(*_: object, **__: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("vla_eval.cli.progress.evaluate_with_progress", begun)
+        monkeypatch.setattr("vla_eval.cli.terminal.progress.evaluate_with_progress", begun)
 
     @given(text=changed_recipe("configs") | damaged_text("configs"))
     def test_a_command_answers_with_one_message(

@@ -23,8 +23,8 @@ from vla_eval.core import (
 )
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError
-from vla_eval.policies import scripted, shortcuts
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.controls import scripted, shortcuts
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.shipped_audit import STRICT
 from vla_eval.rollout import RolloutSettings, rollout

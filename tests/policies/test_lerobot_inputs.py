@@ -4,7 +4,7 @@ import numpy as np
 
 from vla_eval.core import Observation
 from vla_eval.features import STATE_KEY, proprioception
-from vla_eval.policies.lerobot_inputs import InputMap
+from vla_eval.policies.lerobot.inputs import InputMap
 
 
 def test_a_state_that_has_the_name_of_its_kind_is_taken_as_it_is() -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.policies import small_checkpoints
-from tests.policies.small_checkpoints import (
+from tests.checkpoints import small_checkpoints
+from tests.checkpoints.small_checkpoints import (
     FAKE,
     context_for,
     observation,
@@ -24,7 +24,7 @@ from tests.policies.small_checkpoints import (
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import Observation
 from vla_eval.envs.factory import make_env
-from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec
 from vla_eval.testing import check_policy

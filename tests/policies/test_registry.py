@@ -37,7 +37,7 @@ def test_entry_points_of_other_packages_are_adapters(module: str, monkeypatch: p
     monkeypatch.setattr(registry, "_points", lambda _group: (point, ours))
 
     assert policy_factory("theirs").__module__ == module
-    assert policy_factory("random").__module__ == "vla_eval.policies.scripted"
+    assert policy_factory("random").__module__ == "vla_eval.policies.controls.scripted"
 
 
 def test_an_unknown_adapter_is_refused_with_the_closest_name() -> None:

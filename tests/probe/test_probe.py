@@ -25,7 +25,7 @@ N = 9
 PLACE_MODULE = """
 from vla_eval.core import ActionChunk
 from vla_eval.oracles.hover import CUBES
-from vla_eval.policies.scripted_base import ScriptedPolicy, hold_rows
+from vla_eval.policies.controls.base import ScriptedPolicy, hold_rows
 
 class OnePlace(ScriptedPolicy):
     privileged = True

@@ -10,7 +10,7 @@ from tests.probe.test_quantities import record
 from vla_eval.cli.main import main
 from vla_eval.page.build import build_page
 from vla_eval.probe.choice_pairs import choice_pairs
-from vla_eval.probe.found import find_probes
+from vla_eval.probe.find_worlds import find_probes
 from vla_eval.probe.interventions import ProbeSettings, plan_probe
 from vla_eval.probe.page.sections import probe_sections
 from vla_eval.probe.report_text import probe_texts

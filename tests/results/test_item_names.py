@@ -2,11 +2,11 @@
 
 import pytest
 
-from vla_eval.tasks.item_names import COLOR_NAMES, SHAPE_NAMES, item_names
+from vla_eval.tasks.objects.item_names import COLOR_NAMES, SHAPE_NAMES, item_names
 
 
 def test_colors_and_shapes_are_called_as_the_simulator_builds_them() -> None:
-    from vla_eval.tasks.items import COLORS, SHAPES
+    from vla_eval.tasks.objects.items import COLORS, SHAPES
 
     assert tuple(color.name for color in COLORS) == COLOR_NAMES
     assert tuple(SHAPES) == SHAPE_NAMES

@@ -11,8 +11,8 @@ from tests.results.stored_runs import episodes, stored
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.page.build import build_page
-from vla_eval.results.published import Published, PublishedRate, load_published, paper_figures
-from vla_eval.results.published_table import published_side_tables
+from vla_eval.results.published.literature import Published, PublishedRate, load_published, paper_figures
+from vla_eval.results.published.table import published_side_tables
 from vla_eval.results.report import build_table, render
 
 BOARD = "leaderboard_mikasa"

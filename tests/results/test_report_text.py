@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.results.stored_runs import episode, episodes, stored
-from vla_eval.cli import output
 from vla_eval.cli import report as report_verb
+from vla_eval.cli.shared import output
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.results.report import FORMATS, Format, Table, build_table, render
 from vla_eval.results.table_formats import PRESETS

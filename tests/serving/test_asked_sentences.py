@@ -9,7 +9,7 @@ import pytest
 from tests.serving.served_policies import CountingPolicy, Running, frame, host
 from tests.serving.test_server import Client
 from vla_eval.core import EpisodeStart
-from vla_eval.policies.sentence_reading import SentenceReading
+from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.serving import asked_sentences
 from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.server import ServerOptions

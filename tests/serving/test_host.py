@@ -2,12 +2,12 @@
 
 import pytest
 
+from vla_eval.checkpoints.files import file_sha256
 from vla_eval.config.files import find_recipe
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
-from vla_eval.policies.checkpoint import file_sha256
+from vla_eval.policies.controls.scripted import HoldPolicy, RandomPolicy
 from vla_eval.policies.registry import POLICIES, PRIVILEGED
-from vla_eval.policies.scripted import HoldPolicy, RandomPolicy
 from vla_eval.serving.host import HostOptions, host_policy
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.data.recording_folder import RecordingFolder
+from vla_eval.data.recording.folder import RecordingFolder
 from vla_eval.errors import RecipeError
 from vla_eval.storage.run_file import RunDescription
 from vla_eval.storage.starting import FolderStart

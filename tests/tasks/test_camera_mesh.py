@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_eval.tasks.camera_mesh import RECORD, read_binary_stl, visible, without_hidden, write_binary_stl
-from vla_eval.tasks.robots import _CAMERA_MESH, _PANDA_DIR
+from vla_eval.tasks.arm.camera_mesh import RECORD, read_binary_stl, visible, without_hidden, write_binary_stl
+from vla_eval.tasks.arm.robots import _CAMERA_MESH, _PANDA_DIR
 
 N_TRIANGLES = 425_160  # of d415.stl, as its header says
 

@@ -18,7 +18,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.probe.views import APPEARANCES
 from vla_eval.task_state import Phase
 from vla_eval.tasks.appearance import turned_hue
-from vla_eval.tasks.items import COLORS
+from vla_eval.tasks.objects.items import COLORS
 
 SEED = 2
 LATE = 2

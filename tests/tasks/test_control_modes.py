@@ -12,7 +12,7 @@ from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_oracle
+from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import env_spec

@@ -7,7 +7,7 @@ import pytest
 
 from tests.tasks.made_tasks import make
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.interference import delay_motion
+from vla_eval.tasks.arm.interference import delay_motion
 from vla_eval.tasks.memory_env import PARK_X_M
 
 SEED = 2

@@ -7,7 +7,6 @@ import pytest
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
-from vla_eval.config.decoding import decode
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import EpisodeStart
@@ -15,9 +14,10 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import TaskArgumentError, UnknownNameError
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_cue_blind, make_oracle
+from vla_eval.policies.controls.scripted import make_cue_blind, make_oracle
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.storage.run_folder import read_run
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, task_spec
 from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.spec import total_cue_steps

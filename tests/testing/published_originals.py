@@ -17,15 +17,15 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from tests.policies.octo.tiny_octo import GOLDEN as GOLDEN_OCTO
-from tests.policies.original_names import openvla_names, spatialvla_names
-from vla_eval.policies.conversion import octo, openvla, spatialvla
-from vla_eval.policies.lerobot_loading import make_unfilled_policy
-from vla_eval.policies.octo import flax_names
-from vla_eval.policies.spatialvla import described as spatialvla_files
-from vla_eval.policies.spatialvla.action_grid import AXES, uniform_grid
-from vla_eval.policies.spatialvla.sizes import NetworkSizes
-from vla_eval.policies.weight_file import write_weights
+from tests.models.octo.tiny_octo import GOLDEN as GOLDEN_OCTO
+from tests.models.original_names import openvla_names, spatialvla_names
+from vla_eval.checkpoints.conversion import octo, openvla, spatialvla
+from vla_eval.checkpoints.conversion import spatialvla_described as spatialvla_files
+from vla_eval.checkpoints.loading import make_unfilled_policy
+from vla_eval.models.octo import flax_names
+from vla_eval.models.shared.weight_file import write_weights
+from vla_eval.models.spatialvla.action_grid import AXES, uniform_grid
+from vla_eval.models.spatialvla.sizes import NetworkSizes
 from vla_eval.testing.random_checkpoint import random_parts
 
 SHARD_BYTES = 5_000_000_000  # of a file of a published checkpoint, at most

@@ -13,7 +13,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWind
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import ConformanceError
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.scripted import make_hold, make_random
+from vla_eval.policies.controls.scripted import make_hold, make_random
 from vla_eval.specs import PolicySpec
 from vla_eval.testing import check_env, check_policy, check_task
 

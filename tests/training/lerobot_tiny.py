@@ -9,7 +9,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 
 from tests.training.tiny_trainings import TINY_ACT
-from vla_eval.policies.lerobot_loading import config_class
+from vla_eval.checkpoints.loading import config_class
 from vla_eval.testing import tiny_models
 
 PALIGEMMA = {**tiny_models.TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": 4}

@@ -17,11 +17,11 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart, FloatArray, ImageArray, StepResult
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.shard_writer import new_dataset
+from vla_eval.data.recording.shard_writer import new_dataset
 from vla_eval.envs.fake import M_PER_STEP, FakeEnv
 from vla_eval.features import CAMERA_KEYS, EncoderSettings, dataset_features, frame_values
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training import job as job_module
 from vla_eval.training.dataset import TrainingDataset

@@ -16,15 +16,15 @@ from tests.data.second_task import write_second_task
 from tests.serving.served_policies import Running
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, act, pi0
+from vla_eval.checkpoints.files import FACTS_FILE, find_checkpoint, read_facts, write_facts
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig, HeldOutConfig
 from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.derived.mixing import mix_datasets
 from vla_eval.data.manifest import RECORDING_FILE, write_entry
 from vla_eval.data.manifest import read_facts as read_manifest_facts
-from vla_eval.data.mixing import mix_datasets
 from vla_eval.errors import SpecMismatchError
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.policies.checkpoint import FACTS_FILE, find_checkpoint, read_facts, write_facts
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.serving.server import ServerOptions
 from vla_eval.testing.tiny_models import tiny_paligemma, tiny_worker_main

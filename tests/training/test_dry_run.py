@@ -12,11 +12,11 @@ from tests.training import tiny_trainings
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.training import dry_run
+from vla_eval.training.cost.estimate import ASSUMED_STEPS, RateWatch, estimate, unfilled_model
+from vla_eval.training.cost.sample_cost import SAVED_PER_LINEAR, count, sample_cost
 from vla_eval.training.dry_run import DryRunOptions, assumed_config, describe_finetuning
-from vla_eval.training.estimate import ASSUMED_STEPS, RateWatch, estimate, unfilled_model
 from vla_eval.training.finetune import finetune
 from vla_eval.training.request import load_finetune_recipe
-from vla_eval.training.sample_cost import SAVED_PER_LINEAR, count, sample_cost
 
 offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own
 GEMMA_EMBEDDINGS = 257_152 * 2_048

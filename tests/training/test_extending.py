@@ -21,8 +21,8 @@ from tests.training.tiny_trainings import act
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import TrainingError
-from vla_eval.policies.openvla.configuration_openvla import StepDecaySchedulerConfig
-from vla_eval.policies.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
+from vla_eval.models.openvla.configuration_openvla import StepDecaySchedulerConfig
+from vla_eval.models.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
 from vla_eval.training.extension import first_other_rate
 from vla_eval.training.finetune import finetune
 from vla_eval.training.request import finished_run

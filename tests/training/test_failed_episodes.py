@@ -10,7 +10,7 @@ import torch
 from tests.data.failed_episodes import let_fail
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import act
-from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.errors import DatasetError, RecipeError, TrainingError
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune

@@ -18,17 +18,17 @@ from safetensors.torch import load_file, save_file
 
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, act, context, pi0
+from vla_eval.checkpoints.files import WEIGHTS_FILE, TrainingFacts, find_checkpoint, read_facts, write_facts
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.data import exact_statistics
-from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, TrainingError
 from vla_eval.features import STATE_NAMES
-from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, find_checkpoint, read_facts, write_facts
-from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import SeedRange

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
+from vla_eval.checkpoints.files import checkpoint_sha256, find_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.policies.checkpoint import checkpoint_sha256, find_checkpoint
 from vla_eval.storage.run_folder import read_run
 from vla_eval.testing.tiny_models import (
     TINY_POLICY,

@@ -13,12 +13,12 @@ import torch
 from safetensors.torch import load_file
 
 from tests.training import tiny_trainings
+from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
 from vla_eval.evaluation.evaluate import evaluate
-from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.storage.run_folder import read_run
 from vla_eval.training import held_out as held_out_module
 from vla_eval.training.dataset import training_dataset

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.training.tiny_trainings import act, finetune_losses
-from vla_eval.policies.checkpoint import find_checkpoint, step_folders
+from vla_eval.checkpoints.files import find_checkpoint, step_folders
 from vla_eval.training.run_folder import NO_LINKS, newest_checkpoint, point
 
 

@@ -16,7 +16,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 
-from tests.policies.small_checkpoints import (
+from tests.checkpoints.small_checkpoints import (
     FAKE,
     context_for,
     observation,
@@ -26,15 +26,15 @@ from tests.policies.small_checkpoints import (
     with_features,
 )
 from tests.training.lerobot_tiny import TINY, Tiny, lerobots_types
+from vla_eval.checkpoints.loading import LoadOptions, make_empty_policy
+from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED
+from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, MissingDependencyError, SpecMismatchError, VlaEvalError
-from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, make_empty_policy
-from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED
+from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
-from vla_eval.policies.verify import verify_checkpoint
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing import check_policy
 from vla_eval.testing.tiny_models import VOCABULARY, write_tiny_tokenizer

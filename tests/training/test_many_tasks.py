@@ -13,14 +13,14 @@ from tests.data.second_task import SENTENCE, write_second_task
 from tests.data.second_task import TASK as SECOND
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, context
+from vla_eval.checkpoints.files import find_checkpoint, read_facts
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
-from vla_eval.data.mixing import mix_datasets
+from vla_eval.data.derived.mixing import mix_datasets
 from vla_eval.envs.factory import make_env
-from vla_eval.policies.checkpoint import find_checkpoint, read_facts
-from vla_eval.policies.lerobot import make_lerobot
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dry_run import DryRunOptions, describe_finetuning
 from vla_eval.training.finetune import finetune

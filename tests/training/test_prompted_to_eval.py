@@ -9,19 +9,19 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.policies.tiny_prompted import BASE, BOTH, OPENVLA, SPATIALVLA, WRIST, Ported
+from tests.models.tiny_prompted import BASE, BOTH, OPENVLA, SPATIALVLA, WRIST, Ported
+from vla_eval.checkpoints.files import ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE
+from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
+from vla_eval.checkpoints.merging import merge_adapter
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, SpecMismatchError
-from vla_eval.policies.checkpoint import ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions, load_checkpoint
-from vla_eval.policies.merging import merge_adapter
-from vla_eval.policies.openvla_paper import make_openvla
+from vla_eval.policies.lerobot.openvla_paper import make_openvla
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
 

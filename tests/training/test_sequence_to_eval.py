@@ -13,15 +13,15 @@ from torch import nn
 
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import TASK, context
+from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError
-from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.sequence.sizes import CORES, ElmurOptions, TransformerXLOptions
+from vla_eval.models.sequence.sizes import CORES, ElmurOptions, TransformerXLOptions
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
 

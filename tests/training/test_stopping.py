@@ -12,8 +12,8 @@ import pytest
 from tests.training import tiny_trainings
 from tests.training.test_held_out import metrics, same_weights
 from tests.training.tiny_trainings import SHORT, TINY_ACT, act
+from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.cli.main import main
-from vla_eval.policies.checkpoint import find_checkpoint
 from vla_eval.training import loop
 from vla_eval.training.finetune import finetune
 

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from vla_eval.config.finetuning import FinetuneConfig
-from vla_eval.policies.lerobot_device import autocast
-from vla_eval.policies.memory.action_head import ActionHead
-from vla_eval.policies.octo.diffusion_head import DiffusionHead
-from vla_eval.policies.octo.transformer import OctoTransformer
-from vla_eval.policies.openvla.heads import ProprioProjector, ResidualMlp
-from vla_eval.policies.openvla.network import OpenVLANetwork
-from vla_eval.policies.spatialvla import ego3d
-from vla_eval.policies.spatialvla.network import SpatialVLANetwork
+from vla_eval.models.memory.action_head import ActionHead
+from vla_eval.models.octo.diffusion_head import DiffusionHead
+from vla_eval.models.octo.transformer import OctoTransformer
+from vla_eval.models.openvla.heads import ProprioProjector, ResidualMlp
+from vla_eval.models.openvla.network import OpenVLANetwork
+from vla_eval.models.spatialvla import ego3d
+from vla_eval.models.spatialvla.network import SpatialVLANetwork
+from vla_eval.policies.lerobot.device import autocast
 from vla_eval.training.finetune import finetune
 from vla_eval.training.loop import autocast_dtype
 

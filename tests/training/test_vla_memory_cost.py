@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from tests.policies.vla_memory.tiny_vlas import FAMILIES, batch_of, made
+from tests.models.vla_memory.tiny_vlas import FAMILIES, batch_of, made
 from tests.testing.script_files import load_script
-from vla_eval.training.sample_cost import count, sample_cost
-from vla_eval.training.stages import EPISODE_STEPS, STAGES, stage_of
+from vla_eval.training.cost.network_stages import EPISODE_STEPS, STAGES, stage_of
+from vla_eval.training.cost.sample_cost import count, sample_cost
 
 TOKENS = {"memory_tokens": 3, "token_stride": 4, "token_segments": 2}
 

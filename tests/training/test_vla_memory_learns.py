@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.policies.vla_memory.tiny_vlas import fields_of, tiny
+from tests.models.vla_memory.tiny_vlas import fields_of, tiny
 from tests.training import tiny_trainings
 from tests.training.remembered_toy import choices, trained, write_demonstrations
 from vla_eval.testing.tiny_models import write_tiny_tokenizer

@@ -11,19 +11,19 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.policies.vla_memory.tiny_vlas import TINY_SMOLVLA
+from tests.models.vla_memory.tiny_vlas import TINY_SMOLVLA
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import SHORT, TASK, context, pi0
+from vla_eval.checkpoints.files import find_checkpoint
+from vla_eval.checkpoints.loading import LoadOptions
+from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart, FloatArray
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError
-from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
-from vla_eval.policies.lerobot_loading import LoadOptions
-from vla_eval.policies.verify import verify_checkpoint
+from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma, write_tiny_smolvlm
 from vla_eval.training.finetune import finetune

@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vla_eval.training.waiting import about_decisions, n_with_decisions
+from vla_eval.training.decision_frames import about_decisions, n_with_decisions
 
 WAITS_THEN_MOVES = [0.0, 0.0, 0.0, 0.5, 0.9]
 MOVES_AT_ONCE = [0.1, 0.2, 0.3]

@@ -14,7 +14,6 @@ from rerun.experimental import RrdReader
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
-from vla_eval.config.decoding import decode
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
@@ -28,6 +27,7 @@ from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.storage.run_folder import read_run
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.interface import env_spec
 from vla_eval.viz.arm_figure import arm_points_m
 from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX

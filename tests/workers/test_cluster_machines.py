@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from vla_eval.errors import ClusterError, MissingDependencyError, RecipeError
-from vla_eval.evaluation.needed import needed_files
-from vla_eval.policies.run_seeds import load_policy_entries
+from vla_eval.evaluation.needed_files import needed_files
+from vla_eval.policies.entries import load_policy_entries
 from vla_eval.workers import parcel as parcel_module
 from vla_eval.workers.cluster import connect, machines
 from vla_eval.workers.cluster.connect import check_address
 from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machines
 from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections, receive
-from vla_eval.workers.needed import Needed
+from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.parcel import PackedFolder, pack, unpack
 
 HERE = NodeFacts(

@@ -67,7 +67,7 @@ import os, sys, time
 from multiprocessing import forkserver
 from pathlib import Path
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.config.decoding import decode
+from vla_eval.strict.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 
 evaluate_module.collect_environment = lambda: {"machine": "test"}

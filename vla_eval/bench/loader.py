@@ -14,7 +14,7 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 import torch
 
-from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import ConformanceError
 from vla_eval.features import ACTION_KEY

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import (
+from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
     add_json_progress,
@@ -13,11 +13,11 @@ from vla_eval.cli.arguments import (
     add_verb,
     add_workers,
 )
-from vla_eval.cli.cluster import add_cluster, backend_of
-from vla_eval.config.decoding import decode
+from vla_eval.cli.shared.cluster import add_cluster, backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.storage.shard import shard_folder
+from vla_eval.strict.decoding import decode
 
 DESCRIPTION = """Run the oracle and the controls that need no memory on every task, and name the shortcuts by
 which a task can be won: without acting, by touching one candidate after another, by staying at the cue,
@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
-    from vla_eval.cli.evaluations import evaluate_each
-    from vla_eval.cli.output import print_in, print_shard
+    from vla_eval.cli.shared.evaluations import evaluate_each
+    from vla_eval.cli.shared.output import print_in, print_shard
 
     configs = _configs(args)
     out = shard_folder(args.out, args.shard)

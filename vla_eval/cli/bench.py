@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from vla_eval.bounds import MAX_STEPS, check_bounds
+from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
 SYNTHETIC = "synthetic"
 EAGER = ""  # the baseline of --against-official without an interpreter

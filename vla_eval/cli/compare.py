@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import add_verb
-from vla_eval.cli.output import FORMATS, print_in
-from vla_eval.cli.screen import screen_width
+from vla_eval.cli.shared.arguments import add_verb
+from vla_eval.cli.shared.output import FORMATS, print_in
+from vla_eval.cli.terminal.screen import screen_width
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
 chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired

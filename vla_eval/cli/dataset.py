@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import add_workers, seeds_argument
+from vla_eval.cli.shared.arguments import add_workers, seeds_argument
 from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -152,16 +152,16 @@ def _asked_for(args: argparse.Namespace) -> list[str]:
 
 
 def _convert_control_mode(args: argparse.Namespace) -> int:
-    from vla_eval.cli.progress import stop_on_signals
     from vla_eval.cli.record import describe
-    from vla_eval.cli.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import stop_on_signals
+    from vla_eval.cli.terminal.recording_progress import RecordingProgress
     from vla_eval.control_modes import action_spec
     from vla_eval.errors import RecipeError
 
     action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
     for flag in _asked_for(args):
         raise RecipeError(f"{flag}: --control-mode keeps all else of the recording. Remove it.")
-    from vla_eval.data.control_conversion import convert_control_mode
+    from vla_eval.data.derived.control_conversion import convert_control_mode
 
     with stop_on_signals() as stop:
         progress = RecordingProgress(stop)
@@ -186,7 +186,7 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
 
 
 def _mix(args: argparse.Namespace) -> int:
-    from vla_eval.data.mixing import mix_datasets
+    from vla_eval.data.derived.mixing import mix_datasets
 
     facts = mix_datasets(args.datasets, args.out)
     for source in facts.sources:
@@ -248,8 +248,8 @@ def _print_sentences(facts: "ImportFacts") -> None:
 
 def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.config.dataset import EVALUATION_SEEDS
-    from vla_eval.data.initial_states import read_initial_states
-    from vla_eval.data.leak import check_leak
+    from vla_eval.data.sharing.initial_states import read_initial_states
+    from vla_eval.data.sharing.leak import check_leak
     from vla_eval.results.table_formats import markdown_table
     from vla_eval.tasks.catalog import task_spec
 
@@ -282,7 +282,7 @@ def _check_leak(args: argparse.Namespace) -> int:
 
 
 def _card(args: argparse.Namespace) -> int:
-    from vla_eval.data.card import CARD_FILE, SHEET_FILE, write_card
+    from vla_eval.data.sharing.card import CARD_FILE, SHEET_FILE, write_card
 
     write_card(args.dataset, license_id=args.license)
     print(f"{args.dataset / CARD_FILE}\n{args.dataset / SHEET_FILE}")
@@ -290,14 +290,14 @@ def _card(args: argparse.Namespace) -> int:
 
 
 def _push(args: argparse.Namespace) -> int:
-    from vla_eval.data.hub import push_dataset
+    from vla_eval.data.sharing.hub import push_dataset
 
     print(push_dataset(args.dataset, args.repo_id, private=args.private))
     return 0
 
 
 def _pull(args: argparse.Namespace) -> int:
-    from vla_eval.data.hub import pull_dataset
+    from vla_eval.data.sharing.hub import pull_dataset
 
     pulled = pull_dataset(args.repo_id, args.out, revision=args.revision)
     print(f"{args.out}: commit {pulled.commit}, complete and checked")

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import (
+from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
     add_dry_run,
@@ -19,16 +19,16 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
-from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
-from vla_eval.cli.output import add_table_arguments
-from vla_eval.config.decoding import decode, set_field
+from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.output import add_table_arguments
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.evaluation.grid import is_model_table
+from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.storage.shard import shard_folder
-from vla_eval.workers.needed import Needed
+from vla_eval.strict.decoding import decode, set_field
+from vla_eval.workers.needed_files import Needed, shared_folder
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -142,17 +142,23 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
-    from vla_eval.cli.evaluations import evaluate_one
-    from vla_eval.cli.output import check_baseline, check_table_arguments, hint_merge, print_table, write_html
-    from vla_eval.cli.progress import stop_on_signals
+    from vla_eval.cli.shared.evaluations import evaluate_one
+    from vla_eval.cli.shared.output import (
+        check_baseline,
+        check_table_arguments,
+        hint_merge,
+        print_table,
+        write_html,
+    )
+    from vla_eval.cli.terminal.progress import stop_on_signals
     from vla_eval.evaluation.evaluate import RUNS_FOLDER, default_run_folder
     from vla_eval.evaluation.inference_choice import with_inference
-    from vla_eval.evaluation.needed import needed_files
-    from vla_eval.policies.run_seeds import load_policy_entries
+    from vla_eval.evaluation.needed_files import needed_files
+    from vla_eval.policies.entries import load_policy_entries
     from vla_eval.storage.run_folder import read_run
 
     if args.config is not None and is_model_table(args.config):
-        from vla_eval.cli.model_table import evaluate_table
+        from vla_eval.cli.shared.model_table import evaluate_table
 
         return evaluate_table(args)
     if args.tiny:

@@ -5,7 +5,7 @@ import contextlib
 import sys
 from typing import Any
 
-from vla_eval.cli.arguments import (
+from vla_eval.cli.shared.arguments import (
     add_dry_run,
     add_old_flag,
     add_overrides,
@@ -16,12 +16,12 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
-from vla_eval.cli.cluster import add_cluster
-from vla_eval.config.decoding import decode, set_field
+from vla_eval.cli.shared.cluster import add_cluster
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.grid import is_model_table
+from vla_eval.evaluation.model_table import is_model_table
+from vla_eval.strict.decoding import decode, set_field
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 
@@ -94,7 +94,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 def run(args: argparse.Namespace) -> int:
     """Fine-tune; lines for a person go to standard error, the checkpoint's folder to standard output."""
     if args.config is not None and is_model_table(args.config):
-        from vla_eval.cli.model_table import describe_table, finetune_table
+        from vla_eval.cli.shared.model_table import describe_table, finetune_table
 
         if args.dry_run:
             with contextlib.redirect_stdout(sys.stderr):
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     # Here and not above: what is finished need not wait for torch.
     from tqdm import tqdm
 
-    from vla_eval.cli.progress import ANSWER_TO_STOP, stop_on_signals
+    from vla_eval.cli.terminal.progress import ANSWER_TO_STOP, stop_on_signals
     from vla_eval.training.finetune import finetune
 
     # Some of lerobot's policies print while they are made.

@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.screen import NARROWEST, filled, screen_width
+from vla_eval.checkpoints.bases import FIRST_TRAININGS
+from vla_eval.cli.terminal.screen import NARROWEST, filled, screen_width
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
@@ -13,8 +14,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import instruction_for, load_prompts
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.grid import ModelTable, is_model_table
-from vla_eval.policies.bases import FIRST_TRAININGS
+from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.tasks.catalog import FAMILIES, SUITES

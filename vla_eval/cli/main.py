@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
 from vla_eval import __version__
-from vla_eval.cli.streams import standard_streams
+from vla_eval.cli.terminal.streams import standard_streams
 from vla_eval.errors import MAX_SHOWN, VlaEvalError, did_you_mean
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
 from vla_eval.workers.children import leave_working_directory

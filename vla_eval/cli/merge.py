@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS, add_allow_environment_change, add_verb
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, add_allow_environment_change, add_verb
 from vla_eval.errors import MergeError
 from vla_eval.storage.folders import not_a_run_folder
 from vla_eval.storage.run_file import RUN_FILE
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         VlaEvalError: shards that do not fit together, or are not all there.
     """
     # Here and not above, as all that follows: `mikasa-vla --help` need not wait for it.
-    from vla_eval.data.recording_folder import STATE_FOLDER
+    from vla_eval.data.recording.folder import STATE_FOLDER
 
     recordings = [path for path in args.runs if (path / STATE_FOLDER / RUN_FILE).is_file()]
     if not recordings:
@@ -79,7 +79,7 @@ def _merge_runs(args: argparse.Namespace) -> int:
 
 
 def _merge_recordings(args: argparse.Namespace) -> int:
-    from vla_eval.data.merging import merge_recordings, write_recording
+    from vla_eval.data.recording.merging import merge_recordings, write_recording
 
     merged = merge_recordings(args.runs, allow_environment_change=args.allow_environment_change)
     _refuse_missing(merged.missing, allowed=args.allow_missing)

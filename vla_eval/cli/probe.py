@@ -6,7 +6,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import (
+from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
+from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
     add_allow_environment_change,
     add_json_progress,
@@ -14,14 +15,13 @@ from vla_eval.cli.arguments import (
     add_shard,
     workers_argument,
 )
-from vla_eval.cli.cluster import add_cluster
-from vla_eval.cli.output import FORMATS, print_in
-from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
-from vla_eval.cli.probe_runs import run_all
-from vla_eval.config.decoding import decode
+from vla_eval.cli.shared.cluster import add_cluster
+from vla_eval.cli.shared.output import FORMATS, print_in
+from vla_eval.cli.shared.probe_runs import run_all
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.strict.decoding import decode
 
 if TYPE_CHECKING:
     from vla_eval.probe.grid import GridSettings

@@ -4,9 +4,9 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import EXIT_EPISODE_ERRORS
-from vla_eval.cli.output import print_in
-from vla_eval.cli.probe_runs import run_all
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS
+from vla_eval.cli.shared.output import print_in
+from vla_eval.cli.shared.probe_runs import run_all
 from vla_eval.config.evaluation import EvalConfig
 
 if TYPE_CHECKING:

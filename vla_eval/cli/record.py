@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vla_eval.cli.arguments import (
+from vla_eval.cli.shared.arguments import (
     add_allow_environment_change,
     add_json_progress,
     add_overrides,
@@ -15,19 +15,20 @@ from vla_eval.cli.arguments import (
     set_flags,
     typed_command,
 )
-from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
-from vla_eval.cli.replaying import replay_each
+from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
-from vla_eval.config.decoding import decode
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import shard_folder
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend
+from vla_eval.workers.needed_files import shared_folder
 
 if TYPE_CHECKING:
-    from vla_eval.cli.progress import StopRequest
-    from vla_eval.data.recording import RecordedDataset, RecordingSummary
+    from vla_eval.cli.terminal.progress import StopRequest
+    from vla_eval.data.recording.record import RecordedDataset, RecordingSummary
 
 DATA_FOLDER = Path("data")
 FINGERPRINT_DIGITS = 8
@@ -73,10 +74,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Record and replay; the datasets' names go to standard output, everything else to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for lerobot.
-    from vla_eval.cli.output import hint_merge
-    from vla_eval.cli.progress import stop_on_signals
-    from vla_eval.cli.recording_progress import RecordingProgress
-    from vla_eval.data.recording import record
+    from vla_eval.cli.shared.output import hint_merge
+    from vla_eval.cli.terminal.progress import stop_on_signals
+    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.data.recording.record import record
 
     recipe = _recipe(args)
     command = typed_command()
@@ -124,8 +125,8 @@ def _replay_new(
     backend: Backend,
 ) -> int:
     """Replay the datasets that no replay has passed yet; return the exit code."""
-    from vla_eval.cli.recording_progress import RecordingProgress
-    from vla_eval.data.replay_report import needs_replay
+    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.data.replaying.report import needs_replay
 
     paths = [one.path for one in summary.datasets if not args.no_replay and needs_replay(one.path)]
     if not paths:

@@ -5,10 +5,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import add_json_progress, add_verb, add_workers
-from vla_eval.cli.cluster import add_cluster, backend_of, shared_folder
-from vla_eval.cli.replaying import replay_each
+from vla_eval.cli.shared.arguments import add_json_progress, add_verb, add_workers
+from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.errors import RecipeError
+from vla_eval.workers.needed_files import shared_folder
 
 DESCRIPTION = """Execute the stored actions of a dataset in the simulator; compare states and success, and
 with --pixels images. One line per mismatch. The result of a whole dataset is kept in it, and training
@@ -46,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
     if args.rebuild is not None:
         return _rebuild(args)
     # Here and not above: `mikasa-vla --help` need not wait for progress bars.
-    from vla_eval.cli.progress import stop_on_signals
-    from vla_eval.cli.recording_progress import RecordingProgress
-    from vla_eval.data.replay import find_datasets
+    from vla_eval.cli.terminal.progress import stop_on_signals
+    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.data.replaying.replay import find_datasets
 
     needs = (shared_folder(args.dataset),)
     with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
@@ -64,10 +65,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _rebuild(args: argparse.Namespace) -> int:
-    from vla_eval.cli.progress import stop_on_signals
     from vla_eval.cli.record import describe as describe_dataset
-    from vla_eval.cli.recording_progress import RecordingProgress
-    from vla_eval.data.rebuild import rebuild
+    from vla_eval.cli.terminal.progress import stop_on_signals
+    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.data.derived.rebuild import rebuild
 
     if args.episodes is not None or args.pixels:
         raise RecipeError(

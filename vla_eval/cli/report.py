@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.arguments import add_verb
-from vla_eval.cli.output import add_table_arguments, print_in, print_table
-from vla_eval.cli.screen import print_markdown
+from vla_eval.cli.shared.arguments import add_verb
+from vla_eval.cli.shared.output import add_table_arguments, print_in, print_table
+from vla_eval.cli.terminal.screen import print_markdown
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.arguments import add_verb
+from vla_eval.cli.shared.arguments import add_verb
 from vla_eval.lock.switch import own_need
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
@@ -101,7 +101,7 @@ def _of_run(args: argparse.Namespace) -> list[Path]:
 
 def _of_dataset(args: argparse.Namespace) -> list[Path]:
     """Write the episodes into the user's cache, from where the viewer opens them."""
-    from vla_eval.data.dataset_rrd import EpisodeWish, write_dataset_rrds
+    from vla_eval.data.sharing.rrd import EpisodeWish, write_dataset_rrds
     from vla_eval.errors import ViewingError
     from vla_eval.storage.cache import cached
     from vla_eval.viz.picking import MOST_OPENED

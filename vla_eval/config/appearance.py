@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from vla_eval.bounds import check_bounds
 from vla_eval.errors import RecipeError
+from vla_eval.strict.bounds import check_bounds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

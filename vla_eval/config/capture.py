@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_eval.bounds import MAX_EPISODES, MAX_STEPS, check_bounds
 from vla_eval.errors import RecipeError
+from vla_eval.strict.bounds import MAX_EPISODES, MAX_STEPS, check_bounds
 
 Outcomes = Literal["none", "all", "failures", "successes"]
 Which = Outcomes | int

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from vla_eval.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.config.files import check_run_name, content_of, digest_of
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings, StateKind
+from vla_eval.strict.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
 
 MAX_ACTION_NOISE = 10.0  # actions lie between -1 and 1: more is all noise
 EVALUATION_SEEDS = range(1, 101)

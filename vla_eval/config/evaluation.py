@@ -4,7 +4,13 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from vla_eval.bounds import (
+from vla_eval.chunking import ChunkingSettings
+from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
+from vla_eval.config.capture import CaptureConfig
+from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
+from vla_eval.config.files import check_run_name
+from vla_eval.cue_view import CueViewKind
+from vla_eval.strict.bounds import (
     MAX_EPISODES,
     MAX_PROCESSES,
     MAX_SECONDS,
@@ -15,13 +21,7 @@ from vla_eval.bounds import (
     check_seeds,
     require,
 )
-from vla_eval.chunking import ChunkingSettings
-from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
-from vla_eval.config.capture import CaptureConfig
-from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
-from vla_eval.config.files import check_run_name
-from vla_eval.config.renamed import formerly
-from vla_eval.cue_view import CueViewKind
+from vla_eval.strict.renamed import formerly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from vla_eval.bounds import require
-from vla_eval.config.decoding import decode, set_field
 from vla_eval.config.shipped import search_folders
-from vla_eval.config.yaml_data import MAX_CHARACTERS, load_yaml
 from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, unknown_name
-from vla_eval.record_rules import is_name
+from vla_eval.records import is_name
+from vla_eval.strict.bounds import require
+from vla_eval.strict.decoding import decode, set_field
+from vla_eval.strict.yaml_data import MAX_CHARACTERS, load_yaml
 
 Folder = Literal["configs", "policies", "prompts", "datasets", "protocols"]
 

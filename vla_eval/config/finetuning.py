@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from vla_eval.bounds import (
+from vla_eval.config.environment import Simulator
+from vla_eval.errors import RecipeError
+from vla_eval.strict.bounds import (
     MAX_BATCH,
     MAX_EPISODES,
     MAX_PROCESSES,
@@ -17,9 +19,7 @@ from vla_eval.bounds import (
     check_bounds,
     check_seeds,
 )
-from vla_eval.config.environment import Simulator
-from vla_eval.config.renamed import formerly
-from vla_eval.errors import RecipeError
+from vla_eval.strict.renamed import formerly
 
 MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from vla_eval.bounds import MAX_EPISODES, MAX_STEPS, check_bounds, check_seeds, require
 from vla_eval.config.files import Recipe, check_run_name, load_recipe
+from vla_eval.strict.bounds import MAX_EPISODES, MAX_STEPS, check_bounds, check_seeds, require
 
 FREE_SETTINGS = ("stop_at_success", "eager_rendering", "render.backend")
 """Settings of an evaluation that no protocol fixes: success at any step is the same with and without them."""

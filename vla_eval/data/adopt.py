@@ -16,11 +16,11 @@ from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import require_sound
 from vla_eval.data.completeness import RECORDS
 from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.derived.mixing import write_statistics
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.changes import other_sentences
 from vla_eval.data.foreign.lerobot_files import names_of
 from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.mixing import write_statistics
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import STATE_KEY, STATE_NAMES, SUCCESS_KEY, dataset_features

@@ -17,7 +17,7 @@ from vla_eval.data.completeness import RECORDS, check_complete
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.foreign.lerobot_files import OF_LEROBOT, names_of
-from vla_eval.data.frame_cache import channels_first
+from vla_eval.data.frames.frame_cache import channels_first
 from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import DatasetFacts

@@ -10,7 +10,7 @@ from typing import Any, Protocol  # Any: dataclasses have no common type
 from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest, check_file_names
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
-from vla_eval.strict_json import Source, as_dataclass, read_file, read_json, read_version
+from vla_eval.strict.json_text import Source, as_dataclass, read_file, read_json, read_version
 
 
 class Facts(Protocol):

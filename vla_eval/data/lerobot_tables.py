@@ -29,7 +29,7 @@ from vla_eval.data.tables import (
     table_paths,
 )
 from vla_eval.errors import DatasetError
-from vla_eval.strict_json import Source, read_file, read_json, shown
+from vla_eval.strict.json_text import Source, read_file, read_json, shown
 
 TASKS_FILE = Path("meta/tasks.parquet")
 STATS_FILE = Path("meta/stats.json")

@@ -27,7 +27,7 @@ from vla_eval.core import FloatArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
-from vla_eval.strict_json import (
+from vla_eval.strict.json_text import (
     Count,
     Positive,
     Source,

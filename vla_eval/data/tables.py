@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 
 EPISODE_TABLES = "meta/episodes/*/*.parquet"
 FRAME_TABLES = "data/*/*.parquet"

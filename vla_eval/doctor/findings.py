@@ -45,7 +45,7 @@ def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
     Raises:
         ProbeFailure: it failed, crashed or hung.
     """
-    command = python_command("-m", "vla_eval.doctor.probe", name)
+    command = python_command("-m", "vla_eval.doctor.subprocess_checks", name)
     try:
         with own_need():
             done = subprocess.run(

@@ -34,14 +34,14 @@ from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
 from vla_eval.tasks.appearance import with_appearance
-from vla_eval.tasks.arms import ARMS
+from vla_eval.tasks.arm.arms import ARMS
+from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
 from vla_eval.tasks.register import env_class
-from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.spec import TaskSpec
 
 ROBOT = "robot_uids"

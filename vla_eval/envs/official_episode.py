@@ -8,8 +8,8 @@ import numpy as np
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates
 from vla_eval.envs.scenes import to_vector
 from vla_eval.task_state import Phase, PrivilegedState, TaskStatus
-from vla_eval.tasks.bodies import yaw_rad
-from vla_eval.tasks.layout import places_from_right
+from vla_eval.tasks.objects.bodies import yaw_rad
+from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
 

@@ -20,7 +20,7 @@ from mani_skill.utils.building.actors import ycb
 
 from vla_eval.errors import MissingDependencyError, TaskArgumentError
 from vla_eval.storage.cache import cached
-from vla_eval.tasks.mug import (
+from vla_eval.tasks.objects.mug import (
     BOTTOM_POSE,
     BOTTOM_RADIUS_M,
     HEIGHT_M,

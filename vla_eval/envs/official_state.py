@@ -18,7 +18,7 @@ from vla_eval.envs.scenes import to_vector
 from vla_eval.envs.true_states import PARKED_ABOVE_M
 from vla_eval.errors import SpecMismatchError
 from vla_eval.task_state import BodyState
-from vla_eval.tasks.bodies import yaw_rad
+from vla_eval.tasks.objects.bodies import yaw_rad
 from vla_eval.tasks.spec import TaskSpec
 
 Vector = NDArray[np.float64]

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_eval.checkpoints.files import find_checkpoint, weights_file
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import default_run_folder, worker_count
@@ -13,8 +14,7 @@ from vla_eval.evaluation.job_queue import JobQueue
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.rendered import images_read, n_rendered
 from vla_eval.evaluation.sharding import plan_shard
-from vla_eval.policies.checkpoint import find_checkpoint, weights_file
-from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
+from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.records import EpisodeKey
 from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import read_run

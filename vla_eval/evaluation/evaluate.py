@@ -21,14 +21,14 @@ from vla_eval.evaluation.episode_jobs import EpisodeJob, SetupKey
 from vla_eval.evaluation.fingerprint import fingerprint, results_config
 from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
-from vla_eval.evaluation.phases import ReadyPhase, phases, with_servers
 from vla_eval.evaluation.plan import Plan
+from vla_eval.evaluation.server_phases import ReadyPhase, phases, with_servers
 from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.evaluation.worker import Finished, SentenceRead, worker_main
+from vla_eval.models.shared.sentence_reading import SentenceWatch
+from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
-from vla_eval.policies.sentence_reading import SentenceWatch
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode

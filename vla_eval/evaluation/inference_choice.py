@@ -6,7 +6,7 @@ from typing import Any, Literal  # Any: plain data
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
+from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
-from vla_eval.bounds import MAX_EPISODES
+from vla_eval.checkpoints.execution_fields import ignored_fields
+from vla_eval.checkpoints.notes import (
+    checkpoint_hashes,
+    normalization_notes,
+    training_seeds,
+    training_sentences,
+)
+from vla_eval.checkpoints.trained_with import Sentences, about_nothing_known, about_sentence
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
@@ -21,20 +28,13 @@ from vla_eval.evaluation.inference_choice import (
     chosen_inference,
     has_weights,
 )
-from vla_eval.policies.checkpoint_notes import (
-    checkpoint_hashes,
-    normalization_notes,
-    training_seeds,
-    training_sentences,
-)
-from vla_eval.policies.execution_fields import ignored_fields
+from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.registry import check_adapter
-from vla_eval.policies.run_seeds import PolicyEntry, load_policy_entries
-from vla_eval.policies.trained_with import Sentences, about_nothing_known, about_sentence
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
+from vla_eval.strict.bounds import MAX_EPISODES
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_arguments
 from vla_eval.tasks.spec import TaskSpec

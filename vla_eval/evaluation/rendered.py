@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal  # Any: what a recipe holds
 
+from vla_eval.checkpoints.files import find_checkpoint
+from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
 from vla_eval.config.capture import may_be_wanted
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.episode_jobs import EpisodeJob
-from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.checkpoint_notes import LEROBOT_CHECKPOINTS
+from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import SCRIPTED
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.policies.run_seeds import PolicyEntry
 from vla_eval.wire.metadata import ServerMetadata
 
 Reads = Literal["none", "last", "every"]
@@ -73,9 +73,9 @@ def _read_at(server: ServerMetadata, args: Mapping[str, Any]) -> Reads:
 
 def _is_shown_every_frame(folder: Path) -> bool:
     # Here and not above: a dry run of scripted policies need not wait for torch.
-    from vla_eval.policies.lerobot_loading import LoadOptions, make_unfilled_policy, read_config
-    from vla_eval.policies.lerobot_memory import remembers
-    from vla_eval.policies.lerobot_types import history
+    from vla_eval.checkpoints.loading import LoadOptions, make_unfilled_policy, read_config
+    from vla_eval.checkpoints.policy_types import history
+    from vla_eval.models.episodes.memory import remembers
 
     config = read_config(folder, LoadOptions(device="cpu"))
     return len(history(config)) > 1 or remembers(make_unfilled_policy(config))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.plan import Plan, make_plan
-from vla_eval.policies.run_seeds import PolicyEntry
+from vla_eval.policies.entries import PolicyEntry
 from vla_eval.storage.shard import Shard
 
 

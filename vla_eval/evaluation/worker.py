@@ -27,9 +27,9 @@ from vla_eval.errors import (
 )
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
+from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
-from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators

@@ -6,7 +6,7 @@ Named by `--env.discover_packages_path=vla_eval.lerobot_plugin`, or found by its
 distribution of the folder `plugins/` is installed.
 """
 
-import vla_eval.policies.memory.configuration_memory  # noqa: F401  importing it registers
+import vla_eval.models.memory.configuration_memory  # noqa: F401  importing it registers
 from vla_eval.lerobot_plugin.environment import MikasaEnvConfig, MikasaGym
 
 __all__ = ["MikasaEnvConfig", "MikasaGym"]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from vla_eval.page.material import Material
 from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable
 from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 
 TITLES: dict[Cause, str] = {
     "right": "right choice",

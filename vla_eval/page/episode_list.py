@@ -11,7 +11,7 @@ from markupsafe import Markup
 from vla_eval.page.material import Material, key_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import rrd_file, video_file
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 
 OUTCOMES = ("success", "failure", "error")
 FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video", "rrd")

@@ -10,7 +10,7 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs
 from vla_eval.storage.capture_files import stills_file
 from vla_eval.storage.run_folder import StoredRun
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 from vla_eval.viz.contact_sheet import SheetRow, contact_sheet
 from vla_eval.viz.frames import FAILURE_COLOR, SUCCESS_COLOR
 from vla_eval.viz.moments import read_stills

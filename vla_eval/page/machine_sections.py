@@ -15,7 +15,7 @@ from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.timings import measure_latency
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 
 MAX_SHOWN_VIDEOS = 12
 MAX_VIDEO_BYTES = 16_000_000  # in total: a page has to open fast and fit into a mail

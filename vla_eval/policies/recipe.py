@@ -7,9 +7,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from vla_eval.config.files import Recipe, list_recipes, load_recipe
-from vla_eval.config.policy import PolicyRecipe
-from vla_eval.policies.checkpoint import (
+from vla_eval.checkpoints.config_check import MAX_ACTIONS
+from vla_eval.checkpoints.files import (
     CONFIG_FILE,
     checkpoint_name,
     checkpoint_sha256,
@@ -17,13 +16,14 @@ from vla_eval.policies.checkpoint import (
     read_json,
     weights_file,
 )
-from vla_eval.policies.checkpoint_json import get_count, get_text
-from vla_eval.policies.config_check import MAX_ACTIONS
-from vla_eval.policies.lerobot_types import ASKED_FOR_STEPS
+from vla_eval.checkpoints.notes import LEROBOT_ADAPTER
+from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS
+from vla_eval.config.files import Recipe, list_recipes, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.remote.survey import moved, survey_address
+from vla_eval.strict.json_fields import get_count, get_text
 from vla_eval.wire.addresses import named_server
 
-LEROBOT_ADAPTER = "lerobot"
 BIG_CHECKPOINT_BYTES = 1 << 30  # of such policies one worker is enough for a GPU, and too much for most CPUs
 
 

@@ -37,20 +37,20 @@ PolicyFactory = Callable[..., Policy]
 POLICY_GROUP = "vla_eval.policies"
 
 POLICIES = {
-    "random": "vla_eval.policies.scripted:make_random",
-    "hold": "vla_eval.policies.scripted:make_hold",
-    "oracle": "vla_eval.policies.scripted:make_oracle",
-    "cue_blind": "vla_eval.policies.scripted:make_cue_blind",
-    "tour": "vla_eval.policies.scripted:make_tour",
-    "cue_reader": "vla_eval.policies.scripted:make_cue_reader",
-    "body_memory": "vla_eval.policies.shortcuts:make_body_memory",
-    "cue_touch": "vla_eval.policies.shortcuts:make_cue_touch",
-    "one_frame": "vla_eval.policies.shortcuts:make_one_frame",
-    "lerobot": "vla_eval.policies.lerobot:make_lerobot",
-    "openvla": "vla_eval.policies.openvla_paper:make_openvla",
+    "random": "vla_eval.policies.controls.scripted:make_random",
+    "hold": "vla_eval.policies.controls.scripted:make_hold",
+    "oracle": "vla_eval.policies.controls.scripted:make_oracle",
+    "cue_blind": "vla_eval.policies.controls.scripted:make_cue_blind",
+    "tour": "vla_eval.policies.controls.scripted:make_tour",
+    "cue_reader": "vla_eval.policies.controls.scripted:make_cue_reader",
+    "body_memory": "vla_eval.policies.controls.shortcuts:make_body_memory",
+    "cue_touch": "vla_eval.policies.controls.shortcuts:make_cue_touch",
+    "one_frame": "vla_eval.policies.controls.shortcuts:make_one_frame",
+    "lerobot": "vla_eval.policies.lerobot.policy:make_lerobot",
+    "openvla": "vla_eval.policies.lerobot.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
 }
-_SCRIPTED_MODULES = ("vla_eval.policies.scripted:", "vla_eval.policies.shortcuts:")
+_SCRIPTED_MODULES = ("vla_eval.policies.controls.scripted:", "vla_eval.policies.controls.shortcuts:")
 SCRIPTED = frozenset(name for name, target in POLICIES.items() if target.startswith(_SCRIPTED_MODULES))
 """Those of ours that read no image."""
 PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "cue_reader", "body_memory", "cue_touch", "one_frame"})

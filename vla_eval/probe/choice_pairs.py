@@ -8,7 +8,7 @@ from typing import NamedTuple
 from vla_eval.probe.interventions import SWAPS, World
 from vla_eval.probe.quantities import Pair, follows, pair_up
 from vla_eval.probe.world_records import Worlds, compared_with
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 
 NO_CHOICE = "none"
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from vla_eval.probe.choice_pairs import ChoicePairs, choice_pairs
-from vla_eval.probe.found import FoundGridWorld, FoundWorld
+from vla_eval.probe.find_worlds import FoundGridWorld, FoundWorld
 from vla_eval.probe.grid_table import GridTable, grid_table
 from vla_eval.probe.table import ProbeTable, policy_order, probe_table
 from vla_eval.probe.world_records import by_policy

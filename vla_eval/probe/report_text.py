@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.found import find_probes
+from vla_eval.probe.find_worlds import find_probes
 from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.probe_text import render_probe

@@ -23,7 +23,7 @@ from vla_eval.results.comparison import (
 )
 from vla_eval.results.estimates import chance_corrected
 from vla_eval.results.grouping import RowEpisodes, group_runs
-from vla_eval.results.protocol_summary import protocol_summaries
+from vla_eval.results.published.protocol_summary import protocol_summaries
 from vla_eval.results.success_table import Row, RunRow, Table
 from vla_eval.results.table_formats import FORMATS, Format, render
 from vla_eval.storage.run_folder import StoredRun

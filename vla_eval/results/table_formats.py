@@ -12,8 +12,8 @@ from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cel
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
 from vla_eval.results.latex_preset import paper_preset
-from vla_eval.results.protocol_table import protocol_side_table
-from vla_eval.results.published_table import paper_side_table, published_side_tables
+from vla_eval.results.published.protocol_table import protocol_side_table
+from vla_eval.results.published.table import paper_side_table, published_side_tables
 from vla_eval.results.side_table import SideTable
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_columns import Layout, lay_out, sentence_of

@@ -2,9 +2,9 @@
 
 import logging
 
+from vla_eval.checkpoints.trained_with import about_nothing_known, about_sentence
 from vla_eval.core import EpisodeStart
-from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceReading, SentenceWatch
-from vla_eval.policies.trained_with import about_nothing_known, about_sentence
+from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading, SentenceWatch
 from vla_eval.serving.host import HostedPolicy
 from vla_eval.tasks.interface import ANY_TASK
 

@@ -22,7 +22,7 @@ from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher, Inference
 from vla_eval.serving.observations import RequestError
 from vla_eval.serving.sessions import Session, SessionTable
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 from vla_eval.wire.client import READING_KEY
 from vla_eval.wire.codec import CodecError, packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata

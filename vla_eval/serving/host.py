@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any  # Any: arguments of an adapter
 
-from vla_eval.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
+from vla_eval.checkpoints.execution_fields import ignored_fields
+from vla_eval.checkpoints.files import find_checkpoint, read_facts
+from vla_eval.checkpoints.notes import LEROBOT_ADAPTER, checkpoint_hashes, training_seeds, training_sentences
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
-from vla_eval.policies.checkpoint import find_checkpoint, read_facts
-from vla_eval.policies.checkpoint_notes import checkpoint_hashes, training_seeds, training_sentences
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.execution_fields import ignored_fields
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import POLICIES, PRIVILEGED, make_from_adapter
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
@@ -30,12 +29,12 @@ from vla_eval.serving.observations import (
 )
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.storage.provenance import PACKAGES, package_version
+from vla_eval.strict.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import ANY_TASK, env_spec
 from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
 
 OWN_PACKAGE = "mikasa-vla-eval"
-LEROBOT_ADAPTER = "lerobot"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

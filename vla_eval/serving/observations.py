@@ -13,7 +13,7 @@ from vla_eval.core import FloatArray, ImageArray, Observation
 from vla_eval.errors import SpecMismatchError, VlaEvalError, did_you_mean, some_of
 from vla_eval.features import PROPRIO_STATES, STATE_NAMES
 from vla_eval.specs import EnvSpec, PolicySpec
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 from vla_eval.wire.metadata import CameraImage
 from vla_eval.wire.numbers import FLOAT_TYPES, NumbersError, as_state
 

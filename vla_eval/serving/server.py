@@ -22,7 +22,6 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from vla_eval.bounds import MAX_SECONDS, check_bounds
 from vla_eval.errors import VlaEvalError
 from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher
@@ -30,6 +29,7 @@ from vla_eval.serving.connection import ClientConnection, Service
 from vla_eval.serving.host import HostedPolicy
 from vla_eval.serving.metrics import CONTENT_TYPE, ServerMetrics
 from vla_eval.serving.sessions import SessionTable
+from vla_eval.strict.bounds import MAX_SECONDS, check_bounds
 from vla_eval.wire.codec import MAX_MESSAGE_BYTES
 from vla_eval.wire.keys import HEADER, explanation, key_problem, refused
 

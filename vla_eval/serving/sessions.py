@@ -12,7 +12,7 @@ from typing import Any, Literal  # Any: what a client sends
 
 from vla_eval.core import EpisodeStart, Observation, ObservationWindow
 from vla_eval.serving.observations import PROMPT_WIRE_KEY, ObservationReader, RequestError, read_prompt
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 from vla_eval.tasks.catalog import TASKS
 
 MAX_UNREAD_FRAMES = 1024  # 100 MB of two cameras of 128 px

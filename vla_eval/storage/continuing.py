@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from vla_eval.storage.growth import command_beside, without_growth
+from vla_eval.storage.plan_growth import command_beside, without_growth
 from vla_eval.storage.run_file import (
     DEVICE,
     Change,

@@ -11,7 +11,7 @@ from pathlib import Path
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord
 from vla_eval.storage.planned import PlannedEpisodes
-from vla_eval.strict_json import Source, read_file
+from vla_eval.strict.json_text import Source, read_file
 
 logger = logging.getLogger(__name__)
 

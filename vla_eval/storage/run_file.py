@@ -15,7 +15,7 @@ from vla_eval.seeding import SeedRange
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.planned import PlannedEpisodes, planned_config
 from vla_eval.storage.shard import Shard
-from vla_eval.strict_json import Source, as_dataclass, read_file, read_json, read_version
+from vla_eval.strict.json_text import Source, as_dataclass, read_file, read_json, read_version
 
 FORMAT_VERSION = 1
 """Of the whole run folder. Raise it when a file changes its meaning; others are refused."""

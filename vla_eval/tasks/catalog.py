@@ -6,15 +6,15 @@ Horizons, phases and instructions: the paper, appendix "VLA experiments", and `d
 from typing import get_args
 
 from vla_eval.errors import unknown_name
-from vla_eval.tasks.families import make_families
-from vla_eval.tasks.official_catalog import (
+from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
     NAMESPACE_90,
     NAMESPACE_ORIGINAL,
     original_tasks,
 )
-from vla_eval.tasks.sequence_catalog import SEQUENCE_TASKS
-from vla_eval.tasks.spatial_catalog import SPATIAL_TASKS
+from vla_eval.tasks.catalogs.sequence_catalog import SEQUENCE_TASKS
+from vla_eval.tasks.catalogs.spatial_catalog import SPATIAL_TASKS
+from vla_eval.tasks.families import make_families
 from vla_eval.tasks.spec import Suite, TaskSpec
 
 _REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."

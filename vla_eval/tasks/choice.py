@@ -11,8 +11,8 @@ import torch
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.layout import places_from_right
 from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
+from vla_eval.tasks.objects.layout import places_from_right
 
 NO_CHOICE = -1
 

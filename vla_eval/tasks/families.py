@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from vla_eval.bounds import MAX_STEPS
-from vla_eval.config.decoding import check_value
 from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.errors import RecipeError, TaskArgumentError
+from vla_eval.strict.bounds import MAX_STEPS
+from vla_eval.strict.decoding import check_value
 from vla_eval.tasks.interface import IMAGE_SIZE, checked_image_size
 from vla_eval.tasks.spec import TaskSpec
 

@@ -10,9 +10,9 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs import Pose
 
 from vla_eval.tasks.ball import RollingBallEnv
-from vla_eval.tasks.bodies import Body, resting_body
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.one_phase import check_positive
+from vla_eval.tasks.objects.bodies import Body, resting_body
+from vla_eval.tasks.without_cue import check_positive
 
 GOAL_OFFSET_X_M = 0.2
 GOAL_Y_M = (-0.2, 0.2)

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vla_eval.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
 from vla_eval.control_modes import EE_DELTA_POSE, action_spec, control_mode_of
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
+from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
 from vla_eval.tasks.spec import TaskSpec
 
 IMAGE_SIZE = "image_size"

@@ -14,8 +14,8 @@ from mani_skill.utils.structs import Actor
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
-from vla_eval.tasks.items import Item, build_decoy, build_item
-from vla_eval.tasks.layout import Plane, jittered, slot_centres_m
+from vla_eval.tasks.objects.items import Item, build_decoy, build_item
+from vla_eval.tasks.objects.layout import Plane, jittered, slot_centres_m
 
 WIDEST_HALF_M = 0.03
 UPRIGHT_WXYZ = (1.0, 0.0, 0.0, 0.0)

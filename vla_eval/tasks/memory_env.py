@@ -25,12 +25,12 @@ from vla_eval.errors import TaskArgumentError, unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import Phase
-from vla_eval.tasks.arm_control import ArmControl
-from vla_eval.tasks.arms import ARMS, Arm
-from vla_eval.tasks.bodies import Body, yaw_rad
+from vla_eval.tasks.arm.arm_control import ArmControl
+from vla_eval.tasks.arm.arms import ARMS, Arm
+from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.durations import StepRange, step_range
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, checked_image_size
-from vla_eval.tasks.robots import WRIST_MESH_ROBOTS
+from vla_eval.tasks.objects.bodies import Body, yaw_rad
 
 PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 """Index of a phase in tensors -> its name."""

@@ -11,11 +11,11 @@ import torch
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.arms import FETCH_UID
+from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
-from vla_eval.tasks.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
-from vla_eval.tasks.layout import Plane, jittered_apart, slot_centres_m
 from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
+from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
 
 SHAPE_COLOR = COLORS[2]  # blue, as in the official RememberShape
 MIXED_SHAPES = ("cube", "sphere", "t_shape", "cross", "torus")

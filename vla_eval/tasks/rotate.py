@@ -11,8 +11,8 @@ from mani_skill.utils.structs import Pose
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
-from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive, check_range
+from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
+from vla_eval.tasks.without_cue import OnePhaseEnv, check_positive, check_range
 
 PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)

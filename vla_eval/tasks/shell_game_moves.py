@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.bodies import Body, moving_body, resting_body, yaw_rad
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.one_phase import check_positive
+from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, yaw_rad
 from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
+from vla_eval.tasks.without_cue import check_positive
 
 CHOSEN_M = 0.02
 GOAL_ABOVE_BALL_M = 0.025

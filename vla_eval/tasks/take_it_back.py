@@ -9,10 +9,10 @@ from mani_skill.utils.structs import Pose
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.bodies import Body, moving_body, resting_body
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.one_phase import OnePhaseEnv, check_positive
+from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body
+from vla_eval.tasks.without_cue import OnePhaseEnv, check_positive
 
 START_X_M = (-0.05, 0.05)
 START_BANDS_Y_M = (-0.1, 0.0, 0.1)

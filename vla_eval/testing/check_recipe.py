@@ -15,7 +15,7 @@ from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.worker import EnvFacts, make_policy
-from vla_eval.policies.sentence_reading import ReadingPolicy, SentenceWatch
+from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side

@@ -8,8 +8,8 @@ from vla_eval.config.environment import EnvSettings, Simulator
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import EpisodeStart, SimEnv
 from vla_eval.envs.factory import make_env
-from vla_eval.policies import scripted
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.controls import scripted
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import task_spec

@@ -15,14 +15,14 @@ import torch
 from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 
+from vla_eval.checkpoints.files import WEIGHTS_FILE, TrainingFacts, write_facts
+from vla_eval.checkpoints.foreign_code import no_foreign_code
+from vla_eval.checkpoints.loading import config_class
+from vla_eval.checkpoints.processors import save_tokenizers, save_vlm_files
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
-from vla_eval.policies.checkpoint import WEIGHTS_FILE, TrainingFacts, write_facts
-from vla_eval.policies.foreign_code import no_foreign_code
-from vla_eval.policies.lerobot_loading import config_class
-from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
-from vla_eval.policies.weight_file import write_weights
+from vla_eval.models.shared.weight_file import write_weights
 from vla_eval.testing import tiny_models
 from vla_eval.training.dry_run import assumed_config
 from vla_eval.training.model import tokenizer_from

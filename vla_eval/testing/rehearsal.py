@@ -16,6 +16,15 @@ from typing import Any  # lerobot is untyped
 import torch
 from torch import Tensor
 
+from vla_eval.checkpoints.files import ADAPTER_CONFIG_FILE, WEIGHTS_FILE, find_checkpoint
+from vla_eval.checkpoints.loading import (
+    LoadOptions,
+    load_checkpoint,
+    make_unfilled_policy,
+    read_config,
+)
+from vla_eval.checkpoints.policy_types import history
+from vla_eval.checkpoints.verify import random_batch
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -23,27 +32,18 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, Policy
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError
 from vla_eval.features import CAMERA_KEYS
-from vla_eval.policies.checkpoint import ADAPTER_CONFIG_FILE, WEIGHTS_FILE, find_checkpoint
+from vla_eval.models.episodes.memory import remembers_in_rows
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot import make_lerobot
-from vla_eval.policies.lerobot_loading import (
-    LoadOptions,
-    load_checkpoint,
-    make_unfilled_policy,
-    read_config,
-)
-from vla_eval.policies.lerobot_memory import remembers_in_rows
-from vla_eval.policies.lerobot_types import history
-from vla_eval.policies.verify import random_batch
+from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.process_memory import available_bytes, peak_rss_bytes, reset_peak
 from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
-from vla_eval.training.description import describe_model
-from vla_eval.training.estimate import unfilled_model, with_adapters
+from vla_eval.training.cost.description import describe_model
+from vla_eval.training.cost.estimate import unfilled_model, with_adapters
+from vla_eval.training.cost.sample_cost import sample_cost
 from vla_eval.training.request import load_finetune_recipe
-from vla_eval.training.sample_cost import sample_cost
 
 N_STEPS = 20
 GB = 1e9

@@ -14,7 +14,7 @@ import numpy as np
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY, STATE_NAMES
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import PolicySpec
 from vla_eval.testing.tiny_models import TINY_POLICY, Sizes, tiny_paligemma, write_tiny_tokenizer
 
@@ -63,7 +63,7 @@ def write_small_transformer(folder: Path) -> int:
     processing: Any = importlib.import_module("lerobot.policies.pi0.processor_pi0")
     pi0: Any = importlib.import_module("lerobot.policies.pi0.configuration_pi0")
     torch: Any = importlib.import_module("torch")
-    loading: Any = importlib.import_module("vla_eval.policies.lerobot_loading")
+    loading: Any = importlib.import_module("vla_eval.checkpoints.loading")
     image = types.PolicyFeature(types.FeatureType.VISUAL, (3, IMAGE_PX, IMAGE_PX))
     fields = {**TINY_POLICY, "image_resolution": tuple(TINY_POLICY["image_resolution"])}
     fields |= {"chunk_size": SMALL_CHUNK_SIZE, "n_action_steps": SMALL_CHUNK_SIZE}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vla_eval.core import ImageArray
-from vla_eval.data.shard_writer import new_dataset
+from vla_eval.data.recording.shard_writer import new_dataset
 from vla_eval.features import (
     CAMERA_KEYS,
     DONE_KEY,

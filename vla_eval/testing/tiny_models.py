@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 from vla_eval.evaluation.worker import worker_main
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot import LeRobotPolicy, make_lerobot
+from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.training.finetune_jobs import finetune_main
 from vla_eval.workers.inside import SharedStage
 
@@ -113,7 +113,7 @@ def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_
         n_tokens: as for `write_tiny_tokenizer`.
         min_token: the coefficient whose character is 0.
     """
-    from vla_eval.policies.fast_tokens import FastActionTokenizer
+    from vla_eval.checkpoints.fast_tokens import FastActionTokenizer
 
     folder.mkdir()
     made = FastActionTokenizer(_tokenizer({}, n_tokens=n_tokens), scale=10.0, min_token=min_token)

@@ -10,13 +10,13 @@ from typing import Any
 
 import yaml
 
+from vla_eval.checkpoints.notes import LEROBOT_ADAPTER
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import merge_fields
 from vla_eval.config.policy import PolicyRecipe, load_policy
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.grid import ModelTable, TableRow
-from vla_eval.policies.recipe import LEROBOT_ADAPTER
+from vla_eval.evaluation.model_table import ModelTable, TableRow
 from vla_eval.storage.durable import replace_file
 from vla_eval.testing.tiny_models import TINY_POLICY, write_tiny_tokenizer
 

@@ -11,10 +11,10 @@ from accelerate.utils import DistributedType
 from lerobot.common import train_utils
 from torch import nn
 
+from vla_eval.checkpoints.files import LAST, MODEL_FOLDER, write_facts
+from vla_eval.checkpoints.processors import save_tokenizers, save_vlm_files
 from vla_eval.errors import TrainingError
-from vla_eval.policies.checkpoint import LAST, MODEL_FOLDER, write_facts
-from vla_eval.policies.lerobot_processors import save_tokenizers, save_vlm_files
-from vla_eval.strict_json import Source, read_file, read_json, shown
+from vla_eval.strict.json_text import Source, read_file, read_json, shown
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.run_folder import PARTIAL_PREFIX, STATE_FOLDER, point
 

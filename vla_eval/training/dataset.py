@@ -15,7 +15,7 @@ from vla_eval.data.info_file import one_dataset
 from vla_eval.data.manifest import DatasetFacts, read_manifest
 from vla_eval.data.mixture import MixtureFacts
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.replay_report import require_passed
+from vla_eval.data.replaying.report import require_passed
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY

@@ -8,18 +8,18 @@ from typing import Any  # lerobot is untyped
 import draccus
 from lerobot.configs import FeatureType, PolicyFeature
 
+from vla_eval.checkpoints.bases import how_to_get
+from vla_eval.checkpoints.conversion.octo import SIZES
+from vla_eval.checkpoints.files import find_checkpoint
+from vla_eval.checkpoints.foreign_code import only_data
+from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
+from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
-from vla_eval.policies.bases import how_to_get
-from vla_eval.policies.checkpoint import find_checkpoint
-from vla_eval.policies.conversion.octo import SIZES
-from vla_eval.policies.foreign_code import only_data
-from vla_eval.policies.lerobot_device import choose_device
-from vla_eval.policies.lerobot_loading import NO_DOWNLOADS, config_class
-from vla_eval.policies.plain_errors import plain_errors
+from vla_eval.policies.lerobot.device import choose_device
+from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.dataset import TrainingDataset, training_dataset
-from vla_eval.training.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.lora import check_lora_targets
 from vla_eval.training.policy_config import policy_config, used_frames

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple  # Any: lerobot is untyped
 
 import torch
 
+from vla_eval.checkpoints.files import MODEL_FOLDER
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import TrainingError
-from vla_eval.policies.checkpoint import MODEL_FOLDER
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.run_folder import whole_checkpoints
 

@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import DatasetError
-from vla_eval.policies.checkpoint import CONFIG_FILE, find_checkpoint, read_json
-from vla_eval.policies.lerobot_loading import config_class
 from vla_eval.training.dataset import TrainingDataset
 
 

@@ -10,15 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from vla_eval.checkpoints.files import checkpoint_sha256
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.errors import VlaEvalError
-from vla_eval.policies.checkpoint import checkpoint_sha256
-from vla_eval.policies.sentence_reading import SentenceReading, SentenceWatch
+from vla_eval.models.shared.sentence_reading import SentenceReading, SentenceWatch
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
-from vla_eval.training.estimate import RateWatch, estimate
+from vla_eval.training.cost.estimate import RateWatch, estimate
+from vla_eval.training.decision_frames import about_decisions
 from vla_eval.training.extension import check_steps
 from vla_eval.training.failures import about_failures
 from vla_eval.training.held_out import METRIC_KEY, HeldOut, asked_warnings, shared_seeds_warning
@@ -39,7 +40,6 @@ from vla_eval.training.run_folder import (
     whole_checkpoints,
 )
 from vla_eval.training.trackers import Services, services
-from vla_eval.training.waiting import about_decisions
 
 LOCK_FILE = "finetune.lock"
 RUN_ID = "run_id"  # of `finetune.json`

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.checkpoints.files import MODEL_FOLDER, TrainingFacts, checkpoint_name
+from vla_eval.checkpoints.trained_with import Asked, about_sentence, differences, refuse_differences
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
@@ -21,8 +23,6 @@ from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
-from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, checkpoint_name
-from vla_eval.policies.trained_with import Asked, about_sentence, differences, refuse_differences
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec

@@ -11,14 +11,14 @@ from typing import Any  # lerobot is untyped
 from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
+from vla_eval.checkpoints.files import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.control_modes import action_spec
 from vla_eval.data.opening import decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
-from vla_eval.policies.checkpoint import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
-from vla_eval.policies.lerobot_device import choose_device
-from vla_eval.policies.vla_memory.fields import SampleMemory
+from vla_eval.models.vla_memory.fields import SampleMemory
+from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.dataset import TrainingDataset, training_dataset
 from vla_eval.training.failures import chosen_episodes
 from vla_eval.training.held_out import check_asked, check_held_out

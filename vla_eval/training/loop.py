@@ -35,14 +35,14 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import has_method, init_logging
 from tqdm import tqdm
 
-from vla_eval.data.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
+from vla_eval.data.frames.remembered_frames import RememberedFramesDataset
 from vla_eval.data.opening import local_readers
-from vla_eval.data.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
-from vla_eval.policies.lerobot_device import amp_dtype
-from vla_eval.policies.sentence_reading import SentenceReading
-from vla_eval.policies.steps.levels import in_numbers
-from vla_eval.policies.tokens_read import Readings
+from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.sentence_reading import SentenceReading
+from vla_eval.models.shared.tokens_read import Readings
+from vla_eval.policies.lerobot.device import amp_dtype
 from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config

@@ -6,10 +6,10 @@ from lerobot.configs.default import PeftConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 
+from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import RecipeError
-from vla_eval.policies.lerobot_loading import config_class
-from vla_eval.policies.steps.trainable import check_lora
+from vla_eval.models.shared.trainable import check_lora
 
 LORA_TARGETS = {
     "pi05": r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"

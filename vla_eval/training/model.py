@@ -12,20 +12,20 @@ from urllib.error import URLError
 import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 
-from vla_eval.data.exact_statistics import usable_statistics
-from vla_eval.errors import RecipeError, TrainingError
-from vla_eval.policies.backbones import WITHOUT, fetched_backbones
-from vla_eval.policies.checkpoint import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
-from vla_eval.policies.foreign_code import no_foreign_code
-from vla_eval.policies.lerobot_loading import (
+from vla_eval.checkpoints.backbones import WITHOUT, fetched_backbones
+from vla_eval.checkpoints.files import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
+from vla_eval.checkpoints.foreign_code import no_foreign_code
+from vla_eval.checkpoints.loading import (
     LoadOptions,
     begin_from,
     config_class,
     fill_policy,
 )
-from vla_eval.policies.lerobot_processors import step_names, tokenizer_overrides
-from vla_eval.policies.plain_errors import plain_errors, raise_plainly
-from vla_eval.policies.steps.step_names import DECODER_STEP, ENCODER_STEP
+from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
+from vla_eval.checkpoints.processors import step_names, tokenizer_overrides
+from vla_eval.data.exact_statistics import usable_statistics
+from vla_eval.errors import RecipeError, TrainingError
+from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.lora import check_adapters, peft_config
 

@@ -14,6 +14,18 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
+from vla_eval.checkpoints.config_check import check_config
+from vla_eval.checkpoints.files import (
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    find_checkpoint,
+    read_json,
+)
+from vla_eval.checkpoints.foreign_code import only_data
+from vla_eval.checkpoints.loading import asked_for, config_class, with_local_files
+from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
+from vla_eval.checkpoints.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.data.tables import read_columns
@@ -26,18 +38,6 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
-from vla_eval.policies.checkpoint import (
-    CONFIG_FILE,
-    POSTPROCESSOR_FILE,
-    PREPROCESSOR_FILE,
-    find_checkpoint,
-    read_json,
-)
-from vla_eval.policies.config_check import check_config
-from vla_eval.policies.foreign_code import only_data
-from vla_eval.policies.lerobot_loading import asked_for, config_class, with_local_files
-from vla_eval.policies.plain_errors import plain_errors, raise_plainly
-from vla_eval.policies.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vla_eval.config.decoding import decode
+from vla_eval.checkpoints.files import checkpoint_sha256, file_sha256, find_checkpoint
 from vla_eval.config.files import Recipe, digest_of, to_data
 from vla_eval.config.finetuning import (
     LOGGERS,
@@ -18,7 +18,7 @@ from vla_eval.data.imported import IMPORT_FILE
 from vla_eval.data.info_file import one_dataset
 from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE
 from vla_eval.errors import RecipeError
-from vla_eval.policies.checkpoint import checkpoint_sha256, file_sha256, find_checkpoint
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_metrics, read_record

@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from vla_eval.checkpoints.files import LAST, step_folders
 from vla_eval.config.finetuning import LOGGERS
 from vla_eval.errors import TrainingError
-from vla_eval.policies.checkpoint import LAST, step_folders
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.run_file import JsonValue, find_changes
-from vla_eval.strict_json import Source, read_file, read_json, read_version, shown
+from vla_eval.strict.json_text import Source, read_file, read_json, read_version, shown
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"

@@ -15,10 +15,10 @@ from accelerate import PartialState
 from accelerate.tracking import TensorBoardTracker
 from lerobot.common.wandb_utils import cfg_to_group, get_safe_wandb_artifact_name
 
+from vla_eval.checkpoints.files import ADAPTER_CONFIG_FILE, CONFIG_FILE, MODEL_FOLDER, weights_file
 from vla_eval.config.files import to_data
 from vla_eval.errors import MissingDependencyError, TrainingError
 from vla_eval.lock.switch import let_connect
-from vla_eval.policies.checkpoint import ADAPTER_CONFIG_FILE, CONFIG_FILE, MODEL_FOLDER, weights_file
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.run_folder import TRAIN_FOLDER
 

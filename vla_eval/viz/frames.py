@@ -13,7 +13,7 @@ from vla_eval.config.environment import HUMAN_CAMERA
 from vla_eval.core import ImageArray
 from vla_eval.records import EpisodeRecord
 from vla_eval.task_state import Phase
-from vla_eval.tasks.item_names import item_names, item_rgb
+from vla_eval.tasks.objects.item_names import item_names, item_rgb
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 VIEW_PX = 512  # the large view; the others are half of it, one below the other

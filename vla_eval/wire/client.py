@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol  # Any: a message may hold anything
 
 from vla_eval.core import EpisodeStart
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 from vla_eval.wire.connection import Connection
 from vla_eval.wire.metadata import ServerMetadata
 

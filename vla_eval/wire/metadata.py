@@ -10,10 +10,10 @@ from typing import Any, NamedTuple  # Any: a server may say anything
 
 import numpy as np
 
-from vla_eval.bounds import MAX_SEED, MAX_SERVER_ROWS
 from vla_eval.errors import RemoteReplyError
 from vla_eval.seeding import SeedRange
-from vla_eval.strict_json import shown
+from vla_eval.strict.bounds import MAX_SEED, MAX_SERVER_ROWS
+from vla_eval.strict.json_text import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")

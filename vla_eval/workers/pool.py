@@ -7,7 +7,7 @@ A worker that exceeds a time limit writes its stack to its log and is killed; on
 Both give an `EpisodeError` with the cause. A process does the jobs of one setup key
 only: whatever a policy changes in its process, from the default dtype to numpy's functions, ends with
 the process. Knows nothing of environments, policies or files of results, nor of what a job is: the
-inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording_worker`.
+inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording.worker`.
 """
 
 import signal

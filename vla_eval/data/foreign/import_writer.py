@@ -23,7 +23,7 @@ from vla_eval.data.foreign.episodes import (
     SourceEpisode,
 )
 from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.shard_writer import new_dataset, write_exact_statistics
+from vla_eval.data.recording.shard_writer import new_dataset, write_exact_statistics
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
     ACTION_KEY,

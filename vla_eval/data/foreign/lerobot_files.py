@@ -21,7 +21,7 @@ from vla_eval.data.foreign.episodes import (
     Source,
     SourceEpisode,
 )
-from vla_eval.data.frame_cache import EpisodeRows, FrameSource, channels_first, decode_camera
+from vla_eval.data.frames.frame_cache import EpisodeRows, FrameSource, channels_first, decode_camera
 from vla_eval.data.opening import UNREADABLE, open_local_dataset, reason
 from vla_eval.data.tables import Columns, read_columns
 from vla_eval.errors import DatasetError, did_you_mean

@@ -14,12 +14,12 @@ import numpy as np
 from vla_eval.config.files import digest_of
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import RemoteChangedError, SpecMismatchError
+from vla_eval.models.shared.sentence_reading import SentenceReading, from_wire
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.remote.actions import as_rows, converted
 from vla_eval.policies.remote.connecting import connect_client
 from vla_eval.policies.remote.fit import Fit, fit
 from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
-from vla_eval.policies.sentence_reading import SentenceReading, from_wire
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.wire.addresses import split_urls
 from vla_eval.wire.client import PolicyClient

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal  # Any: what a recipe holds
 
-from vla_eval.bounds import MAX_SECONDS, check_bounds, require
-from vla_eval.config.decoding import decode
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.errors import RecipeError
+from vla_eval.strict.bounds import MAX_SECONDS, check_bounds, require
+from vla_eval.strict.decoding import decode
 from vla_eval.wire.metadata import MAX_ACTIONS, MAX_IMAGE_PX
 
 ADAPTER = "remote"

@@ -14,7 +14,7 @@ from typing import Any  # Any: a message may hold anything
 from vla_eval.core import EpisodeStart
 from vla_eval.errors import RemoteReplyError
 from vla_eval.policies.remote.settings import RemoteSettings
-from vla_eval.strict_json import shown
+from vla_eval.strict.json_text import shown
 from vla_eval.wire.connection import MAX_SHOWN_ERROR, Connection
 from vla_eval.wire.metadata import ServerMetadata
 

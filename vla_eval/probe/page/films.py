@@ -8,12 +8,12 @@ from PIL import Image
 
 from vla_eval.page.probe_section import FilmFrame, FilmPair, Filmstrip
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.found import FoundWorld
+from vla_eval.probe.find_worlds import FoundWorld
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import video_file
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.interface import CONTROL_HZ
-from vla_eval.tasks.item_names import item_names
+from vla_eval.tasks.objects.item_names import item_names
 
 MOST_PAIRS = 3
 N_FRAMES = 6

@@ -9,7 +9,7 @@ from vla_eval.page.rates import Plots, Sign
 from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable, page_table
 from vla_eval.probe import grid_text, probe_text
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.found import FoundGridWorld, FoundProbe, find_probes
+from vla_eval.probe.find_worlds import FoundGridWorld, FoundProbe, find_probes
 from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.page.films import film_pairs

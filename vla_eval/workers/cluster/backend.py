@@ -17,7 +17,7 @@ from vla_eval.workers.cluster.pool import ClusterPool
 from vla_eval.workers.cluster.service import ClusterService
 from vla_eval.workers.jobs import Job
 from vla_eval.workers.local import LOOPBACK
-from vla_eval.workers.needed import Needed
+from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.process import WorkerMain
 
 

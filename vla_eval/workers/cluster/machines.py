@@ -12,7 +12,7 @@ from vla_eval.workers.cluster.connect import on_machine
 from vla_eval.workers.cluster.node_facts import NodeFacts, node_facts, objections, receive
 from vla_eval.workers.jobs import MachineKind
 from vla_eval.workers.load import MachineLoad
-from vla_eval.workers.needed import Needed
+from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.parcel import pack
 
 MAX_ERRORS_IN_A_ROW = 3

@@ -9,7 +9,7 @@ from pathlib import Path
 from vla_eval.config.files import digest_of, shipped_digests
 from vla_eval.storage.provenance import collect_environment, vulkan_drivers
 from vla_eval.storage.run_file import JsonValue, find_changes
-from vla_eval.workers.needed import Needed
+from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.parcel import PackedFolder, unpack
 from vla_eval.workers.start import visible_gpus
 

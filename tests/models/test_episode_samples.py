@@ -1,0 +1,221 @@
+"""What is done to the images of episodes that are trained on."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import Tensor
+
+from vla_eval.errors import RecipeError
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.models.episodes.samples import Episodes, count_motions, episodes_of
+from vla_eval.models.sequence.configuration_sequence import MikasaSequenceConfig
+from vla_eval.models.shared.levels import in_numbers
+
+CAMERAS = ("observation.images.base", "observation.images.wrist")
+N_EPISODES, N_STEPS, CHUNK, EDGE_PX, MOST_PX = 6, 5, 8, 16, 3
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(7)
+        yield
+
+
+def config(**fields: object) -> MikasaSequenceConfig:
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, EDGE_PX, EDGE_PX))
+    return MikasaSequenceConfig(
+        device="cpu",
+        window_steps=N_STEPS,
+        waiting_share=1.0,
+        input_features={
+            **dict.fromkeys(CAMERAS, image),
+            STATE_KEY: PolicyFeature(type=FeatureType.STATE, shape=(10,)),
+        },
+        output_features={ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
+        **fields,  # type: ignore[arg-type]  # fields of a dataclass
+    )
+
+
+def batch() -> dict[str, Tensor]:
+    """Return episodes whose every pixel has a value of its own in each frame."""
+    n_pixels = N_EPISODES * (N_STEPS + 1) * 3 * EDGE_PX**2
+    images = (torch.randperm(n_pixels) / n_pixels).reshape(N_EPISODES, N_STEPS + 1, 3, EDGE_PX, EDGE_PX)
+    n_actions = N_STEPS - 1 + CHUNK
+    return {
+        CAMERAS[0]: images,
+        CAMERAS[1]: 1 - images,
+        STATE_KEY: torch.zeros(N_EPISODES, N_STEPS + 1, 10),
+        f"{STATE_KEY}_is_pad": torch.zeros(N_EPISODES, N_STEPS + 1, dtype=torch.bool),
+        ACTION_KEY: torch.rand(N_EPISODES, n_actions, 7),
+        ACTION_PADDING_KEY: torch.zeros(N_EPISODES, n_actions, dtype=torch.bool),
+    }
+
+
+def waits_then_moves() -> dict[str, Tensor]:
+    """The arm moves at step 0, waits at 1 and 2, moves at 3 and 4: the decision is step 3."""
+    given = batch()
+    given[ACTION_KEY] = torch.zeros(N_EPISODES, N_STEPS - 1 + CHUNK, 7)
+    given[ACTION_KEY][:, 3:] = torch.arange(1.0, N_STEPS - 1 + CHUNK - 2)[:, None] / CHUNK
+    return given
+
+
+def shown_images(episodes: Episodes) -> Tensor:
+    """Return (B, T, cameras, 3, H, W), what each step shows."""
+    return episodes.images[episodes.frames]
+
+
+def found_shift(seen: Tensor, moved: Tensor) -> tuple[int, int]:
+    """Return the one shift (down, right) that makes `moved` (3, H, W) of `seen`, pixel by pixel."""
+    fits = []
+    for down in range(-EDGE_PX, EDGE_PX + 1):
+        for right in range(-EDGE_PX, EDGE_PX + 1):
+            from_y = [min(max(y - down, 0), EDGE_PX - 1) for y in range(EDGE_PX)]
+            from_x = [min(max(x - right, 0), EDGE_PX - 1) for x in range(EDGE_PX)]
+            if torch.equal(seen[:, from_y][:, :, from_x], moved):
+                fits.append((down, right))
+    assert len(fits) == 1
+    return fits[0]
+
+
+def test_the_images_of_an_episode_are_moved_together_and_those_of_each_camera_by_their_own_amount() -> None:
+    given = batch()
+    images = shown_images(episodes_of(given, config(shift_px=MOST_PX), training=True))
+
+    shifts = [
+        [
+            found_shift(given[key][episode, 0], images[episode, 0, camera])
+            for camera, key in enumerate(CAMERAS)
+        ]
+        for episode in range(N_EPISODES)
+    ]
+    for episode in range(N_EPISODES):
+        for camera, key in enumerate(CAMERAS):
+            last = given[key][episode, N_STEPS - 1]
+            assert found_shift(last, images[episode, N_STEPS - 1, camera]) == shifts[episode][camera]
+    amounts = {shift for of_episode in shifts for shift in of_episode}
+    assert len(amounts) > N_EPISODES
+    assert max(abs(px) for shift in amounts for px in shift) <= MOST_PX
+    assert any(base != wrist for base, wrist in shifts)
+
+
+def test_images_are_not_moved_at_zero_pixels_nor_outside_training() -> None:
+    given = batch()
+    shown = torch.stack([given[key][:, :N_STEPS] for key in CAMERAS], dim=2)
+    assert torch.equal(shown_images(episodes_of(given, config(), training=True)), shown)
+    assert torch.equal(shown_images(episodes_of(given, config(shift_px=MOST_PX), training=False)), shown)
+
+
+def test_a_negative_shift_is_refused() -> None:
+    with pytest.raises(RecipeError, match="shift_px is -1, expected a number of pixels ≥ 0"):
+        config(shift_px=-1)
+
+
+def test_images_in_bytes_are_those_numbers() -> None:
+    as_bytes = batch()
+    for key in CAMERAS:
+        as_bytes[key] = (as_bytes[key] * 255).to(torch.uint8)
+    as_numbers = as_bytes | {key: as_bytes[key].to(torch.float32) / 255 for key in CAMERAS}
+    of_bytes, of_numbers = (
+        episodes_of(given, config(), training=False).images for given in (as_bytes, as_numbers)
+    )
+    assert of_bytes.dtype == torch.uint8
+    assert torch.equal(in_numbers(of_bytes), of_numbers)
+    assert torch.equal(in_numbers(of_numbers), of_numbers)
+
+
+def test_actions_beyond_the_next_decision_do_not_count_where_that_is_asked_for() -> None:
+    given = waits_then_moves()
+    all_of_it = episodes_of(given, config(), training=False)
+    assert (all_of_it.counts > 0).all()
+    assert (all_of_it.goal_counts > 0).all()
+    episodes = episodes_of(given, config(masks_beyond_decision=True), training=False)
+    assert (episodes.goal_counts[0] > 0).tolist() == [False, False, False, True, True]
+    masked = episodes.counts[0] > 0
+    n_counted = [int(of_step.sum()) for of_step in masked]
+    assert n_counted == [3, 2, 1, CHUNK, CHUNK]
+    assert all(bool(masked[step, :n].all()) for step, n in enumerate(n_counted))
+
+
+def test_without_any_decision_the_goal_counts_at_every_step() -> None:
+    given = batch()
+    given[ACTION_KEY] = torch.arange(0.0, N_STEPS - 1 + CHUNK)[:, None].expand(N_EPISODES, -1, 7) / CHUNK
+    episodes = episodes_of(given, config(masks_beyond_decision=True), training=False)
+    assert (episodes.goal_counts > 0).all()
+    assert (episodes.counts > 0).all()
+
+
+def test_actions_beyond_the_next_decision_are_those_of_waiting_where_that_is_asked_for() -> None:
+    given = waits_then_moves()
+    given[ACTION_KEY][:, 1:3] = 0.5
+    given[ACTION_KEY][:, 0] = 0.25
+    fields = {"masks_beyond_decision": True, "waits_beyond_decision": True}
+    episodes = episodes_of(given, config(**fields), training=False)
+    assert (episodes.counts > 0).all()
+    first = [of_step[:, 0].tolist() for of_step in episodes.actions[0]]
+    assert first[0] == [0.25, *[0.5] * (CHUNK - 1)]
+    assert first[1] == first[2] == [0.5] * CHUNK
+    assert first[3] == given[ACTION_KEY][0, 3 : 3 + CHUNK, 0].tolist()
+    assert (episodes.goal_counts[0] > 0).tolist() == [False, False, False, True, True]
+    with pytest.raises(RecipeError, match="expected masks_beyond_decision to be true, too"):
+        config(waits_beyond_decision=True)
+
+
+def test_the_frame_of_a_decision_is_shown_up_to_so_many_times_again() -> None:
+    given, n_late = waits_then_moves(), set()
+    for _ in range(8):
+        episodes = episodes_of(given, config(late_steps=3), training=True)
+        assert len(episodes.images) == N_EPISODES * N_STEPS  # each frame is encoded once
+        images_of_all = shown_images(episodes)
+        for steps, counts, images in zip(episodes.steps, episodes.counts, images_of_all, strict=True):
+            shown = steps[counts[:, 0] > 0].tolist()
+            assert shown == sorted(shown) and set(shown) == set(range(N_STEPS))
+            n_late.add(shown.count(3) - 1)
+            assert len(shown) == N_STEPS + shown.count(3) - 1
+            assert torch.equal(images[shown.index(3)], images[shown.index(4) - 1])
+    assert n_late == {0, 1, 2, 3}
+    once = episodes_of(given, config(late_steps=3), training=False).steps
+    assert once.tolist() == [list(range(N_STEPS))] * N_EPISODES
+
+
+def test_a_decision_counts_as_much_however_often_it_is_shown() -> None:
+    given = waits_then_moves()
+    once = episodes_of(given, config(), training=False).counts
+    for _ in range(4):
+        episodes = episodes_of(given, config(late_steps=3), training=True)
+        for steps, counts, expected in zip(episodes.steps, episodes.counts, once, strict=True):
+            is_there = counts[:, 0] > 0
+            for step in range(N_STEPS):
+                assert torch.allclose(counts[is_there & (steps == step)].sum(dim=0), expected[step])
+
+
+def test_a_late_decision_may_be_where_an_episode_ends() -> None:
+    episodes = episodes_of(waits_then_moves(), config(late_steps=3, decision_share=1.0), training=True)
+    for steps, counts in zip(episodes.steps, episodes.counts, strict=True):
+        shown = steps[counts[:, 0] > 0].tolist()
+        assert shown[:3] == [0, 1, 2] and set(shown[3:]) == {3} and len(shown) <= 7
+
+
+class TestMotions:
+    @pytest.mark.parametrize(
+        ("sizes", "n_motions"),
+        [
+            ([0, 0, 1, 0.6, 0.3, 0.1], 1),  # waits, sets out, slows down
+            ([1, 0.6, 0.3, 0.1, 0.05, 0], 1),  # sets out at once
+            ([0, 1, 0.2, 0.1, 1.2, 0.4], 2),  # slows down, and sets out again
+            ([0, 1, 0.2, 0, 0, 1], 2),  # waits in between
+            ([0, 0.4, 0.8, 0.4, 0.2, 0], 0),  # no jerk
+        ],
+    )
+    def test_a_motion_begins_where_the_arm_sets_out(self, sizes: list[float], n_motions: int) -> None:
+        actions = torch.zeros(1, len(sizes), 7)
+        actions[0, :, 1] = -torch.tensor(sizes)  # any direction
+        actions[0, :, 6] = torch.tensor(sizes).roll(1)  # the gripper is no motion of the arm
+        assert count_motions(actions, torch.ones(1, len(sizes), dtype=torch.bool)).tolist() == [n_motions]
+
+    def test_padding_before_an_episode_does_not_move(self) -> None:
+        actions = torch.ones(1, 6, 7)
+        real = torch.tensor([[False, False, True, True, True, True]])
+        assert count_motions(actions, real).tolist() == [1]

@@ -1,0 +1,94 @@
+"""Fields of LeRobot's configurations that say how chunks are executed, and how each is answered here.
+
+LeRobot's own loop (`select_action`) reads them; ours asks for whole chunks and executes them as an evaluation
+says. All other fields are honoured: LeRobot's classes are built from them, and processors come from the
+checkpoint. A test compares this table with the installed lerobot. Standard library only.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any  # JSON of another program
+
+from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, read_json
+from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
+from vla_eval.chunking import ChunkingSpec
+
+RTC = "real-time chunking is of LeRobot's rollouts; here a chunk does not depend on the one before"
+DRAWS = "an inference's draws depend on task, seed, run and control step"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """How a field is answered.
+
+    Attributes:
+        translated: into what of ours; None: the field is ignored.
+        instead: of an ignored one: what holds, and how to get what it asks for.
+        off: its value that asks for nothing, which the policy is built with.
+    """
+
+    translated: str | None = None
+    instead: str = ""
+    off: bool | None = None
+
+
+EXECUTION_FIELDS: Mapping[str, Answer] = MappingProxyType(
+    {
+        "n_action_steps": Answer(translated="the default of --n-action-steps"),
+        "n_obs_steps": Answer(translated="the frames that an inference gets"),
+        "temporal_ensemble_coeff": Answer(
+            instead="chunks are executed as the evaluation says. The same is --n-action-steps 1 --set "
+            "chunking.mode=temporal_ensemble --set chunking.ensemble_decay={value}"
+        ),
+        "rtc_config": Answer(instead=RTC),
+        "rtc_ramp_rate": Answer(instead=RTC),
+        "per_episode_seed": Answer(instead=DRAWS, off=False),
+        "eval_seed": Answer(instead=DRAWS),
+    }
+)
+"""Field -> how it is answered."""
+
+
+def without_execution(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration in which the ignored fields ask for nothing: some policies act on them."""
+    off = {name: answer.off for name, answer in EXECUTION_FIELDS.items() if answer.translated is None}
+    return {name: off.get(name, value) for name, value in data.items()}
+
+
+def ignored_fields(
+    adapter: str, args: Mapping[str, Any], *, chunking: ChunkingSpec | None = None
+) -> tuple[str, ...]:
+    """Return a sentence for each field of a policy's checkpoint that asks for what is not done here.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+        chunking: of the evaluation; None: it is the client's.
+
+    Raises:
+        CheckpointError: there is no checkpoint, or its configuration is damaged.
+    """
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return ()
+    file = find_checkpoint(Path(checkpoint)) / CONFIG_FILE
+    data = read_json(file)
+    return tuple(
+        f"{file}: {name} = {value!r:.200} is ignored: {answer.instead.format(value=value)}."
+        for name, answer in EXECUTION_FIELDS.items()
+        if answer.translated is None
+        and (value := data.get(name)) not in (None, False)
+        and not (isinstance(value, dict) and value.get("enabled") is False)
+        and not (name == "temporal_ensemble_coeff" and _ensembles(chunking, value))
+    )
+
+
+def _ensembles(chunking: ChunkingSpec | None, decay: object) -> bool:
+    """Whether an evaluation does what ACT's temporal ensembling does."""
+    return (
+        chunking is not None
+        and chunking.mode == "temporal_ensemble"
+        and (chunking.n_action_steps, chunking.ensemble_decay) == (1, decay)
+    )

@@ -1,0 +1,190 @@
+"""What an evaluation notes of the weights that a policy's recipe names: digests, statistics, training seeds.
+
+Knows nothing of models, and does not import torch: planning an evaluation must not wait for it.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any  # JSON of another program
+
+from vla_eval.checkpoints.files import (
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    TrainingFacts,
+    checkpoint_sha256,
+    find_checkpoint,
+    read_facts,
+)
+from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
+from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
+from vla_eval.seeding import SeedRange
+from vla_eval.strict.json_fields import get_mapping, get_text
+
+LEROBOT_ADAPTER = "lerobot"
+LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
+"""Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
+
+NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""What each of lerobot's kinds of normalisation takes; its other kind, IDENTITY, takes none. Source:
+https://github.com/huggingface/lerobot/blob/v0.6.1/src/lerobot/processor/normalize_processor.py"""
+LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
+OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
+
+
+def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
+    """Return digests of all that a policy's weights consist of, and of what they were trained on.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+        policy: the recipe's name.
+
+    Returns:
+        `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
+        without weights, or whose adapter is another package's.
+
+    Raises:
+        CheckpointError: the weights are not there.
+        RecipeError: an argument that names a folder is no text.
+    """
+    for name in ("checkpoint", "base_checkpoint"):
+        if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
+            raise RecipeError(
+                f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
+            )
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return {}
+    folder = find_checkpoint(Path(checkpoint))
+    hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
+    base = args.get("base_checkpoint")
+    if isinstance(base, str):
+        hashes[f"checkpoints/{policy}/base"] = checkpoint_sha256(Path(base))
+    facts = read_facts(folder)
+    if facts is not None:
+        hashes[f"datasets/{facts.dataset}"] = facts.dataset_sha256
+    return hashes
+
+
+def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by which statistics a policy normalises what it sees and un-normalises what it does.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Returns:
+        `of`: the dataset whose statistics they are, by its name, or `the checkpoint` where that is not
+        known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
+        is used. Empty for a policy without a checkpoint of LeRobot's.
+
+    Raises:
+        CheckpointError: a file that the checkpoint names is missing or damaged.
+    """
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return {}
+    folder = find_checkpoint(Path(checkpoint))
+    facts = read_facts(folder)
+    return {
+        "of": "the checkpoint" if facts is None else facts.dataset,
+        "before": _used(folder, PREPROCESSOR_FILE),
+        "after": _used(folder, POSTPROCESSOR_FILE),
+    }
+
+
+def training_seeds(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[SeedRange, ...]]:
+    """Return of which seeds a policy was shown demonstrations.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Returns:
+        Task id -> seeds; empty where they are not known.
+
+    Raises:
+        CheckpointError: what the checkpoint says of its training is damaged.
+    """
+    facts = _facts(adapter, args)
+    return {} if facts is None else facts.seeds or {}
+
+
+def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[str, ...]] | None:
+    """Return task id -> the sentences that a policy was trained with; None where they are not known.
+
+    Args:
+        adapter: registry name of the recipe's adapter.
+        args: the arguments of the recipe's adapter.
+
+    Raises:
+        CheckpointError: what the checkpoint says of its training is damaged.
+    """
+    facts = _facts(adapter, args)
+    return None if facts is None else facts.sentences
+
+
+def _facts(adapter: str, args: Mapping[str, Any]) -> TrainingFacts | None:
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return None
+    return read_facts(find_checkpoint(Path(checkpoint)))
+
+
+def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:
+    used: dict[str, dict[str, list[float]]] = {}
+    for step in read_saved_processor(folder / processor).steps:
+        file = step.state_file
+        if file is None or step.registry_name not in LEROBOT_STEPS | OWN_STEPS:
+            continue
+        state = _numbers(file)
+        for field, name, key in _names(step):
+            if key not in state:
+                raise CheckpointError(
+                    f"{file}: has no statistic '{name}' of '{field}', by which {processor} "
+                    f"normalises. Fetch the complete checkpoint."
+                )
+            used.setdefault(field, {})[name] = state[key]
+    return used
+
+
+def _names(step: SavedStep) -> Iterator[tuple[str, str, str]]:
+    """Yield field, statistic and the name of its tensor for all that a step uses."""
+    config, where = step.config, step.where
+    if step.registry_name in OWN_STEPS:
+        known = {str(kind): names for kind, names in STATISTICS.items()}
+        fields = get_mapping(config, "fields", where=where)
+        for field in fields:
+            kind = get_text(get_mapping(fields, field, where=where), "kind", where=where)
+            if kind not in known:
+                raise CheckpointError(
+                    f"{where}: {step.name} normalises '{field}' by '{kind}', known are "
+                    f"{', '.join(known)}. Use the version of mikasa-vla-eval that made the checkpoint."
+                )
+            for name in known[kind]:
+                yield field, name, f"{field}/{name}"
+        return
+    features, norm_map = (get_mapping(config, key, where=where) for key in ("features", "norm_map"))
+    for field in features:
+        kind = get_text(get_mapping(features, field, where=where), "type", where=where)
+        mode = get_text(norm_map, kind or "", where=where)
+        for name in NEEDED_STATISTICS.get(mode or "IDENTITY", ()):
+            yield field, name, f"{field}.{name}"
+
+
+def _numbers(file: Path) -> dict[str, list[float]]:
+    from safetensors.numpy import load_file  # with numpy, which most of planning does without
+
+    try:
+        tensors = load_file(file)
+    except Exception as exc:  # safetensors raises its own class, which is no public name
+        raise CheckpointError(
+            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
+        ) from exc
+    return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}

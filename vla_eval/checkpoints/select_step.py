@@ -1,0 +1,36 @@
+"""Ask a LeRobot policy that cannot be given frames from outside: one `select_action` per control step.
+
+Such a policy collects frames, and what is left of its chunk, in queues of its own. Each episode has its own
+instance of them: it is put in before the policy is asked, and taken out afterwards.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any, NamedTuple  # lerobot is untyped
+
+from torch import Tensor
+
+from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS
+
+
+class Step(NamedTuple):
+    """A chunk (B, 1, D) of one action, and the policy's queues after it."""
+
+    action: Tensor
+    queues: Mapping[str, Any]
+
+
+def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | None) -> Step:
+    """Return the next action of an episode.
+
+    Args:
+        policy: whose `reset` was just called.
+        batch: the newest frame (B, …).
+        queues: those after the previous step; None at the beginning of the episode. They are not changed.
+    """
+    owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
+    for name, value in (queues or {}).items():
+        setattr(owner, name, copy.deepcopy(value))
+    action: Tensor = owner.select_action(batch)
+    kept = {name: getattr(owner, name) for name in ASKED_FOR_STEPS[owner.config.type]}
+    return Step(action.unsqueeze(1), kept)

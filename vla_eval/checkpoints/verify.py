@@ -1,0 +1,191 @@
+"""Check a LeRobot checkpoint by using it: weights, statistics, and one chunk of finite actions.
+
+Knows nothing of tasks: whether the actions are any good is for an evaluation to measure.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from vla_eval.checkpoints.files import WEIGHTS_FILE, checkpoint_sha256, weights_file
+from vla_eval.checkpoints.loading import (
+    LoadedPolicy,
+    LoadOptions,
+    load_checkpoint,
+    make_unfilled_policy,
+    read_config,
+    read_weights,
+)
+from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, chunk_size, history, noise_shape
+from vla_eval.checkpoints.select_step import select_step
+from vla_eval.errors import CheckpointError, InvalidActionError
+from vla_eval.models.episodes.memory import remembers_singly
+from vla_eval.models.shared.weights import check_fit
+from vla_eval.models.vla_memory.fields import mask_field
+
+INSTRUCTION = "pick the cube"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verified:
+    """What was found.
+
+    Attributes:
+        folder: with the weights.
+        kind: lerobot's name of the policy's type.
+        n_tensors: in the file, each taken over with its shape and type.
+        n_parameters: of the model; shared ones once.
+        n_trained: of these, what the configuration trains.
+        statistics: `field.statistic` of what normalises.
+        chunk: shape of the actions of one forward pass.
+        sha256: digest of the checkpoint, as an evaluation notes it.
+    """
+
+    folder: Path
+    kind: str
+    n_tensors: int
+    n_parameters: int
+    n_trained: int
+    statistics: tuple[str, ...]
+    chunk: tuple[int, ...]
+    sha256: str
+
+    def lines(self) -> list[str]:
+        """Return lines for a person."""
+        return [
+            f"checkpoint   {self.folder} ({self.sha256[:12]})",
+            f"type         {self.kind}",
+            f"weights      {self.n_tensors} tensors, none missing, none left over, all finite",
+            f"parameters   {self.n_parameters:,}, of which {self.n_trained:,} are trained",
+            f"statistics   {', '.join(self.statistics) or 'none needed'}",
+            f"forward pass {' × '.join(map(str, self.chunk))} actions, all finite",
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Structure:
+    """What a checkpoint's header and its configuration say of each other, in agreement.
+
+    Attributes:
+        kind: lerobot's name of the policy's type.
+        n_tensors: in the file.
+        n_parameters: of the model; shared ones once.
+    """
+
+    kind: str
+    n_tensors: int
+    n_parameters: int
+
+    def line(self) -> str:
+        """Return a line for a person."""
+        return (
+            f"{self.kind}, {self.n_tensors} tensors with the names and shapes of the network, none missing, "
+            f"none left over; {self.n_parameters:,} parameters"
+        )
+
+
+def check_structure(folder: Path) -> Structure:
+    """Compare the names and shapes of a whole model's weights with the network, without loading them.
+
+    A base needs no statistics: a fine-tuning gives it those of its dataset. Types may differ from the
+    configuration's, since a recipe chooses the precision.
+
+    Raises:
+        CheckpointError: the configuration is refused, or tensors are missing, unexpected or of another shape.
+    """
+    config = read_config(folder, LoadOptions(device="cpu"))
+    policy = make_unfilled_policy(config, where=folder)
+    file = folder / WEIGHTS_FILE
+    weights = read_weights(file)
+    check_fit(policy, weights, where=str(file), cast=True)
+    return Structure(
+        kind=config.type,
+        n_tensors=len(weights),
+        n_parameters=sum(x.numel() for x in policy.parameters()),
+    )
+
+
+def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
+    """Load a checkpoint strictly and let it act once on random images.
+
+    Raises:
+        CheckpointError: weights, processors or statistics are not complete.
+        InvalidActionError: the actions have another shape than declared, or are not finite.
+    """
+    loaded = load_checkpoint(path, options)
+    with loaded.acting():
+        actions = _act(loaded)
+        expected = (1, chunk_size(loaded.config), int(loaded.config.action_feature.shape[0]))
+    if tuple(actions.shape) != expected or not torch.isfinite(actions).all():
+        raise InvalidActionError(
+            f"{loaded.folder}: expected finite actions of shape {expected}, found {tuple(actions.shape)}, "
+            f"finite: {bool(torch.isfinite(actions).all())}."
+        )
+    file = weights_file(loaded.folder)
+    assert file is not None  # it was just loaded
+    parameters = list(loaded.policy.parameters())
+    return Verified(
+        folder=loaded.folder,
+        kind=loaded.config.type,
+        n_tensors=_count_tensors(file),
+        n_parameters=sum(x.numel() for x in parameters),
+        n_trained=sum(x.numel() for x in parameters if x.requires_grad),
+        statistics=_used_statistics(loaded),
+        chunk=expected,
+        sha256=checkpoint_sha256(loaded.folder),
+    )
+
+
+def _count_tensors(file: Path) -> int:
+    """Count by the header alone: the weights have been read once already."""
+    with safe_open(file, framework="pt") as header:
+        return len(header.keys())
+
+
+@torch.no_grad()
+def _act(loaded: LoadedPolicy) -> Tensor:
+    config, draws = loaded.config, torch.Generator().manual_seed(0)
+    extra: dict[str, Any] = {}
+    shape = noise_shape(config)
+    if shape is not None:
+        extra["noise"] = torch.randn(1, *shape, generator=draws).to(config.device)
+    if callable(getattr(loaded.policy, "remember", None)):
+        times = () if remembers_singly(loaded.policy) else (0,)
+        extra["memory"] = loaded.policy.remember(
+            loaded.preprocessor(random_batch(config, times, draws)), None
+        )
+    loaded.policy.reset()
+    batch = loaded.preprocessor(random_batch(config, history(config), draws))
+    if config.type in ASKED_FOR_STEPS:
+        raw = select_step(loaded.policy, batch, None).action
+    else:
+        raw = loaded.policy.predict_action_chunk(batch, **extra)
+    actions: Tensor = loaded.postprocessor(raw)
+    return actions
+
+
+def random_batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -> dict[str, Any]:
+    """Return random fields of one episode, (1, …), or with frames in time (1, T, …)."""
+    batch: dict[str, Any] = {"task": [INSTRUCTION]}
+    times = (len(deltas),) if deltas else ()
+    for key, feature in config.input_features.items():
+        if not key.startswith("observation."):
+            raise CheckpointError(f"the field '{key}' is no observation; nothing can be made up for it.")
+        batch[key] = torch.rand(1, *times, *feature.shape, generator=draws)
+        if times:
+            batch[f"{key}_is_pad"] = torch.zeros(1, *times, dtype=torch.bool)
+        if key in getattr(config, "memory_fields", ()):
+            batch[mask_field(key)] = torch.ones(1, *times, dtype=torch.bool)
+    return batch
+
+
+def _used_statistics(loaded: LoadedPolicy) -> tuple[str, ...]:
+    found: dict[str, None] = {}
+    for step in (*loaded.preprocessor.steps, *loaded.postprocessor.steps):
+        for key, values in (getattr(step, "stats", None) or {}).items():
+            found.update(dict.fromkeys(f"{key}.{name}" for name in values))
+    return tuple(found)

@@ -1,0 +1,56 @@
+"""The flag `--cluster`: where workers, servers and fine-tunings run."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+from vla_eval.workers.needed_files import Needed
+
+
+def add_cluster(parser: argparse.ArgumentParser) -> None:
+    """Declare `--cluster`."""
+    parser.add_argument(
+        "--cluster",
+        metavar="WHERE",
+        help="run on a Ray cluster: auto, local or ray://HOST:PORT (docs/cluster.md)",
+    )
+
+
+@contextlib.contextmanager
+def backend_of(
+    args: argparse.Namespace,
+    *,
+    needs: Callable[[], tuple[Needed, ...]] = tuple,
+    notes_kinds: bool = True,
+) -> Iterator[Backend]:
+    """Give what `--cluster` names; without it, this machine.
+
+    Args:
+        args: of the command line.
+        needs: returns the files that each machine of a cluster must have; called if there is a cluster.
+        notes_kinds: whether results say what kind of machine they are from; else there must be one kind.
+
+    Raises:
+        RecipeError: the flag's value is no cluster.
+        MissingDependencyError, ClusterError: see `cluster`.
+    """
+    if args.cluster is None:
+        yield LOCAL
+        return
+    # Here and not above: `mikasa-vla --help` need not wait for it.
+    from vla_eval.workers.cluster.backend import cluster
+    from vla_eval.workers.cluster.connect import check_address
+
+    address = check_address(args.cluster)
+    allowed = notes_kinds and bool(getattr(args, "allow_environment_change", False))
+    with cluster(address, say=_say, allow_other_kind=allowed, needs=needs()) as backend:
+        yield backend
+
+
+def _say(line: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(line, file=sys.stderr)

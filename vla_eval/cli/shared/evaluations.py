@@ -1,0 +1,92 @@
+"""Run evaluations as the command line asks: one, or several one after another, each in its own folder."""
+
+import argparse
+import itertools
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_eval.cli.shared.arguments import typed_command
+from vla_eval.cli.terminal import progress
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import FolderInUseError
+from vla_eval.evaluation.evaluate import EvaluationSummary
+from vla_eval.policies.entries import PolicyEntry
+from vla_eval.workers.backend import Backend
+
+
+class Evaluations(NamedTuple):
+    """The result of several evaluations.
+
+    Attributes:
+        n_errors: episodes that ended in an error.
+        stopped: the exit code if a signal has stopped them; None: all are there.
+    """
+
+    n_errors: int
+    stopped: int | None
+
+
+def evaluate_one(
+    config: EvalConfig,
+    out: Path,
+    args: argparse.Namespace,
+    *,
+    stop: progress.StopRequest,
+    backend: Backend,
+    policies: Sequence[PolicyEntry] | None = None,
+) -> EvaluationSummary:
+    """Run or resume an evaluation as the command line asks, with progress; arguments as for `evaluate_each`.
+
+    `policies`: see `evaluate`.
+
+    Raises:
+        VlaEvalError: see `evaluate`.
+    """
+    return progress.evaluate_with_progress(
+        config,
+        out=out,
+        command=typed_command(),
+        stop=stop,
+        allow_environment_change=args.allow_environment_change,
+        shard=args.shard,
+        backend=backend,
+        json_progress=args.json_progress,
+        policies=policies,
+    )
+
+
+def evaluate_each(
+    runs: Iterable[tuple[Path, EvalConfig]], args: argparse.Namespace, *, backend: Backend
+) -> Evaluations:
+    """Run or resume each evaluation; a signal stops the one that runs, and those after it.
+
+    One that another process is writing comes after all others, so that several processes share the work.
+
+    Args:
+        runs: run folder and configuration of each.
+        args: of the command line: `--shard`, `--allow-environment-change` and `--json-progress`.
+        backend: where the workers run.
+
+    Raises:
+        FolderInUseError: another process is still writing when all others are finished.
+        VlaEvalError: see `evaluate`.
+    """
+    n_errors = 0
+    put_off: list[tuple[Path, EvalConfig]] = []
+    with progress.stop_on_signals() as stop:
+        for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
+            try:
+                summary = evaluate_one(config, out, args, stop=stop, backend=backend)
+            except FolderInUseError:
+                if (out, config) in put_off:
+                    raise
+                print(f"{out}: another process is writing into it; it comes last.", file=sys.stderr)
+                put_off.append((out, config))
+                continue
+            n_errors += summary.n_errors
+            if summary.was_stopped:
+                print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
+                return Evaluations(n_errors, stop.exit_code)
+    return Evaluations(n_errors, None)

@@ -1,0 +1,219 @@
+"""Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
+
+import os
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from vla_eval.cli.terminal.episode_bar import EpisodeBar
+from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines
+from vla_eval.config.capture import CaptureConfig
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
+from vla_eval.evaluation.plan import Plan
+from vla_eval.policies.entries import PolicyEntry
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.shard import Shard
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.load import Load
+from vla_eval.workers.local import LOCAL
+
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+STDERR = 2
+ANSWER_TO_STOP = "Stopping after this step, with a checkpoint. Once more: at once, without one."
+"""Of a training."""
+MEGABYTES_PER_FRAME = 0.9  # 3 × (512² + 2 × 128²) bytes
+
+
+@dataclass(slots=True)
+class StopRequest:
+    """The signal that asked the run to stop, if any."""
+
+    signal_number: int | None = None
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether a signal has come."""
+        return self.signal_number is not None
+
+    @property
+    def exit_code(self) -> int:
+        """What shells expect of a command that a signal has ended; without one, that of SIGTERM.
+
+        Of several processes that train together, the others stop, too.
+        """
+        return 128 + (self.signal_number or signal.SIGTERM)
+
+
+@contextmanager
+def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
+    """Turn Ctrl-C, SIGTERM and SIGHUP into a request, so that no record is cut in the middle.
+
+    A second signal does not wait: it raises KeyboardInterrupt.
+
+    Args:
+        answer: to the first one, a line on standard error.
+    """
+    request = StopRequest()
+
+    def ask(number: int, _frame: FrameType | None) -> None:
+        if request.is_asked:
+            raise KeyboardInterrupt
+        request.signal_number = number
+        if answer:
+            os.write(STDERR, f"\n{answer}\n".encode())  # `print` may be what was interrupted
+
+    previous: dict[int, Any] = {}  # Any: what `signal.signal` takes and gives
+    for name in STOP_SIGNALS:
+        number = getattr(signal, name)
+        # `nohup` has SIGHUP ignored: leave it so.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            previous[number] = signal.signal(number, ask)
+    try:
+        yield request
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def evaluate_with_progress(
+    config: EvalConfig,
+    *,
+    out: Path,
+    command: str,
+    stop: StopRequest,
+    allow_environment_change: bool = False,
+    shard: Shard | None = None,
+    backend: Backend = LOCAL,
+    json_progress: int | None = None,
+    policies: Sequence[PolicyEntry] | None = None,
+) -> EvaluationSummary:
+    """Run an evaluation with progress on standard error, and end early if asked to stop.
+
+    `json_progress` is the file descriptor of lines for other programs; `policies`: see `evaluate`.
+
+    Raises:
+        VlaEvalError: see `evaluate`.
+    """
+    progress = Progress(stop, out=out, capture=config.capture, json_progress=json_progress)
+    try:
+        return evaluate(
+            config,
+            out=out,
+            command=command,
+            allow_environment_change=allow_environment_change,
+            observer=progress,
+            shard=shard,
+            backend=backend,
+            policies=policies,
+        )
+    finally:
+        progress.close()
+
+
+def capture_cost(capture: CaptureConfig) -> str:
+    """Return what capturing takes, before it begins."""
+    return (
+        f"capturing: every {capture.frame_stride} control steps an image of 512 × 512 and two of 128 × 128, "
+        f"also for policies that read none; {MEGABYTES_PER_FRAME} MB of memory each until the episode is "
+        "over. On a CPU this is most of an episode's time: a larger capture.frame_stride costs less."
+    )
+
+
+def load_text(load: Load, *, n_open: int) -> str:
+    """Return what the machines of a cluster are doing, for a person; nothing for this machine alone.
+
+    Args:
+        load: of all workers.
+        n_open: episodes that have no result yet.
+    """
+    if not load.machines:
+        return ""
+    used = [machine for machine in load.machines if machine.is_used]
+    machines = "1 machine" if len(used) == 1 else f"{len(used)} machines"
+    shares = [machine.gpu_share for machine in used if machine.gpu_share is not None]
+    gpu = f", GPUs {sum(shares) / len(shares):.0%} busy" if shares else ""
+    return f"{machines}{gpu}, {max(0, n_open - load.n_running)} episodes in the queue"
+
+
+class Progress:
+    """Implements `EvaluationObserver` on standard error."""
+
+    def __init__(
+        self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
+    ) -> None:
+        """Take the request to stop, the run folder, what is captured, and where lines for programs go."""
+        lines = JsonLines(json_progress)
+        self._stop = stop
+        self._capture = capture
+        self._out = out
+        self._bar = EpisodeBar(is_quiet=lines.is_stderr)
+        self._lines = EvaluationLines(lines, out=out)
+        self._n_total = self._n_done = self._n_errors = self._n_results = self._n_successes = 0
+
+    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
+        """Say how much there is to do, and what is left out."""
+        self._lines.on_start(plan, n_finished=n_finished, n_workers=n_workers)
+        n_episodes = len(plan.jobs)
+        for pair in plan.left_out:
+            self._bar.write(f"left out: {pair}")
+        for warning in plan.warnings:
+            self._bar.write(f"warning: {warning}")
+        for note in plan.notes:
+            self._bar.write(f"note: {note}")
+        if n_finished == n_episodes:
+            self._bar.write(f"{self._out}: all {n_episodes} episodes are there")
+            return
+        workers = "1 worker" if n_workers == 1 else f"{n_workers} workers"
+        self._bar.write(
+            f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before; starting {workers}"
+        )
+        if self._capture.is_on:
+            self._bar.write(capture_cost(self._capture))
+        self._n_done, self._n_total = n_finished, n_episodes
+        self._bar.begin(n_done=n_finished, n_total=n_episodes)
+        self._bar.doing("starting processes, loading simulator and policies")
+
+    def on_device(self, device: Mapping[str, str]) -> None:
+        """Say that the first simulator is there, and what renders its images."""
+        renderer = device.get("render_device")
+        self._bar.doing(f"rendering on {renderer}" if renderer else "simulating")
+
+    def on_warning(self, line: str) -> None:
+        """Say it at once."""
+        self._bar.write(f"warning: {line}")
+
+    def on_record(self, record: EpisodeRecord) -> None:
+        """Count the record; say at once what went wrong."""
+        self._lines.on_record(record)
+        self._n_done += 1
+        if record.error is not None:
+            self._n_errors += 1
+            where = f"{record.policy} on {record.task}, seed {record.seed}, run {record.run}"
+            self._bar.write(f"error: {where}: {record.error.kind}: {record.error.message}")
+        else:
+            self._n_results += 1
+            self._n_successes += bool(record.success_once)
+        rate = f"success {self._n_successes / self._n_results:.2f}" if self._n_results else "no result yet"
+        note = f"{rate}, errors {self._n_errors}"
+        self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)
+
+    def on_load(self, load: Load) -> None:
+        """Show steps as they are executed, and of a cluster its queue and its machines."""
+        self._lines.on_load(load)
+        self._bar.load(load_text(load, n_open=self._n_total - self._n_done), n_steps=load.n_counted)
+
+    def on_tick(self) -> bool:
+        """Write a line now and then; return whether a signal has asked to stop."""
+        self._bar.tick()
+        self._lines.on_tick()
+        return self._stop.is_asked
+
+    def close(self) -> None:
+        """Write how far it has come."""
+        self._bar.close()
+        self._lines.close(stopped=self._stop.is_asked)

@@ -1,0 +1,1 @@
+"""Datasets made from datasets: another control mode, other actions, several mixed, rebuilt."""

@@ -1,0 +1,177 @@
+"""Convert the actions of a recorded dataset to another control mode: the same motion, commanded differently.
+
+Each episode is replayed as it was recorded, and the joint positions at which the arm's controller really
+aimed are read from the simulator. Then it is run again in the other mode, with actions that aim at them. An
+episode that does not succeed there is left out.
+"""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
+from vla_eval.data.derived.changed_actions import copy_with_actions
+from vla_eval.data.derived.converted_episode import convert_episode
+from vla_eval.data.derived.rebuild import failed_attempt
+from vla_eval.data.manifest import RecordedEpisode, read_facts, read_failed, read_manifest
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.jobs import TaskPlan
+from vla_eval.data.recording.plan import plan_recording
+from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
+from vla_eval.data.recording.seed_queue import Selection
+from vla_eval.data.replaying.replay import check_task_versions, recipe_of
+from vla_eval.data.replaying.report import manifest_sha256
+from vla_eval.data.tables import read_columns
+from vla_eval.envs.factory import make_env
+from vla_eval.errors import DatasetError
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Converted:
+    """What has come of a conversion.
+
+    Attributes:
+        dataset: the new dataset.
+        n_episodes: episodes of the old one.
+        n_same_states: how many of the new ones have the old one's states, bit for bit.
+        left_out: a sentence for each episode that is not in the new one.
+    """
+
+    dataset: RecordedDataset
+    n_episodes: int
+    n_same_states: int
+    left_out: tuple[str, ...]
+
+
+def convert_control_mode(
+    dataset: Path,
+    mode: str,
+    *,
+    out: Path,
+    observer: RecordingObserver,
+    workers: int | Literal["auto"] = "auto",
+    backend: Backend = LOCAL,
+) -> Converted | None:
+    """Write OUT/TASK with the episodes of a recorded dataset in another control mode.
+
+    Where all episodes survive with the states that were recorded, bit for bit, the images are those of the
+    recording. Otherwise they are rendered again; after an interruption the same call resumes the rendering.
+
+    Args:
+        dataset: the folder of one recorded dataset.
+        mode: the control mode of the new one.
+        out: another folder.
+        observer: gets the progress.
+        workers: processes that render.
+        backend: where they run.
+
+    Returns:
+        None if the observer asked to stop.
+
+    Raises:
+        UnknownNameError: there is no such mode.
+        DatasetError: there is no recorded dataset, or it has this mode, or no episode survives.
+    """
+    action_spec(mode)
+    begun = time.monotonic()
+    facts, episodes = read_facts(dataset), read_manifest(dataset)
+    if facts.control_mode == mode:
+        raise DatasetError(f"{dataset}: its actions are for {mode} already. Name another --control-mode.")
+    check_task_versions(dataset, episodes)
+    recipe = recipe_of(facts)
+    recipe = dataclasses.replace(
+        recipe, tasks=(facts.task,), workers=workers, env=_env_arguments(recipe, mode), episodes=len(episodes)
+    )
+    (plan,) = plan_recording(recipe).tasks
+    tried = _try_all(dataset, episodes, plan, observer)
+    if tried is None:
+        return None
+    kept = [one for one, why in tried if not why]
+    if not kept:
+        raise DatasetError(f"{dataset}: no episode succeeds in {mode}; the first: {tried[0][1]}.")
+    earlier = [failed_attempt(one.seed, one.n_steps) for one in read_failed(dataset)]
+    failed = [*earlier, *(one for one, why in tried if why)]
+    recorded = {episode.seed: episode.states_sha256 for episode in episodes}
+    n_same_states = sum(one.states_sha256 == recorded[one.seed] for one in kept)
+    recipe = dataclasses.replace(recipe, episodes=len(kept))
+    if n_same_states == len(episodes):
+        made = _copied(dataset, out / plan.task, episodes, kept, recipe, begun=begun)
+        return Converted(dataset=made, n_episodes=len(episodes), n_same_states=n_same_states, left_out=())
+    summary = run_plan(
+        recipe,
+        plan_recording(recipe),
+        out=out,
+        observer=observer,
+        selections={plan.task: Selection(kept=tuple(kept), failed=tuple(sorted(failed, key=_seed)))},
+        source=manifest_sha256(dataset),
+        backend=backend,
+    )
+    if summary.was_stopped:
+        return None
+    (made,) = summary.datasets
+    return Converted(
+        dataset=made,
+        n_episodes=len(episodes),
+        n_same_states=n_same_states,
+        left_out=tuple(f"seed {one.seed}: {why}" for one, why in tried if why),
+    )
+
+
+def _copied(
+    dataset: Path,
+    path: Path,
+    episodes: Sequence[RecordedEpisode],
+    kept: Sequence[Attempt],
+    recipe: DatasetRecipe,
+    *,
+    begun: float,
+) -> RecordedDataset:
+    """Return the new dataset with the images of the old one."""
+    changed = [
+        dataclasses.replace(
+            episode,
+            env_kwargs=dict(recipe.env),
+            actions=one.actions,
+            intended_actions=one.intended_actions,
+        )
+        for episode, one in zip(episodes, kept, strict=True)
+    ]
+    copy_with_actions(dataset, path, changed, recipe)
+    return RecordedDataset.read(path, seconds=time.monotonic() - begun)
+
+
+def _seed(one: Attempt) -> int:
+    return one.seed
+
+
+def _env_arguments(recipe: DatasetRecipe, mode: str) -> dict[str, object]:
+    """Return the task's arguments with the new mode; the default is not named, as in a recording."""
+    arguments = {name: value for name, value in recipe.env.items() if name != CONTROL_MODE}
+    return arguments if mode == EE_DELTA_POSE else {**arguments, CONTROL_MODE: mode}
+
+
+def _try_all(
+    dataset: Path, episodes: Sequence[RecordedEpisode], plan: TaskPlan, observer: RecordingObserver
+) -> list[tuple[Attempt, str]] | None:
+    """Return each episode in the new mode, with the reason why it does not survive, or an empty text."""
+    old = make_env(dataclasses.replace(plan.group.env, kwargs=episodes[0].env_kwargs))
+    new = make_env(plan.group.env)
+    columns = read_columns(dataset)
+    observer.on_phase(plan.task, "converting", n_done=0, n_total=len(episodes))
+    tried = []
+    try:
+        for episode in episodes:
+            if observer.on_tick():
+                return None
+            tried.append(convert_episode(old, new, episode, columns, plan))
+            observer.on_progress(n_done=len(tried))
+    finally:
+        old.close()
+        new.close()
+    return tried

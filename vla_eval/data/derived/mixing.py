@@ -1,0 +1,178 @@
+"""Put complete datasets of several tasks together as one LeRobotDataset, for a policy that learns them all.
+
+lerobot's `aggregate_datasets` does it: tables and videos stay files of their own, videos byte for byte;
+episodes, frames and sentences are numbered again. Everything is checked before anything is written, and the
+new dataset appears whole or not at all. The sources stay as they are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+from lerobot.datasets.compute_stats import aggregate_stats
+from lerobot.datasets.io_utils import write_stats
+
+from vla_eval import __version__
+from vla_eval.data.check import require_checked
+from vla_eval.data.completeness import check_complete, files_sha256
+from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
+from vla_eval.data.imported import ImportFacts
+from vla_eval.data.manifest import DatasetFacts, read_failed, read_manifest
+from vla_eval.data.mixture import MixtureFacts, MixtureSource, write_mixture
+from vla_eval.data.opening import join_datasets, open_local_dataset
+from vla_eval.data.replaying.report import require_passed
+from vla_eval.data.tables import read_columns
+from vla_eval.errors import DatasetError
+from vla_eval.storage.drafts import whole_folder
+from vla_eval.storage.durable import storage_full
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Opened:
+    """A complete dataset of one task.
+
+    Attributes:
+        root: its folder.
+        facts: what it says of itself.
+        meta: lerobot's description of it.
+    """
+
+    root: Path
+    facts: DatasetFacts | ImportFacts
+    meta: Any
+
+
+def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
+    """Write one dataset of the episodes of several, in their order; return what it is.
+
+    Args:
+        roots: folders of complete datasets, at least two.
+        out: the folder to make.
+
+    Raises:
+        DatasetError: one is not complete, its replay found a mismatch, two are the same or differ in what a
+            policy sees or does; or `out` exists.
+        StorageFullError: it could not be written; nothing is left.
+    """
+    opened = [_open(root) for root in roots]
+    if len(opened) < 2:
+        raise DatasetError(f"expected at least two datasets to mix, found {len(opened)}.")
+    for other in opened[1:]:
+        _refuse_difference(opened[0], other)
+    sources = tuple(_source(one) for one in opened)
+    _refuse_repetition(sources)
+    try:
+        with whole_folder(out, error=DatasetError) as draft:
+            _aggregate([one.root for one in opened], draft)
+            write_statistics(draft, [one.meta for one in opened])
+            facts = MixtureFacts(
+                complete=True,
+                state=opened[0].facts.state,
+                control_mode=opened[0].facts.control_mode,
+                sources=sources,
+                files=digest_files(draft),
+                vla_eval_version=__version__,
+            )
+            write_mixture(draft, facts)
+    except OSError as exc:
+        raise storage_full(out, exc) from exc
+    return facts
+
+
+def _open(root: Path) -> _Opened:
+    facts = check_complete(root)
+    if isinstance(facts, MixtureFacts):
+        names = ", ".join(source.name for source in facts.sources)
+        raise DatasetError(f"{root}: is a mixture itself, of {names}. Name those instead.")
+    dataset = open_local_dataset(root)
+    require_checked(dataset, facts)
+    return _Opened(root=root, facts=facts, meta=dataset.meta)
+
+
+def _source(opened: _Opened) -> MixtureSource:
+    root, facts, meta = opened.root, opened.facts, opened.meta
+    is_recorded = isinstance(facts, DatasetFacts)
+    return MixtureSource(
+        name=root.resolve().name,
+        task=facts.task,
+        task_version=facts.task_version if isinstance(facts, DatasetFacts) else None,
+        instructions=tuple(sorted(str(sentence) for sentence in meta.tasks.index)),
+        n_episodes=int(meta.total_episodes),
+        n_frames=int(meta.total_frames),
+        sha256=files_sha256(facts.files),
+        seeds=tuple(episode.seed for episode in read_manifest(root)) if is_recorded else None,
+        failed_seeds=tuple(failed.seed for failed in read_failed(root)) if is_recorded else (),
+        was_replayed=is_recorded and require_passed(root) is not None,
+    )
+
+
+def _refuse_difference(first: _Opened, other: _Opened) -> None:
+    """Raise `DatasetError` where two datasets differ in what a policy sees or does."""
+    expected, found = _form(first), _form(other)
+    for what in {**expected, **found}:
+        if expected.get(what) != found.get(what):
+            raise DatasetError(
+                f"{first.root} and {other.root} cannot be mixed: {what} is {_shown(expected.get(what))} in "
+                f"the first and {_shown(found.get(what))} in the second. Record or convert one as the other."
+            )
+
+
+def _form(opened: _Opened) -> dict[str, Any]:
+    """Return what has to be alike: name -> value. How frames were encoded may differ."""
+    features: dict[str, Any] = opened.meta.features
+    return {
+        "the state": opened.facts.state,
+        "the control mode": opened.facts.control_mode,
+        "frames per second": opened.meta.fps,
+        **{f"the shape of {name}": tuple(feature["shape"]) for name, feature in features.items()},
+        **{f"the type of {name}": feature["dtype"] for name, feature in features.items()},
+        **{f"the names of {name}": feature.get("names") for name, feature in features.items()},
+        "the robot": opened.meta.robot_type,
+    }
+
+
+def _shown(value: object) -> str:
+    return "not there" if value is None else str(value)
+
+
+def _refuse_repetition(sources: Sequence[MixtureSource]) -> None:
+    by_content: dict[str, str] = {}
+    for source in sources:
+        if source.sha256 in by_content:
+            raise DatasetError(
+                f"{by_content[source.sha256]} and {source.name} are the same dataset: its episodes would "
+                "count twice. Name it once."
+            )
+        by_content[source.sha256] = source.name
+
+
+def _aggregate(roots: Sequence[Path], draft: Path) -> None:
+    try:
+        join_datasets(roots, draft, concatenate_videos=False, concatenate_data=False)
+    except ValueError as exc:
+        raise DatasetError(
+            f"lerobot cannot put {', '.join(str(root) for root in roots)} together: {exc!s:.300}"
+        ) from exc
+
+
+def write_statistics(root: Path, metas: Sequence[Any]) -> None:
+    """Write statistics over all frames: of numbers from their rows, of images from those of the sources.
+
+    Those of images have no quantiles: what the sources know of them does not give that of all pixels. The
+    rest is exact (`exact_statistics` says what lerobot makes of quantiles).
+    """
+    numbers = {key: rows.reshape(len(rows), -1) for key, rows in read_columns(root).items()}
+    cameras = metas[0].video_keys
+    images = aggregate_stats(
+        [
+            {
+                camera: {name: value for name, value in meta.stats[camera].items() if name not in QUANTILES}
+                for camera in cameras
+            }
+            for meta in metas
+        ]
+    )
+    in_order = {camera: images[camera] for camera in cameras}  # lerobot's is that of a set
+    write_stats({**{key: vector_statistics(rows) for key, rows in numbers.items()}, **in_order}, root)

@@ -1,0 +1,109 @@
+"""Rebuild a dataset from its manifest: an episode is a function of (task, arguments, seed, actions).
+
+For a dataset whose videos or tables are damaged or were never fetched, and for one that is to be
+rendered with other settings. It runs the second pass of a recording, with its shards and its checks.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from vla_eval.data.manifest import FAILED_FILE, RecordedEpisode, read_facts, read_failed, read_manifest
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.plan import plan_recording
+from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
+from vla_eval.data.recording.seed_queue import Selection
+from vla_eval.data.replaying.replay import check_task_versions, recipe_of
+from vla_eval.data.replaying.report import manifest_sha256
+from vla_eval.errors import DatasetError
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rebuilt:
+    """The new dataset, and how many of its episodes have the raw images of the old one."""
+
+    dataset: RecordedDataset
+    n_same_images: int
+
+
+def rebuild(
+    dataset: Path,
+    *,
+    out: Path,
+    observer: RecordingObserver,
+    workers: int | Literal["auto"] = "auto",
+    backend: Backend = LOCAL,
+) -> Rebuilt | None:
+    """Rebuild a dataset in OUT/TASK; after an interruption the same call resumes.
+
+    Args:
+        dataset: the old dataset; only its manifest and its recipe are read.
+        out: another folder.
+        observer: gets the progress.
+        workers: processes.
+        backend: where they run.
+
+    Returns:
+        What has come of it; None if the observer asked to stop.
+
+    Raises:
+        DatasetError: there is no manifest or recipe, or the task has changed since.
+        RecordingError: the actions do not lead to the recorded states on this machine.
+    """
+    episodes = read_manifest(dataset)
+    if not episodes:
+        raise DatasetError(f"{dataset}: the manifest has no episodes.")
+    check_task_versions(dataset, episodes)
+    task = episodes[0].task
+    recipe = dataclasses.replace(recipe_of(read_facts(dataset)), tasks=(task,), workers=workers)
+    failed = read_failed(dataset) if (dataset / FAILED_FILE).exists() else ()
+    selection = Selection(
+        kept=tuple(_attempt(episode) for episode in episodes),
+        failed=tuple(failed_attempt(one.seed, one.n_steps) for one in failed),
+    )
+    summary = run_plan(
+        recipe,
+        plan_recording(recipe),
+        out=out,
+        observer=observer,
+        selections={task: selection},
+        source=manifest_sha256(dataset),
+        backend=backend,
+    )
+    if summary.was_stopped:
+        return None
+    (made,) = summary.datasets
+    pairs = zip(episodes, read_manifest(made.path), strict=True)
+    return Rebuilt(
+        dataset=made, n_same_images=sum(old.images_sha256 == new.images_sha256 for old, new in pairs)
+    )
+
+
+def _attempt(episode: RecordedEpisode) -> Attempt:
+    return Attempt(
+        seed=episode.seed,
+        success_step=episode.success_step,
+        n_steps=episode.n_steps,
+        cue_steps=episode.cue_steps,
+        delay_steps=episode.delay_steps,
+        actions=episode.actions,
+        intended_actions=episode.intended_actions,
+        states_sha256=episode.states_sha256,
+    )
+
+
+def failed_attempt(seed: int, n_steps: int) -> Attempt:
+    """Return what is known of a failed seed; nobody renders it."""
+    return Attempt(
+        seed=seed,
+        success_step=None,
+        n_steps=n_steps,
+        cue_steps=0,
+        delay_steps=0,
+        actions="",
+        intended_actions=None,
+        states_sha256="",
+    )

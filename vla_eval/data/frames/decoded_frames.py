@@ -1,0 +1,242 @@
+"""A `LeRobotDataset` that decodes each frame once: the same samples, without video decoding per sample.
+
+lerobot decodes video for every sample of every epoch. Frames of 128×128 are small: 5000 of two cameras
+take 470 MiB, which a memory map serves from the page cache to any number of loader processes.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args  # Any: lerobot and datasets are untyped
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from vla_eval.core import ImageArray
+from vla_eval.data.frames.frame_cache import (
+    EpisodeRows,
+    FrameSource,
+    channels_first,
+    frames_in_ram,
+    frames_on_disk,
+)
+from vla_eval.data.rewards import rewards_of
+from vla_eval.errors import DatasetError, check_names
+from vla_eval.features import REWARD_KEY, RewardKind
+from vla_eval.models.shared.levels import in_numbers
+from vla_eval.strict.renamed import warn_renamed
+
+Storage = Literal["disk", "ram"]
+Sample = dict[str, Any]  # Any: tensors, and the task's sentence
+
+
+class FrameLayout(NamedTuple):
+    """(N, 2) first and stop row of each sample's episode, and what has to be decoded."""
+
+    bounds: torch.Tensor
+    frames: FrameSource
+
+
+class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
+    """Serves what `source[i]` serves, bit for bit, from decoded frames.
+
+    Chunks (`delta_timestamps`), `*_is_pad`, `episodes`, `image_transforms` and `return_uint8` are those
+    of the source. It has the attributes that lerobot's training loop reads of a dataset.
+
+    Args:
+        source: a dataset that can be read.
+        storage: `disk` keeps the frames in a memory-mapped file in the user's cache; `ram` in this process
+            (loader processes share them), for machines whose disk is smaller than their RAM. The old name
+            `memory` still means `ram`, with a warning.
+        cache: the folder for decoded frames; by default in the user's cache.
+        whole_episodes: serve for each frame the sample of its episode's last frame. For policies with a
+            memory, whose window reaches back to the beginning: a window that ends in the middle is a part
+            of the same sample.
+        reward: what `next.reward` is, see `rewards_of`; None: as the table has it, if it has it.
+
+    Raises:
+        DatasetError: cameras that are not videos, a damaged file, no rewards of that kind, or no room for the
+            frames.
+        UnknownNameError: `delta_timestamps` names a field that is not there, or `storage` is another word.
+    """
+
+    def __init__(
+        self,
+        source: LeRobotDataset,
+        *,
+        storage: Storage | Literal["memory"] = "disk",
+        cache: Path | None = None,
+        whole_episodes: bool = False,
+        reward: RewardKind | None = None,
+    ) -> None:
+        if storage == "memory":
+            warn_renamed("storage='memory'", "storage='ram'")
+            storage = "ram"
+        check_names("storage", [storage], get_args(Storage), where="DecodedFramesDataset")
+        reader = source._ensure_reader()
+        self.source, self._whole_episodes = source, whole_episodes
+        self.meta, self.episodes = source.meta, source.episodes
+        self._deltas: Mapping[str, list[int]] | None = reader.delta_indices
+        self._transforms: Callable[[Any], Any] | None = reader._image_transforms
+        self._return_uint8 = bool(reader._return_uint8)
+        self._columns = read_columns(source)
+        check_names("field", self._deltas or (), source.meta.features, where="delta_timestamps")
+        self._bounds, frame_source = frame_layout(source, self._columns)
+        if reward is not None:
+            rewards = rewards_of(self._columns, self._bounds, reward, root=source.root)
+            self._columns[REWARD_KEY] = rewards
+        self._files: dict[str, Path] = {}
+        self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share
+        if storage == "disk":
+            self._files = frames_on_disk(frame_source, cache)
+            self._open()
+        else:
+            arrays = frames_in_ram(frame_source)
+            self._frames = {camera: torch.from_numpy(array) for camera, array in arrays.items()}
+
+    @property
+    def num_frames(self) -> int:
+        """Number of samples."""
+        return int(self._bounds.shape[0])
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of selected episodes."""
+        return int(self.source.num_episodes)
+
+    @property
+    def features(self) -> Any:
+        """The fields, as lerobot describes them."""
+        return self.source.features
+
+    @property
+    def fps(self) -> int:
+        """Frames per second."""
+        return int(self.source.fps)
+
+    @property
+    def hf_dataset(self) -> Any:
+        """The table of all that is not an image."""
+        return self.source.hf_dataset
+
+    @property
+    def absolute_to_relative_idx(self) -> dict[int, int] | None:
+        """Frame number in the whole dataset -> number here, where only some episodes are selected."""
+        mapping: dict[int, int] | None = self.source.absolute_to_relative_idx
+        return mapping
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    def __getitem__(self, index: int) -> Sample:
+        """Return one sample; every tensor in it is a new one."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        index %= len(self)
+        if self._whole_episodes:
+            index = int(self._bounds[index, 1]) - 1
+        fields = {
+            key: column[index].clone() if isinstance(column, torch.Tensor) else column[index]
+            for key, column in self._columns.items()
+        }
+        rows, padding = self._queries(index)
+        fields |= padding
+        for key, chosen in rows.items():
+            if key not in self._frames:
+                fields[key] = self._columns[key][chosen]
+        sample = {**self._images(index, rows), **fields}
+        sample["task"] = self.meta.tasks.iloc[fields["task_index"].item()].name
+        return sample
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave mapped files behind: another process maps them itself."""
+        return {**self.__dict__, "_frames": {} if self._files else self._frames}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self._files:
+            self._open()
+
+    def _open(self) -> None:
+        for camera, path in self._files.items():
+            frames: ImageArray = np.load(path, mmap_mode="r", allow_pickle=False)
+            if len(frames) != len(self):
+                raise DatasetError(
+                    f"{path}: holds {len(frames)} frames, expected {len(self)}. Delete the folder "
+                    f"{path.parent}: it is made again."
+                )
+            self._frames[camera] = frames
+
+    def _queries(self, index: int) -> tuple[dict[str, list[int]], dict[str, torch.Tensor]]:
+        """Return field -> rows, those beyond the episode replaced by its ends, and which ones were."""
+        first, stop = self._bounds[index].tolist()
+        rows, padding = {}, {}
+        for key, deltas in (self._deltas or {}).items():
+            wanted = [index + delta for delta in deltas]
+            rows[key] = [max(first, min(stop - 1, row)) for row in wanted]
+            padding[f"{key}_is_pad"] = torch.tensor([not first <= row < stop for row in wanted])
+        return rows, padding
+
+    def _images(self, index: int, rows: Mapping[str, list[int]]) -> Sample:
+        """Return the images of a sample by field; `rows` has those of fields with an axis of time."""
+        return {camera: self._image(camera, rows.get(camera, [index])) for camera in self._frames}
+
+    def _image(self, camera: str, rows: list[int]) -> torch.Tensor:
+        taken = self._frames[camera][rows]  # a list of rows copies
+        frames = torch.from_numpy(taken) if isinstance(taken, np.ndarray) else taken
+        frames = frames.squeeze(0)
+        frames = frames if self._return_uint8 else in_numbers(frames)
+        return frames if self._transforms is None else self._transforms(frames)
+
+
+def read_columns(source: LeRobotDataset) -> dict[str, Any]:
+    """Return column -> a tensor with one row per frame, or the list of values if they are no numbers.
+
+    `torch.tensor` of Python numbers, as lerobot's own transform does it row by row: same types.
+    """
+    refused = [key for key in source.meta.camera_keys if key not in source.meta.video_keys]
+    refused += list(source.meta.depth_keys)
+    if refused:
+        raise DatasetError(
+            f"{source.root}: the cameras {', '.join(refused)} are not RGB videos. Only those are decoded "
+            f"ahead; use lerobot's own loader for this dataset."
+        )
+    plain = source.hf_dataset.with_format(None)[:]
+    columns: dict[str, Any] = {}
+    for key, values in plain.items():
+        is_text = bool(values) and isinstance(values[0], str | dict | type(None))
+        columns[key] = values if is_text else torch.tensor(values)
+    return columns
+
+
+def frame_layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> FrameLayout:
+    """Return where the loaded dataset's frames are.
+
+    Args:
+        source: the dataset.
+        columns: see `read_columns`.
+
+    Raises:
+        DatasetError: the frames of an episode do not follow each other.
+    """
+    indices, numbers = columns["index"].tolist(), columns["episode_index"].tolist()
+    times_s = columns["timestamp"].tolist()
+    bounds = torch.empty((len(indices), 2), dtype=torch.long)
+    episodes = []
+    row = 0
+    while row < len(indices):
+        ends = source.meta.episodes[numbers[row]]
+        stop = row + ends["dataset_to_index"] - ends["dataset_from_index"]
+        expected = list(range(ends["dataset_from_index"], ends["dataset_to_index"]))
+        if indices[row:stop] != expected:
+            raise DatasetError(
+                f"{source.root}: the frames of episode {numbers[row]} are not numbered {expected[0]} to "
+                f"{expected[-1]} in a row. The files in data/ and meta/episodes/ are not of one dataset."
+            )
+        bounds[row:stop] = torch.tensor([row, stop])
+        episodes.append(
+            EpisodeRows(index=numbers[row], first=row, stop=stop, timestamps_s=tuple(times_s[row:stop]))
+        )
+        row = stop
+    shapes = {key: channels_first(source.meta.features[key]) for key in source.meta.video_keys}
+    return FrameLayout(bounds, FrameSource(dataset=source, shapes=shapes, episodes=episodes))

@@ -1,0 +1,1 @@
+"""Record demonstrations: seeds, episodes, shards, whole datasets; resumable. Knows no training."""

@@ -1,0 +1,224 @@
+"""What a recording keeps while it runs, so that it can be stopped at any moment.
+
+    OUT/TASK/                            a finished dataset; appears in one step
+    OUT/recording/run.json               recipe and environment it was started with, and each continuation
+    OUT/recording/TASK/attempts.jsonl    one `Attempt` per line, in the order they came
+    OUT/recording/TASK/shards/shard-00000  finished shards; removed once the dataset is there
+    OUT/recording/logs/worker-0.log      what workers wrote
+    OUT/recording/recording.lock         held by the process that records
+
+Only the parent process writes here, but for shards and datasets. Knows nothing of what they hold.
+"""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from vla_eval.data.manifest import RECORDING_FILE
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.errors import DatasetError, RunFolderError
+from vla_eval.lock.switch import let_write
+from vla_eval.storage.continuing import continued, without_device
+from vla_eval.storage.durable import LineFile, sync_folder
+from vla_eval.storage.episodes_file import cut_tail, read_lines
+from vla_eval.storage.run_file import (
+    DEVICE,
+    RUN_FILE,
+    JsonValue,
+    RunDescription,
+    RunFile,
+    environment_changed,
+    find_changes,
+)
+from vla_eval.storage.starting import StartedFolder, starting
+from vla_eval.strict.json_text import Source, as_dataclass, read_json
+
+STATE_FOLDER = "recording"
+LOCK_FILE = "recording.lock"
+ATTEMPTS_FILE = "attempts.jsonl"
+SHARDS = "shards"
+_OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOCK_FILE)  # of a recording that has no attempt yet
+
+
+class RecordingFolder:
+    """The folder of a recording that this process writes into; make it with `open`."""
+
+    def __init__(self, out: Path, started: StartedFolder, run_file: RunFile) -> None:
+        """Use `open`."""
+        self.out = out
+        self._started = started
+        self._run_file = run_file
+        self._attempts: dict[str, LineFile] = {}
+
+    @classmethod
+    def open(cls, out: Path, description: RunDescription, *, allow_environment_change: bool) -> Self:
+        """Start a recording in a folder, or resume the one that is there.
+
+        Args:
+            out: the folder; it is made if it is not there.
+            description: recipe and environment; they must be what they were before.
+            allow_environment_change: resume although commit, versions or machine have changed.
+
+        Raises:
+            RunChangedError: recipe or environment are not what they were; the message says in what.
+            RunFolderError: another process records there, or the folder is somebody else's.
+            StorageFullError: the disk is full.
+        """
+        state = out / STATE_FOLDER
+        let_write(out)
+
+        def make(folder: Path) -> None:
+            _refuse_foreign(out)
+            folder.mkdir(parents=True, exist_ok=True)
+
+        with starting(
+            state, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a recording", make=make
+        ) as started:
+            run_file = continued(
+                state, description, shown=out, allow_environment_change=allow_environment_change
+            )
+            run_file.save(state)
+            sync_folder(out)
+        return cls(out, started, run_file)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the files and let other processes in; a start that failed leaves nothing behind."""
+        for file in self._attempts.values():
+            file.close()
+        self._attempts = {}
+        if isinstance(value, Exception):
+            self._started.start.undo()
+        self._started.lock.release()
+
+    @property
+    def environment(self) -> Mapping[str, JsonValue]:
+        """The environment that the recording was started in, without the device."""
+        return without_device(self._run_file.description.environment)
+
+    @property
+    def device(self) -> dict[str, str]:
+        """What is known of the device that renders the images."""
+        return device_of(self._run_file)
+
+    def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
+        """Record the device; all images of a dataset must come from one device.
+
+        Raises:
+            RunChangedError: it is another one than before, and changes are not allowed.
+        """
+        changes = find_changes(
+            {name: value for name, value in self.device.items() if name in device},
+            {name: value for name, value in device.items() if name in self.device},
+            prefix=f"environment.{DEVICE}",
+        )
+        if changes and not allow_change:
+            raise environment_changed(changes, self.out)
+        if dict(device) != self.device:
+            self._run_file = self._run_file.with_device({**self.device, **device}, changes)
+            self._run_file.save(self.out / STATE_FOLDER)
+
+    def logs(self) -> Path:
+        """Return the folder of the workers' logs."""
+        return _made(self.out / STATE_FOLDER / "logs")
+
+    def dataset(self, task: str) -> Path:
+        """Return where the dataset of a task appears."""
+        return self.out / task
+
+    def is_finished(self, task: str) -> bool:
+        """Whether the dataset of a task is there; it appears only when it is complete."""
+        return (self.dataset(task) / RECORDING_FILE).exists()
+
+    def shard(self, task: str, index: int) -> Path:
+        """Return where a shard appears."""
+        path = shard_path(self.out, task, index)
+        _made(path.parent)
+        return path
+
+    def attempts(self, task: str) -> dict[int, Attempt]:
+        """Return seed -> attempt of all that is known.
+
+        Raises:
+            DatasetError: the file is damaged.
+        """
+        cut_tail(self._task_folder(task) / ATTEMPTS_FILE)
+        return read_attempts(self.out, task)
+
+    def append(self, task: str, attempt: Attempt) -> None:
+        """Keep an attempt; it is durable when this returns.
+
+        Raises:
+            StorageFullError: it could not be stored.
+        """
+        if task not in self._attempts:
+            self._attempts[task] = LineFile(self._task_folder(task) / ATTEMPTS_FILE, durable=True)
+        self._attempts[task].append(json.dumps(dataclasses.asdict(attempt)))
+
+    def remove_shards(self, task: str) -> None:
+        """Remove what is not needed once the dataset is there."""
+        remove_shards(self.out, task)
+
+    def _task_folder(self, task: str) -> Path:
+        return _made(self.out / STATE_FOLDER / task)
+
+
+def read_attempts(out: Path, task: str) -> dict[int, Attempt]:
+    """Return seed -> attempt of a recording, without touching it.
+
+    Raises:
+        DatasetError: the file is damaged.
+    """
+    path = out / STATE_FOLDER / task / ATTEMPTS_FILE
+    lines = read_lines(path).split(b"\n")[:-1]
+    found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
+    return {one.seed: one for one in found}
+
+
+def shard_path(out: Path, task: str, index: int) -> Path:
+    """Return where a shard of a recording is, or would be."""
+    return out / STATE_FOLDER / task / SHARDS / f"shard-{index:05d}"
+
+
+def device_of(run_file: RunFile) -> dict[str, str]:
+    """Return what is known of the device that renders the images."""
+    device = run_file.description.environment.get(DEVICE)
+    return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
+
+
+def remove_shards(out: Path, task: str) -> None:
+    """Remove the shards of a recording, which are not needed once the dataset is there."""
+    shutil.rmtree(out / STATE_FOLDER / task / SHARDS, ignore_errors=True)
+
+
+def _refuse_foreign(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise RunFolderError(f"{out}: expected a folder, found a file. Use another --out.")
+    if not out.exists() or (out / STATE_FOLDER).exists():
+        return
+    names = sorted(entry.name for entry in out.iterdir())
+    if names:
+        shown = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+        raise RunFolderError(
+            f"{out}: holds other files ({shown}) and no recording: nothing is written into it. Use another "
+            f"--out."
+        )
+
+
+def _attempt(line: bytes, *, where: str) -> Attempt:
+    remedy = "The file was changed by another program; restore it or record into another --out."
+    source = Source(where=where, what="an attempt", remedy=remedy, error=DatasetError)
+    return as_dataclass(Attempt, read_json(line, source), source)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,368 @@
+"""Record demonstrations: choose seeds without rendering, render and encode what is kept, put it together.
+
+One LeRobotDataset per task, OUT/TASK, since policies are trained per task. It may be stopped at any
+moment, by any means: the same call resumes where it stopped. The result depends neither on that, nor on the
+number of workers.
+"""
+
+import functools
+import importlib
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal, Protocol, Self
+
+from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe
+from vla_eval.config.files import content_of, options_of
+from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed, read_manifest
+from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.folder import RecordingFolder
+from vla_eval.data.recording.jobs import (
+    AttemptJob,
+    DatasetWritten,
+    JoinJob,
+    Origin,
+    RecordingAnswer,
+    RecordingJob,
+    ShardJob,
+    ShardWritten,
+    TaskPlan,
+    join_job,
+    shard_jobs,
+)
+from vla_eval.data.recording.plan import RecordingPlan, plan_recording
+from vla_eval.data.recording.seed_queue import SeedQueue, Selection
+from vla_eval.errors import RecordingError
+from vla_eval.storage.provenance import collect_environment
+from vla_eval.storage.run_file import RunDescription
+from vla_eval.storage.shard import Shard
+from vla_eval.workers.backend import Backend, Pool
+from vla_eval.workers.framing import send_message
+from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.job_list import JobList
+from vla_eval.workers.local import LOCAL
+from vla_eval.workers.messages import DeviceFound, Failed, as_exception
+from vla_eval.workers.start import simulator_modules
+
+WORKER_MODULE = "vla_eval.data.recording.worker"
+MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
+
+Phase = Literal["trying seeds", "converting", "rendering", "joining"]
+RecordingPool = Pool[RecordingJob, RecordingAnswer]
+
+
+class RecordingObserver(Protocol):
+    """Watches a recording: progress on a terminal, for example."""
+
+    def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
+        """Called when a phase of a task begins, with how many episodes are done already."""
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Called when more is done of the phase."""
+
+    def on_tick(self) -> bool:
+        """Called several times a second; returns whether the recording shall stop now."""
+
+
+class _Silence:
+    """Watches nothing and never stops."""
+
+    def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
+        """Do nothing."""
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Do nothing."""
+
+    def on_tick(self) -> bool:
+        """Continue."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedDataset:
+    """One finished dataset."""
+
+    path: Path
+    facts: DatasetFacts
+    failed: tuple[FailedSeed, ...]
+    kept_failures: tuple[int, ...]  # seeds of the episodes without success
+    seconds: float  # of this call
+
+    @classmethod
+    def read(cls, path: Path, *, seconds: float) -> Self:
+        """Return what is known of the dataset in a folder."""
+        return cls(
+            path=path,
+            facts=read_facts(path),
+            failed=read_failed(path),
+            kept_failures=tuple(one.seed for one in read_manifest(path) if one.success_step is None),
+            seconds=seconds,
+        )
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of its files."""
+        return sum(file.n_bytes for file in self.facts.files.values())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedPart:
+    """What one part of a recording has of a task: `n_episodes` of `n_total`."""
+
+    task: str
+    n_episodes: int
+    n_total: int
+    seconds: float  # of this call
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary:
+    """What one call of `record` has come to; fewer datasets than tasks if it was stopped.
+
+    A part of a recording has no datasets yet.
+    """
+
+    out: Path
+    datasets: tuple[RecordedDataset, ...]
+    was_stopped: bool
+    parts: tuple[RecordedPart, ...] = ()
+
+
+def recording_main(connection: Connection, shared: SharedStage, log: Path) -> None:
+    """Record for the parent until it closes the pipe; the entry point of a worker process."""
+    detach(log)
+    # Imported by the worker alone: importing lerobot would delay the parent's message about a mistake by 5 s.
+    runner = importlib.import_module(WORKER_MODULE).RecordingRunner
+    serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
+
+
+class _Stopped(Exception):
+    """The observer asked to stop."""
+
+
+def record(
+    recipe: DatasetRecipe,
+    *,
+    out: Path,
+    command: str = "",
+    allow_environment_change: bool = False,
+    observer: RecordingObserver | None = None,
+    backend: Backend = LOCAL,
+    part: Shard | None = None,
+) -> RecordingSummary:
+    """Record all datasets of a recipe that are not there yet.
+
+    Args:
+        recipe: what to record.
+        out: the folder; each task's dataset appears in it.
+        command: what the user typed, for the record.
+        allow_environment_change: resume although package versions or the machine have changed.
+        observer: gets the progress.
+        backend: where the workers run; they write shards and datasets into the folder.
+        part: render only this part of the episodes; `merge_recordings` makes the datasets.
+
+    Raises:
+        VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk. What was
+            recorded stays.
+    """
+    return run_plan(
+        recipe,
+        plan_recording(recipe),
+        out=out,
+        command=command,
+        allow_environment_change=allow_environment_change,
+        observer=observer or _Silence(),
+        backend=backend,
+        part=part,
+    )
+
+
+def run_plan(
+    recipe: DatasetRecipe,
+    plan: RecordingPlan,
+    *,
+    out: Path,
+    observer: RecordingObserver,
+    command: str = "",
+    allow_environment_change: bool = False,
+    selections: Mapping[str, Selection] | None = None,
+    source: str | None = None,
+    backend: Backend = LOCAL,
+    part: Shard | None = None,
+) -> RecordingSummary:
+    """Record what is planned; see `record`.
+
+    Args:
+        recipe: what to record.
+        plan: what `plan_recording` makes of it.
+        out: the folder.
+        observer: gets the progress.
+        command: what the user typed.
+        allow_environment_change: resume although package versions or the machine have changed.
+        selections: task -> the attempts to render, where they are known already.
+        source: digest of what the selections were read from.
+        backend: see `record`.
+        part: see `record`.
+    """
+    part = part and part.of_blocks(recipe.episodes_per_shard, recipe.episodes)
+    versions = {one.task: one.task_version for one in plan.tasks}
+    description = RunDescription(
+        name=recipe.name,
+        config={**content_of(recipe, options=OPTION_FIELDS), "task_versions": versions, "source": source},
+        recipes=plan.recipe_files,
+        environment=collect_environment(),
+        options=options_of(recipe, options=OPTION_FIELDS),
+        command=command,
+        shard=part,
+    )
+    datasets: list[RecordedDataset] = []
+    parts: list[RecordedPart] = []
+    n_workers = backend.n_cores if recipe.workers == "auto" else recipe.workers
+    with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
+        pool: RecordingPool = backend.pool(
+            recording_main,
+            answers=(Attempt, ShardWritten, DatasetWritten),
+            size=n_workers,
+            timeouts=recipe.timeouts,
+            logs=folder.logs(),
+            preload=(WORKER_MODULE, *simulator_modules(recipe.simulator)),
+        )
+        with pool as running:
+            recorder = _Recorder(
+                plan=plan,
+                folder=folder,
+                pool=running,
+                observer=observer,
+                allow_environment_change=allow_environment_change,
+            )
+            try:
+                for task in plan.tasks:
+                    if part is None:
+                        datasets.append(recorder.record(task, (selections or {}).get(task.task)))
+                    else:
+                        parts.append(recorder.record_part(task, part))
+                was_stopped = False
+            except _Stopped:
+                was_stopped = True
+    return RecordingSummary(out=out, datasets=tuple(datasets), was_stopped=was_stopped, parts=tuple(parts))
+
+
+@dataclass(slots=True, kw_only=True)
+class _Recorder:
+    """Takes the tasks of a recipe through their phases."""
+
+    plan: RecordingPlan
+    folder: RecordingFolder
+    pool: RecordingPool
+    observer: RecordingObserver
+    allow_environment_change: bool
+
+    def record(self, task: TaskPlan, selection: Selection | None) -> RecordedDataset:
+        """Return the dataset of a task; made if it is not there yet."""
+        begun = time.monotonic()
+        path = self.folder.dataset(task.task)
+        if not self.folder.is_finished(task.task):
+            selection = selection or self._try_seeds(task)
+            shards = self._shard_jobs(task, selection)
+            self._render(shards)
+            self._join(task, selection, shards)
+        self.folder.remove_shards(task.task)  # also what a killed session has left
+        return RecordedDataset.read(path, seconds=time.monotonic() - begun)
+
+    def record_part(self, task: TaskPlan, part: Shard) -> RecordedPart:
+        """Try all seeds, since each decides on the others, and render the part's share of the episodes."""
+        begun = time.monotonic()
+        jobs = self._shard_jobs(task, self._try_seeds(task))
+        own = [job for job in jobs if part.holds(job.first_index)]
+        self._render(own)
+        return RecordedPart(
+            task=task.task,
+            n_episodes=sum(len(job.attempts) for job in own),
+            n_total=task.recipe.episodes,
+            seconds=time.monotonic() - begun,
+        )
+
+    def _shard_jobs(self, task: TaskPlan, selection: Selection) -> tuple[ShardJob, ...]:
+        return shard_jobs(task, selection.kept, functools.partial(self.folder.shard, task.task))
+
+    def _try_seeds(self, task: TaskPlan) -> Selection:
+        queue = SeedQueue(
+            task.recipe,
+            self.folder.attempts(task.task),
+            lambda seed: AttemptJob(plan=task, seed=seed),
+        )
+        self._begin(task, "trying seeds", n_done=queue.n_kept)
+        for _, answer in self._answers(queue):
+            assert isinstance(answer, Attempt)
+            self.folder.append(task.task, answer)
+            queue.add(answer)
+            self.observer.on_progress(n_done=queue.n_kept)
+        return queue.selection()
+
+    def _render(self, jobs: Sequence[ShardJob]) -> None:
+        open_jobs = [job for job in jobs if not job.path.exists()]
+        n_total = sum(len(job.attempts) for job in jobs)
+        n_done = n_total - sum(len(job.attempts) for job in open_jobs)
+        self.observer.on_phase(jobs[0].plan.task, "rendering", n_done=n_done, n_total=n_total)
+        for done, _ in self._answers(JobList(open_jobs)):
+            assert isinstance(done, ShardJob)
+            n_done += len(done.attempts)
+            self.observer.on_progress(n_done=n_done)
+
+    def _join(self, task: TaskPlan, selection: Selection, shards: Sequence[ShardJob]) -> None:
+        self._begin(task, "joining", n_done=0)
+        origin = Origin(
+            recipe_files=self.plan.recipe_files,
+            environment=self.folder.environment,
+            device=self.folder.device,
+        )
+        path = self.folder.dataset(task.task)
+        job = join_job(task, path, shards=shards, failed=selection.failed, origin=origin)
+        for _ in self._answers(JobList([job])):
+            self.observer.on_progress(n_done=task.recipe.episodes)
+
+    def _answers(
+        self, queue: SeedQueue[AttemptJob] | JobList[ShardJob] | JobList[JoinJob]
+    ) -> Iterable[tuple[RecordingJob, RecordingAnswer]]:
+        """Run the jobs, each again if it fails once; yield each with its answer when it is done."""
+        n_failed: Counter[str] = Counter()
+        for event in self.pool.run(queue):
+            answered = self._look_at(event)
+            if answered is None:
+                continue
+            job, answer = answered
+            if isinstance(answer, Failed):
+                n_failed[job.name] += 1
+                _raise_if_last(answer, n_failed[job.name], job.name)
+                queue.give_back(job)  # type: ignore[arg-type]  # it is the queue's own
+            else:
+                yield job, answer
+
+    def _look_at(self, event: object) -> "tuple[RecordingJob, RecordingAnswer | Failed] | None":
+        """Return job and answer, if the event is one; else see to it."""
+        if event is None:
+            if self.observer.on_tick():
+                raise _Stopped
+        elif isinstance(event, DeviceFound):
+            self.folder.note_device(dict(event.device), allow_change=self.allow_environment_change)
+        else:
+            return event.job, event.answer  # type: ignore[attr-defined]  # an Answered
+        return None
+
+    def _begin(self, task: TaskPlan, phase: Phase, *, n_done: int) -> None:
+        self.observer.on_phase(task.task, phase, n_done=n_done, n_total=task.recipe.episodes)
+
+
+def _raise_if_last(failed: Failed, n_failed: int, name: str) -> None:
+    """Raise if it makes no sense to try the job again."""
+    if failed.refused:
+        raise as_exception(failed.error)
+    if n_failed >= MAX_TRIES:
+        error = failed.error
+        raise RecordingError(
+            f"{name}: failed {MAX_TRIES} times, the last time during {error.stage}: {error.kind}: "
+            f"{error.message}\n{error.details or ''}\nWhat was recorded is kept; the same command resumes."
+        )

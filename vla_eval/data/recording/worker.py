@@ -1,0 +1,205 @@
+"""The inside of a worker that records: tries seeds, renders and encodes shards, puts datasets together.
+
+It gets its jobs over a pipe, as `vla_eval.evaluation.worker` does, and keeps the environment between
+jobs of one kind. Only whole shards and whole datasets appear on the disk.
+"""
+
+import dataclasses
+import errno
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.environment import EnvSettings
+from vla_eval.core import FloatArray, Policy, SimEnv
+from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.manifest import (
+    FAILED_FILE,
+    MANIFEST_FILE,
+    MIKASA_FOLDER,
+    RECORDING_FILE,
+    RecordedEpisode,
+    write_entry,
+    write_lines,
+)
+from vla_eval.data.recording.demonstrations import (
+    SLOT,
+    Attempt,
+    EpisodeLog,
+    NoisyEnv,
+    attempt,
+    images_digests,
+    replay_attempt,
+)
+from vla_eval.data.recording.jobs import (
+    AttemptJob,
+    DatasetWritten,
+    JoinJob,
+    RecordingAnswer,
+    RecordingJob,
+    ShardJob,
+    ShardWritten,
+    TaskPlan,
+)
+from vla_eval.data.recording.shard_writer import Format, ShardWriter, join_shards
+from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.errors import VlaEvalError
+from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.features import CAMERA_KEYS, frame_values
+from vla_eval.storage.drafts import draft_path, publish, remove_drafts
+from vla_eval.storage.durable import storage_full
+from vla_eval.storage.starting import DISK_TROUBLE
+from vla_eval.workers.inside import Heartbeat
+from vla_eval.workers.messages import DeviceFound, Failed, describe_error
+
+logger = logging.getLogger(__name__)
+
+NEARLY_FULL_BYTES = 1 << 24  # an encoder's error does not say that the disk is full; this little left does
+
+
+class RecordingRunner:
+    """Does jobs, keeping the environment between those that need the same."""
+
+    def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
+        """Start with nothing made."""
+        self._heartbeat = heartbeat
+        self._tell = tell
+        self._env: SimEnv | None = None
+        self._env_settings: EnvSettings | None = None
+        self._expert: Policy | None = None
+
+    def answer(self, job: RecordingJob) -> RecordingAnswer | Failed:
+        """Do the job; whatever goes wrong becomes a `Failed`."""
+        self._heartbeat.begin_batch()
+        self._heartbeat("setup")
+        try:
+            if isinstance(job, AttemptJob):
+                return self._attempt(job)
+            if isinstance(job, ShardJob):
+                return self._write_shard(job)
+            return join_dataset(job)
+        except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
+            logger.exception("%s, stage %s", job.setup_key, self._heartbeat.stage)
+            known = _explained(exc, job)
+            return Failed(
+                error=describe_error(known, self._heartbeat.stage), refused=isinstance(known, VlaEvalError)
+            )
+
+    def close(self) -> None:
+        """Release the simulator."""
+        if self._env is not None:
+            self._env.close()
+        self._env = self._env_settings = self._expert = None
+
+    def _attempt(self, job: AttemptJob) -> Attempt:
+        plan = job.plan
+        env = self._make_env(dataclasses.replace(plan.group.env, privileged=True))
+        if self._expert is None:
+            self._heartbeat("reset")
+            status = env.reset({SLOT: job.seed}, render=False)[SLOT].status
+            self._expert = make_policy(plan.group, EnvFacts(env.spec, status.n_candidates))
+        start = plan.start(job.seed, horizon_steps=env.spec.horizon_steps)
+        noise = plan.recipe.action_noise
+        acting: SimEnv = NoisyEnv(env, noise) if noise > 0 else env
+        return attempt(acting, self._expert, start, plan.group.rollout, heartbeat=self._heartbeat)
+
+    def _write_shard(self, job: ShardJob) -> ShardWritten:
+        plan = job.plan
+        env = self._make_env(dataclasses.replace(plan.group.env, cameras=tuple(CAMERA_KEYS)))
+        form = Format(
+            state=plan.recipe.state,
+            encoder=plan.recipe.encoder,
+            max_frames=env.spec.horizon_steps,
+            action_names=env.spec.action.dims,
+            image_size_px=env.spec.cameras[0].height_px,
+        )
+        with ShardWriter(job.path, form) as writer:
+            for index, one in enumerate(job.attempts, start=job.first_index):
+                start = plan.start(one.seed, horizon_steps=one.n_steps)
+                log = replay_attempt(env, start, one, heartbeat=self._heartbeat)
+                self._heartbeat("setup")  # whose limit is long: encoding
+                episode = recorded_episode(plan, one, log, index=index)
+                writer.add_episode(episode, frames_of(plan.recipe, episode, log))
+        return ShardWritten(n_episodes=len(job.attempts))
+
+    def _make_env(self, settings: EnvSettings) -> SimEnv:
+        if self._env is None or self._env_settings != settings:
+            self.close()
+            self._env = make_env(settings)
+            self._env_settings = settings
+            device = describe_device(self._env)
+            if device is not None and settings.cameras:
+                self._tell(DeviceFound(device=device))
+        return self._env
+
+
+def join_dataset(job: JoinJob) -> DatasetWritten:
+    """Put the shards of a task together; the dataset appears whole."""
+    home = job.shards[0].parent / job.path.name
+    remove_drafts(home)
+    draft = draft_path(home)
+    episodes = join_shards(job.shards, draft)
+    (draft / MIKASA_FOLDER).mkdir()
+    write_lines(draft / MANIFEST_FILE, episodes)
+    write_lines(draft / FAILED_FILE, job.failed)
+    facts = dataclasses.replace(
+        job.facts,
+        n_episodes=len(episodes),
+        n_frames=sum(episode.n_steps for episode in episodes),
+        files=digest_files(draft),
+    )
+    write_entry(draft / RECORDING_FILE, facts)
+    publish(draft, job.path)
+    return DatasetWritten(facts=facts)
+
+
+def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: int) -> RecordedEpisode:
+    """Return the manifest's entry of an attempt that has been rendered."""
+    return RecordedEpisode(
+        episode_index=index,
+        task=plan.task,
+        task_version=plan.task_version,
+        env_kwargs=dict(plan.group.env.kwargs),
+        seed=one.seed,
+        instruction=plan.group.instruction,
+        expert=plan.group.key.policy,
+        expert_version=plan.expert_version,
+        cue_steps=one.cue_steps,
+        delay_steps=one.delay_steps,
+        n_steps=one.n_steps,
+        success_step=one.success_step,
+        actions=one.actions,
+        intended_actions=one.intended_actions,
+        states_sha256=one.states_sha256,
+        images_sha256=images_digests([result.observation.images for result in log.results[:-1]]),
+    )
+
+
+def frames_of(
+    recipe: DatasetRecipe, episode: RecordedEpisode, log: EpisodeLog
+) -> Sequence[dict[str, object]]:
+    """Return the frames of an episode, as `ShardWriter.add_episode` takes them."""
+    actions = stored_actions(recipe, episode)
+    return [
+        frame_values(before, after, action=action, state=recipe.state, is_last=step == episode.n_steps)
+        for step, (before, after, action) in enumerate(
+            zip(log.results[:-1], log.results[1:], actions, strict=True), start=1
+        )
+    ]
+
+
+def stored_actions(recipe: DatasetRecipe, episode: RecordedEpisode) -> FloatArray:
+    """Return the actions of the field `action`: the executed ones, or those without noise."""
+    intended = episode.intended_rows()
+    return intended if recipe.stored_action == "intended" and intended is not None else episode.action_rows()
+
+
+def _explained(exc: BaseException, job: RecordingJob) -> BaseException:
+    """Return a `StorageFullError` in place of what a full disk has caused."""
+    if isinstance(exc, VlaEvalError) or isinstance(job, AttemptJob):
+        return exc
+    is_known = isinstance(exc, OSError) and exc.errno in DISK_TROUBLE
+    if is_known or shutil.disk_usage(job.path.parent).free < NEARLY_FULL_BYTES:
+        return storage_full(job.path, exc if isinstance(exc, OSError) else OSError(errno.ENOSPC, str(exc)))
+    return exc

@@ -1,0 +1,1 @@
+"""What goes to other people: cards, the Hub, the viewer, the layout of the paper."""

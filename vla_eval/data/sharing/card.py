@@ -1,0 +1,290 @@
+"""Write a dataset's card: `README.md` with the Hub's front matter, and a contact sheet.
+
+The same dataset gives the same card: no date, no machine's name, everything in a fixed order.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+from huggingface_hub import DatasetCard, DatasetCardData
+
+from vla_eval.control_modes import JOINT_DELTA_POS
+from vla_eval.data.exact_statistics import RESOLUTION, about_still_dimensions
+from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
+from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.sharing.summary import DatasetSummary, draw_sheet, summarize
+from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
+from vla_eval.storage.durable import replace_file
+from vla_eval.tasks.catalog import find_task
+
+CARD_FILE = Path("README.md")
+SHEET_FILE = Path("images/contact_sheet.png")
+OWN_LICENSE = "mit"  # of what is recorded here; of an import nothing is known
+MAX_SEEDS_SHOWN = 40
+
+
+def write_card(root: Path, *, license_id: str | None = None) -> str:
+    """Write card and contact sheet into a complete dataset, and return the card's text.
+
+    Args:
+        root: the dataset.
+        license_id: licence as the Hub names it; by default that of this project for recordings and for
+            mixtures of them, and none for imports.
+
+    Raises:
+        DatasetError: the dataset is not complete, or damaged.
+        StorageFullError: the disk is full.
+    """
+    summary = summarize(root)
+    (root / SHEET_FILE).parent.mkdir(exist_ok=True)
+    (root / SHEET_FILE).write_bytes(draw_sheet(root, summary))
+    meta = open_local_dataset(root).meta
+    still = tuple(about_still_dimensions(meta.stats, meta.features))
+    text = render_card(summary, license_id=license_id, still=still)
+    replace_file(root / CARD_FILE, text)
+    return text
+
+
+def render_card(
+    summary: DatasetSummary, *, license_id: str | None = None, still: tuple[str, ...] = ()
+) -> str:
+    """Return the card of a dataset; `still`: lines on the dimensions that hardly move."""
+    if license_id is None and _is_recorded_here(summary):
+        license_id = OWN_LICENSE
+    sections = [f"# {_title(summary)}\n", _introduction(summary)]
+    for heading, section in _SECTIONS.items():
+        text = section(summary)
+        if section is _statistics:
+            text += "".join(f"\n- {markdown_cell(line)}" for line in still) + ("\n" if still else "")
+        if text:
+            sections.append(f"## {heading}\n\n{text}")
+    if license_id is None:
+        sections.append("## Licence\n\nThat of the source, which the converter does not know.\n")
+    data = DatasetCardData(
+        license=license_id,
+        task_categories=["robotics"],
+        tags=["LeRobot", "ManiSkill", "memory", "mikasa-vla"],
+        # Without it the Hub's viewer guesses, and shows the manifest as data.
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    text = "\n".join(sections)
+    return str(DatasetCard(f"---\n{data.to_yaml()}\n---\n\n{text}"))
+
+
+def _is_recorded_here(summary: DatasetSummary) -> bool:
+    if summary.mixture is not None:
+        return all(source.task_version is not None for source in summary.mixture.sources)
+    return summary.facts is not None
+
+
+def _title(summary: DatasetSummary) -> str:
+    if summary.mixture is not None:
+        n_tasks, n_sources = len(summary.mixture.tasks), len(summary.mixture.sources)
+        return f"{n_tasks} tasks of {n_sources} datasets: {len(summary.lengths)} demonstrations"
+    task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
+    n_episodes = len(summary.lengths)
+    all_succeed = summary.n_success in (None, n_episodes)
+    what = "demonstrations" if all_succeed else f"episodes, {summary.n_success} with success"
+    return f"{markdown_cell(task or 'Imported demonstrations')}: {n_episodes} {what}"
+
+
+def _introduction(summary: DatasetSummary) -> str:
+    task = find_task(summary.facts.task) if summary.facts else None
+    about = f"{task.description} " if task else ""
+    sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
+    height_px, width_px = summary.image_size_px
+    size = f"{height_px} × {width_px}"
+    heading = "Instruction" if len(summary.instructions) == 1 else "Instructions"
+    return (
+        f"{about}Two cameras of {size} pixels, 20 frames per second, one frame per control step, as a "
+        f"LeRobotDataset v3.\n\n{heading}:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
+    )
+
+
+def _statistics(summary: DatasetSummary) -> str:
+    lengths = np.array(summary.lengths)
+    rows = [
+        ("episodes", str(len(lengths))),
+        ("frames", str(lengths.sum())),
+        ("frames per episode", f"{lengths.min()} to {lengths.max()}, mean {lengths.mean():.1f}"),
+        ("episodes with success", "not stored" if summary.n_success is None else str(summary.n_success)),
+    ]
+    if summary.facts is not None:
+        seeds = [episode.seed for episode in summary.episodes]
+        experts = sorted({f"{one.expert}, version {one.expert_version}" for one in summary.episodes})
+        rows += [
+            ("seeds", f"{min(seeds)} to {max(seeds)}"),
+            ("seeds left out because the expert failed", _listed([one.seed for one in summary.failed])),
+            (
+                "seeds kept although the expert failed",
+                _listed([one.seed for one in summary.episodes if one.success_step is None]),
+            ),
+            ("expert", markdown_cell("; ".join(experts))),
+        ]
+    action = summary.action
+    numbers = zip(action.names, action.mean, action.std, action.low, action.high, strict=True)
+    lines = [f"| {name} | {value} |" for name, value in rows]
+    per_dim = [
+        f"| {markdown_cell(name)} | {mean:.4f} | {std:.4f} | {low:.4f} | {high:.4f} |"
+        for name, mean, std, low, high in numbers
+    ]
+    return "\n".join(
+        [
+            *("| | |", "|:--|:--|", *lines, ""),
+            *("| action | mean | std | min | max |", "|:--|--:|--:|--:|--:|", *per_dim, ""),
+        ]
+    )
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    shown = ", ".join(map(str, seeds[:MAX_SEEDS_SHOWN]))
+    more = f" and {len(seeds) - MAX_SEEDS_SHOWN} more" if len(seeds) > MAX_SEEDS_SHOWN else ""
+    return f"{len(seeds)}: {shown}{more}" if seeds else "none"
+
+
+def _fields(summary: DatasetSummary) -> str:
+    lines = [f"| {markdown_code(name)} | {markdown_cell(kind)} |" for name, kind in summary.fields.items()]
+    return "\n".join(["| field | type |", "|:--|:--|", *lines, ""])
+
+
+def _origin(summary: DatasetSummary) -> str:
+    """Say how a recording came about, and what proves it."""
+    facts = summary.facts
+    if facts is None:
+        return ""
+    replay = summary.replay
+    said = "not replayed yet (`mikasa-vla replay`)"
+    if replay is not None:
+        verdict = "passed" if replay.passed else f"FAILED ({len(replay.mismatches)} mismatches)"
+        compared = markdown_cell(replay.states_compared)
+        said = f"{verdict}: {replay.n_episodes} of {replay.n_total} episodes, states {compared}"
+    rows = [
+        ("task rules", f"{markdown_cell(facts.task)}, version {facts.task_version}"),
+        ("replay", said),
+        (
+            "renderer",
+            markdown_cell(", ".join(f"{key} {value}" for key, value in sorted(facts.device.items()))),
+        ),
+        ("recipe sha256", markdown_code(facts.recipe_sha256)),
+        ("manifest sha256", markdown_code(facts.files[MANIFEST_FILE.as_posix()].sha256)),
+        *(
+            (f"{markdown_cell(name)} sha256", markdown_code(digest))
+            for name, digest in sorted(facts.recipe_files.items())
+        ),
+    ]
+    lines = "\n".join(f"| {name} | {value} |" for name, value in rows)
+    recipe = yaml.safe_dump(facts.recipe, sort_keys=True, allow_unicode=True)
+    return (
+        f"`meta/mikasa/manifest.jsonl` has seed and actions of every episode: `mikasa-vla replay` checks the "
+        f"dataset with it. Digests of all files are in `meta/mikasa/recording.json`.\n\n"
+        f"| | |\n|:--|:--|\n{lines}\n\nRecipe:\n\n{markdown_block(recipe, 'yaml')}\n"
+    )
+
+
+def _import(summary: DatasetSummary) -> str:
+    """Say where an import came from, and what it lacks."""
+    facts = summary.imported
+    if facts is None:
+        return ""
+    lines = [
+        f"- layout of the source: {markdown_code(facts.source_layout)}; digests of its files: "
+        f"`meta/mikasa/import.json`",
+        f"- instruction: {markdown_cell(facts.instruction_source)}",
+        f"- fields that the source does not have: {markdown_cell(', '.join(facts.absent)) or 'none'}",
+        f"- arrays of the source that were left out: {markdown_cell(', '.join(facts.left_out)) or 'none'}",
+        f"- actions are for the control mode {markdown_code(facts.control_mode)}",
+    ]
+    if not facts.executable_by_pd_ee_delta_pose:
+        lines.append(
+            "- **not executable by `pd_ee_delta_pose`**: a policy trained on these actions is evaluated with "
+            f"{markdown_code(f'env.control_mode={facts.control_mode}')}"
+        )
+    return "\n".join([*lines, ""])
+
+
+def _mixture(summary: DatasetSummary) -> str:
+    """Say of which datasets a mixture was made."""
+    if summary.mixture is None:
+        return ""
+    rows = [
+        (
+            markdown_cell(one.name),
+            "—" if one.task is None else markdown_cell(one.task),
+            "—" if one.task_version is None else str(one.task_version),
+            str(one.n_episodes),
+            str(one.n_frames),
+            f"{min(one.seeds)} to {max(one.seeds)}" if one.seeds else "—",
+            "yes" if one.was_replayed else "no",
+            markdown_code(one.sha256),
+        )
+        for one in summary.mixture.sources
+    ]
+    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return (
+        "Mixed by `mikasa-vla dataset mix`; episodes are in this order. `meta/mikasa/mixture.json` has the "
+        "seeds and the digests of all files. A mixture has no manifest: replay its sources.\n\n"
+        "| dataset | task | rules | episodes | frames | seeds | replayed | sha256 |\n"
+        f"|:--|:--|--:|--:|--:|:--|:--|:--|\n{lines}\n\nActions are for the control mode "
+        f"{markdown_code(summary.mixture.control_mode)}.\n"
+    )
+
+
+def _differences(summary: DatasetSummary) -> str:
+    """Say how a recording differs from the data that the paper's policies were trained on."""
+    facts = summary.facts
+    if facts is None:
+        return ""
+    lines = [
+        "- The simulation is a new implementation of the tasks, not the authors' code "
+        "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
+        _expert_difference(facts, summary),
+        f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper says that all of "
+        f"its episodes succeed, and its recorder kept every episode, whether it succeeded or not.",
+        f"- Cut: {_cut(facts)}; the paper's recorder recorded to the horizon.",
+        f"- Actions are for {markdown_code(facts.control_mode)}, {_stored(facts)}; the paper's recordings "
+        f"for reinforcement learning are for {markdown_code(JOINT_DELTA_POS)}.",
+        "- Images are video (lossy); the paper's are arrays of pixels.",
+    ]
+    render = facts.recipe.get("render")
+    if isinstance(render, dict) and render.get("wrist_mesh") == "simplified":
+        lines.append("- The wrist camera's housing is drawn with a simpler mesh.")
+    return "\n".join([*lines, ""])
+
+
+def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
+    text = "- The paper's experts were trained by PPO; here the expert is "
+    text += markdown_code(str(facts.recipe.get("expert", "oracle")))
+    noise = facts.recipe.get("action_noise", 0.0)
+    text += (
+        f", with noise of std {markdown_cell(str(noise))} in its actions." if noise else ", without noise."
+    )
+    if summary.action.idle:
+        text += (
+            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {RESOLUTION:g}): "
+            f"expect imitation to be easier than with the paper's data."
+        )
+    return text
+
+
+def _stored(facts: DatasetFacts) -> str:
+    if facts.recipe.get("stored_action") == "intended":
+        return "as the expert asked for them, before noise was added"
+    return "as they were executed"
+
+
+def _cut(facts: DatasetFacts) -> str:
+    if facts.recipe.get("cut") == "horizon":
+        return "at the horizon"
+    return f"{markdown_cell(str(facts.recipe.get('steps_after_success')))} steps after the first success"
+
+
+_SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {
+    "Statistics": _statistics,
+    "Fields": _fields,
+    "Origin and proof": _origin,
+    "Import": _import,
+    "Sources": _mixture,
+    "Differences from the paper's data": _differences,
+}

@@ -1,0 +1,1 @@
+"""The networks: a folder per model family, and what they share. Knows no simulators and no runs."""

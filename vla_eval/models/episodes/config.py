@@ -1,0 +1,169 @@
+"""What lerobot's configurations of our own policies from scratch share.
+
+A training sample is an episode. Knows no network.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar  # lerobot is untyped
+
+from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.models.episodes.eef_state import STATE
+from vla_eval.models.shared.ported_config import PortedConfig
+
+SENTENCES = ("none", "words")
+"""`words`: which words are in it, see `sentence.SentenceEncoder`."""
+
+
+@dataclass
+class EpisodeConfig(PortedConfig):
+    """A policy that is trained on episodes from their beginning.
+
+    A training sample is an episode from its beginning to a frame: `observation.*` at the `window_steps`
+    frames up to it and, for the goal, at the episode's last frame; `action` at all of them and one chunk
+    further. So any loop that follows `*_delta_indices` trains it.
+
+    Nothing is normalised by statistics: positions in metres and actions in [-1, 1] need none, and rotation
+    and gripper hardly vary in scripted demonstrations, where a deviation would scale up noise.
+
+    Attributes:
+        whole_episodes: `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it.
+        takes_bytes: `mikasa-vla finetune` hands over images as bytes, so that numbers are made only of the
+            frames that are used.
+        masks_padding: actions beyond an episode's end count nothing, see `episode_samples`.
+        window_steps: frames of history in a training sample; at least the longest episode, so that no
+            memory begins in its middle. None: our `finetune` takes the dataset's longest.
+        first_action_weight: share of a chunk's first action in the loss; the others share the rest.
+        change_weight: a step counts 1 + so much per unit by which its action differs from the one before,
+            which raises the moment of decision.
+        waiting_share: a step whose action is that of the step before is used with this probability.
+        decision_share: share of the episodes of a training batch that end at a decision: a step at which the
+            arm begins to move after it waited, one of the episode's at random. What happens then has to be
+            known from memory; a step later the demonstration's own motion gives it away.
+        masks_beyond_decision: actions of a frame's chunk from the next decision on do not count: what they
+            depend on has not been seen yet. Otherwise the mean of all motions is learned for them, and a
+            chunk that is executed across the decision takes the arm to where no demonstration has it. The
+            goal does not count before the first decision either: it could only be learned by heart there.
+        waits_beyond_decision: with `masks_beyond_decision`, those actions are not left out, but replaced by
+            the one before the decision: to continue waiting. A chunk executed across the decision then keeps
+            the arm where it is until the policy is asked again.
+        late_steps: the frame of a decision is shown up to so many times again in training, at random: a
+            policy that is not asked at every step sees it several times before it may decide. All of them
+            together count as much as one.
+        goal_weight: of the auxiliary loss, in units of its variance: where the demonstration ends.
+        sentence: what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing;
+            one of several has to know which is meant, where the images do not show it.
+        mix_colors: the three colours of an episode's images change places at random in training.
+        exchange_share: share of the episodes in which the things that appear exchange their colours, alike in
+            all frames: a scene looks otherwise each time. See `things`.
+        erase_share: of those that end at their first decision, the share in which some of the things that
+            appear at it, but of no colour that was shown before, are erased: a rule is learned sooner where
+            there is less to choose from.
+        erase_warmup_episodes: in so many training samples of a process, the number of wrong things that may
+            stay where some are erased grows from one to all, as the square of the samples so far. 0: all may
+            stay from the beginning.
+        shift_px: the images of an episode are moved by up to so many pixels in each direction in training,
+            those of each camera by an amount of their own, the same in all frames (random shifts, Kostrikov
+            et al. 2020, "Image Augmentation Is All You Need"). 0: they are not.
+        scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
+    """
+
+    whole_episodes: ClassVar[bool] = True
+    takes_bytes: ClassVar[bool] = True
+    masks_padding: ClassVar[bool] = True
+
+    window_steps: int | None = None
+
+    first_action_weight: float = 0.5
+    change_weight: float = 3.0
+    waiting_share: float = 0.3
+    decision_share: float = 0.0
+    masks_beyond_decision: bool = False
+    waits_beyond_decision: bool = False
+    late_steps: int = 0
+    goal_weight: float = 1.0
+    mix_colors: bool = False
+    exchange_share: float = 0.0
+    erase_share: float = 0.0
+    erase_warmup_episodes: int = 0
+    shift_px: int = 0
+    sentence: str = "none"
+
+    optimizer_lr: float = 2e-3
+    optimizer_weight_decay: float = 1e-4
+    scheduler_warmup_steps: int = 50
+    scheduler_decay_steps: int = 2000
+    scheduler_decay_lr: float = 4e-5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window_steps is not None and self.window_steps < 1:
+            raise RecipeError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
+        for name in ("first_action_weight", "waiting_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
+        if self.sentence not in SENTENCES:
+            raise unknown_name("sentence", self.sentence, SENTENCES, where=f"policy ({self.type})")
+        for name in ("decision_share", "exchange_share", "erase_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
+        if self.erase_share and not self.decision_share:
+            raise RecipeError("decision_share is 0, expected more: erase_share is of episodes that end there")
+        if self.erase_warmup_episodes < 0:
+            raise RecipeError(
+                f"erase_warmup_episodes is {self.erase_warmup_episodes}, expected a number of samples ≥ 0"
+            )
+        if self.erase_warmup_episodes and not self.erase_share:
+            raise RecipeError("erase_share is 0, expected more: erase_warmup_episodes is of what is erased")
+        if self.shift_px < 0:
+            raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
+        if self.late_steps < 0:
+            raise RecipeError(f"late_steps is {self.late_steps}, expected a number ≥ 0")
+        if self.waits_beyond_decision and not self.masks_beyond_decision:
+            raise RecipeError("waits_beyond_decision is true, expected masks_beyond_decision to be true, too")
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
+            raise ValueError(f"'{self.type}' needs images, observation.state and action")
+        if self.robot_state_feature.shape != (STATE,):
+            raise ValueError(
+                f"'{self.type}' needs the state 'eef' of {STATE} numbers, found "
+                f"{self.robot_state_feature.shape}: record with state: eef"
+            )
+        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
+        if len(shapes) != 1:
+            raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
+
+    @property
+    def reads_sentence(self) -> bool:
+        """Whether it acts by the instruction."""
+        return self.sentence != "none"
+
+    @property
+    def n_window_steps(self) -> int:
+        """`window_steps`, once it is known."""
+        if self.window_steps is None:
+            raise ValueError(
+                f"'{self.type}': window_steps is not set: give it the length in frames of the dataset's "
+                "longest episode (`mikasa-vla finetune` does)"
+            )
+        return self.window_steps
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The window up to the frame, and a frame beyond every episode's end: lerobot takes its last one."""
+        return [*range(1 - self.n_window_steps, 1), self.n_window_steps]
+
+    @property
+    def inference_delta_indices(self) -> None:
+        """Only the frame itself: the policy keeps its own history."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """A chunk for each frame of the window."""
+        return list(range(1 - self.n_window_steps, self.chunk_size))
+
+    def get_scheduler_preset(self) -> Any:
+        """Return lerobot's configuration of the schedule."""
+        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)

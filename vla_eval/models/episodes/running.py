@@ -1,0 +1,121 @@
+"""What a LeRobot policy is given of running episodes: frames in time, seeds, noise, and a row of a pass.
+
+Knows nothing of how a policy infers or what it remembers.
+"""
+
+import zlib
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any  # lerobot is untyped
+
+import torch
+from torch import Tensor
+
+from vla_eval.core import EpisodeStart
+from vla_eval.errors import InvalidActionError
+from vla_eval.models.vla_memory.fields import FrameMemory
+from vla_eval.seeding import Stream, generator
+
+Frame = Mapping[str, Tensor]
+
+N_SEED_BITS = 63
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Episode:
+    """A running episode as it is at one inference.
+
+    Attributes:
+        start: what it began with.
+        frames: the newest frames that an inference may read, oldest first.
+        unseen: the frames since the previous inference, oldest first.
+        memory: what the policy remembers of the frames before; None at the beginning.
+        earlier: the earlier frames that the policy is shown as further images; None: it is shown none.
+        step: of the newest frame.
+    """
+
+    start: EpisodeStart
+    frames: tuple[Frame, ...] = ()
+    unseen: tuple[Frame, ...] = ()
+    memory: Any = None  # whatever the policy's `remember` returns
+    earlier: FrameMemory | None = None
+    step: int = 0
+
+    def shown(self, unseen: Sequence[Frame], *, step: int, n_kept: int) -> "Episode":
+        """Return the episode after these frames, of which an inference may read the newest `n_kept`."""
+        earlier = self.earlier
+        if earlier is not None:
+            shown = []
+            for frame in unseen:
+                earlier = earlier.after(frame)
+                shown.append({**frame, **earlier.fields()})
+            unseen = shown
+        frames = deque(self.frames, maxlen=n_kept)
+        frames.extend(unseen)
+        return replace(self, frames=tuple(frames), unseen=tuple(unseen), earlier=earlier, step=step)
+
+    def read(self, deltas: Sequence[int], *, masks_history: bool) -> Frame:
+        """Return the frame (…) that an inference reads, or the frames in time (T, …).
+
+        Args:
+            deltas: which frames, 0 being the newest; none: the newest, without an axis of time.
+            masks_history: add `FIELD_is_pad`, which marks what lies before the episode's beginning: there is
+                the first frame again, as in lerobot's datasets.
+        """
+        if not deltas:
+            return self.frames[-1]
+        last = len(self.frames) - 1
+        frames = frames_in_time([self.frames[max(0, last + delta)] for delta in deltas])
+        if not masks_history:
+            return frames
+        is_pad = torch.tensor([last + delta < 0 for delta in deltas])
+        return {**frames, **{f"{key}_is_pad": is_pad for key in frames}}
+
+    def seed(self) -> int:
+        """Return the seed of the next inference; the same wherever and beside whatever it runs."""
+        start = self.start
+        rng = generator(start.seed, Stream.POLICY, zlib.crc32(start.task.encode()), start.run, self.step)
+        return int(rng.integers(1 << N_SEED_BITS))
+
+
+def in_rows(episodes: Sequence[Episode], n_rows: int) -> list[Episode]:
+    """Return which episode each row of a pass computes.
+
+    A row that nobody is due for repeats another one, so that the pass keeps its shape.
+
+    Raises:
+        InvalidActionError: a row is beyond the pass, or two episodes have the same one.
+    """
+    due: dict[int, Episode] = {}
+    for episode in episodes:
+        row, slot = episode.start.row, episode.start.slot
+        if not 0 <= row < n_rows:
+            raise InvalidActionError(
+                f"slot {slot}: expected a row from 0 to {n_rows - 1}, found {row}: a pass of this policy has "
+                f"{n_rows} rows. Reset the episode with another row, or make the policy with more slots."
+            )
+        if row in due:
+            raise InvalidActionError(
+                f"slots {due[row].start.slot} and {slot}: both are in row {row} of one pass. Infer for them "
+                "in separate calls, or reset one of them with another row."
+            )
+        due[row] = episode
+    return [due.get(row, episodes[0]) for row in range(n_rows)]
+
+
+def given_noise(seeds: Iterable[int], shape: tuple[int, int]) -> Tensor:
+    """Return the noise (B, *shape) of these inferences."""
+    # On the CPU: the same draws on every device.
+    return torch.stack([torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+
+
+def frames_in_time(frames: Sequence[Frame]) -> dict[str, Tensor]:
+    """Return frames (…) as one of (T, …)."""
+    return {key: torch.stack([frame[key] for frame in frames]) for key in frames[0]}
+
+
+def batch_of(frames: Sequence[Frame], episodes: Iterable[Episode]) -> dict[str, Any]:
+    """Return frames (…), one per episode, as lerobot's preprocessors take them: (B, …), and instructions."""
+    batch: dict[str, Any] = dict(frames_in_time(frames))
+    return {**batch, "task": [episode.start.instruction for episode in episodes]}

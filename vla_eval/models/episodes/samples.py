@@ -1,0 +1,333 @@
+"""Episodes to train on from a batch of lerobot's loader: the steps moved together, and how each counts."""
+
+from typing import NamedTuple  # lerobot is untyped
+
+import torch
+from torch import Tensor
+
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
+from vla_eval.models.episodes.color_objects import changed_things
+from vla_eval.models.episodes.config import EpisodeConfig
+from vla_eval.models.episodes.eef_state import SPACE
+from vla_eval.models.shared.levels import in_bytes, in_numbers
+
+LEAST_VARIANCE_M2 = 1e-6
+LEAST_WEIGHT = 1e-12
+SAME_ACTION = 1e-3  # actions that differ by less are waiting
+MOTION_BEGINS = 0.5
+"""By so much more than the one before it, in units of the controller's limits, a translation moves the arm
+where a motion begins. Then all of 1,500 demonstrations of six tasks with one place to go to have one motion;
+of 750 with three cubes to touch, 731 have three, the others two."""
+
+
+class Episodes(NamedTuple):
+    """A batch of B episodes of T steps, from their beginning; padding comes last.
+
+    Attributes:
+        images: (N, cameras, 3, H, W), as they were handed over (see `in_numbers`): those of `first`, one
+            episode after the other. Most of (B, T) is padding, and images are nearly all of the work.
+        first: (B, T) where a frame is shown for the first time; False for padding.
+        state: (B, T, state).
+        actions: (B, T, chunk, action).
+        counts: (B, T, chunk) float, 0 for what is beyond the episode.
+        goal_counts: (B, T) float, how much the goal counts at each step.
+        goal_m: (B, 3) the tool centre point at the episode's end.
+        steps: (B, T) which step of the window each is.
+    """
+
+    images: Tensor
+    first: Tensor
+    state: Tensor
+    actions: Tensor
+    counts: Tensor
+    goal_counts: Tensor
+    goal_m: Tensor
+    steps: Tensor
+
+    @property
+    def frames(self) -> Tensor:
+        """(B, T) which of `images` each step shows; padding shows the last one of its episode."""
+        return last_of(self.first)
+
+    @property
+    def real(self) -> Tensor:
+        """(B, T) False for padding: the first action of a chunk counts at every other step."""
+        return self.counts.sum(dim=-1) > 0
+
+
+def last_of(chosen: Tensor) -> Tensor:
+    """Return (B, T): which of the chosen steps, episode by episode, each step is or comes after."""
+    return chosen.flatten().cumsum(dim=0).sub(1).reshape(chosen.shape)
+
+
+def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
+    """Return the images (…, cameras, 3, H, W), in the order of the configuration."""
+    return torch.stack([batch[key] for key in config.image_features], dim=-4)
+
+
+def episodes_of(
+    batch: dict[str, Tensor],
+    config: EpisodeConfig,
+    *,
+    training: bool,
+    same_action: float = SAME_ACTION,
+    may_stay: float = 1.0,
+) -> Episodes:
+    """Return the steps to train on, moved together: those of the episode, most waiting left out.
+
+    Args:
+        batch: as `config` asks for it by its delta indices; images in [0, 1], or bytes.
+        config: of the policy.
+        training: leave waiting out, end some episodes at a decision, change things and colours and move
+            images, at random by torch's generator; else take every step.
+        same_action: actions that differ by less are waiting.
+        may_stay: see `changed_things`.
+    """
+    n_steps = config.n_window_steps
+    real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
+    actions = batch[ACTION_KEY].unfold(1, config.chunk_size, 1).transpose(-1, -2)
+    change = _change(actions[:, :, 0], real)
+    waits = change < same_action
+    begins = _begins(waits, real)
+    kept = _kept(waits, begins, real, config) if training else real
+    counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
+    can_know = torch.ones_like(change)
+    if config.masks_beyond_decision:
+        before = _before_the_next(begins, config.chunk_size)
+        if config.waits_beyond_decision:
+            actions = _waiting_beyond(actions, before)
+        else:
+            counts = counts * before
+        can_know = ((begins.cumsum(dim=1) > 0) | ~begins.any(dim=1, keepdim=True)).float()
+    counts = (
+        counts * _shares(config, actions) * (1 + config.change_weight * change)[..., None] * kept[..., None]
+    )
+    steps, share = _shown(kept, begins, config.late_steps if training else 0)
+    rows = torch.arange(len(steps), device=steps.device)[:, None]
+
+    def taken(values: Tensor) -> Tensor:
+        return values[rows, steps]
+
+    counts = taken(counts) * share[..., None]
+    first = _first(steps, share > 0)
+    episodes = rows.expand_as(steps)[first]
+    images = torch.stack([batch[key][episodes, steps[first]] for key in config.image_features], dim=1)
+    if training and (config.exchange_share or config.erase_share):
+        decision = begins.int().argmax(dim=1)  # 0: there is none
+        empty = torch.stack([batch[key][rows[:, 0], decision - 1] for key in config.image_features], dim=1)
+        n_before = (first & (steps < decision[:, None])).sum(dim=1)
+        images = _with_other_things(images, first.sum(dim=1), n_before, empty, config, may_stay)
+    return Episodes(
+        images=_augmented(images, episodes, config, n_episodes=len(steps)) if training else images,
+        first=first,
+        state=taken(batch[STATE_KEY][:, :n_steps]),
+        actions=taken(actions),
+        counts=counts,
+        goal_counts=counts.sum(dim=-1) * taken(can_know),
+        goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
+        steps=steps,
+    )
+
+
+def count_motions(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B,): how often the arm begins to move, from rest or from where it has slowed down.
+
+    Args:
+        actions: (B, T, action), the first three of them a translation of the tool.
+        real: (B, T) False for padding, at which nothing moves.
+    """
+    sizes = actions[..., :SPACE].norm(dim=-1) * real
+    rises = sizes.diff(dim=1, prepend=torch.zeros_like(sizes[:, :1]))
+    n_motions: Tensor = (rises > MOTION_BEGINS).sum(dim=1)
+    return n_motions
+
+
+def _first(steps: Tensor, is_there: Tensor) -> Tensor:
+    """Return (B, T): whether a frame is shown there, not for padding, and for the first time."""
+    first = is_there.clone()
+    first[:, 1:] &= steps[:, 1:] != steps[:, :-1]
+    return first
+
+
+def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
+    """Return (B, T) the steps that are shown, in order, and how much each of them counts; padding nothing.
+
+    A decision that is shown several times counts as much as one that is shown once: else the motion behind
+    it, of which there is one frame each, would be learned less.
+
+    Args:
+        kept: (B, steps) those that are trained on.
+        begins: (B, steps) decisions.
+        late_steps: a decision is shown up to so many times again, drawn by torch's generator.
+    """
+    times = kept.long()
+    if late_steps:
+        times = times + torch.randint(0, late_steps + 1, times.shape, device=times.device) * (kept & begins)
+    ends = times.cumsum(dim=1)
+    n_shown = ends[:, -1:]
+    places = torch.arange(int(n_shown.max()), device=times.device).expand(len(times), -1)
+    # Padding is the last step again, which does not count.
+    steps = torch.searchsorted(ends, places.minimum(n_shown - 1).contiguous(), right=True)
+    return steps, (places < n_shown) / times.gather(1, steps)
+
+
+def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
+    """Return chunks (B, T, chunk, action) that continue with the last action before a decision.
+
+    Args:
+        actions: of each step and those behind it.
+        before: (B, T, chunk) whether an action is before the next decision; the first of a chunk always is.
+    """
+    last = (before.sum(dim=-1, keepdim=True) - 1)[..., None].expand(-1, -1, 1, actions.shape[-1])
+    return torch.where(before[..., None], actions, actions.gather(2, last))
+
+
+def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) -> Tensor:
+    """Return (B, T): the steps that are trained on, drawn by torch's generator."""
+    left_out = waits & (torch.rand(waits.shape, device=waits.device) > config.waiting_share)
+    left_out[:, -1] = False  # the frame that was sampled
+    kept = real & ~left_out
+    return kept & _until_a_decision(begins, config.decision_share) if config.decision_share else kept
+
+
+def _shares(config: EpisodeConfig, actions: Tensor) -> Tensor:
+    """Return (chunk,): what the actions of a chunk count."""
+    shares = torch.full((config.chunk_size,), 1.0, device=actions.device)
+    if config.chunk_size > 1:
+        shares = shares * (1 - config.first_action_weight) / (config.chunk_size - 1)
+        shares[0] = config.first_action_weight
+    return shares
+
+
+def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_episodes: int) -> Tensor:
+    """Return images (N, …) of these episodes (N,), changed alike in all frames of an episode."""
+    mixed = _mixed(images, episodes, n_episodes) if config.mix_colors else images
+    return _moved(mixed, episodes, n_episodes, config.shift_px) if config.shift_px else mixed
+
+
+def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
+    """Return by how much a goal is missed, squared, in units of what the mean of the batch's would miss.
+
+    Args:
+        goal_m: (B, T, 3) predicted at each step.
+        right_m: (B, 3).
+        weights: (B, T) of the steps.
+    """
+    missed = (goal_m - right_m[:, None]).square().mean(dim=-1)
+    return weighted_mean(missed, weights) / goal_variance(right_m)
+
+
+def goal_variance(right_m: Tensor) -> Tensor:
+    """Return what the mean of goals (B, 3) misses, squared."""
+    return (right_m - right_m.mean(dim=0)).square().mean().clamp(min=LEAST_VARIANCE_M2)
+
+
+def _change(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): by how much at most an action (B, T, action) differs from the one before.
+
+    The first of an episode has none before it: 1, a full change.
+    """
+    change = torch.ones_like(actions[..., 0])
+    difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
+    change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
+    return change.clamp(max=1.0)
+
+
+def decisions(actions: Tensor, *, same_action: float = SAME_ACTION) -> Tensor:
+    """Return (T,): at which steps of an episode, (T, action), the arm begins to move after it waited."""
+    real = torch.ones(1, len(actions), dtype=torch.bool)
+    return _begins(_change(actions[None], real) < same_action, real)[0]
+
+
+def _begins(waits: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): whether a step is a decision, one of motion after one of waiting."""
+    begins = torch.zeros_like(waits)
+    begins[:, 1:] = real[:, :-1] & waits[:, :-1] & ~waits[:, 1:]
+    return begins
+
+
+def _before_the_next(begins: Tensor, chunk_size: int) -> Tensor:
+    """Return (B, T, chunk): whether no decision (B, T) lies between a step and that of the chunk's action."""
+    so_far = begins.cumsum(dim=1)
+    after = so_far[:, -1:].expand(-1, chunk_size - 1)
+    return torch.cat([so_far, after], dim=1).unfold(1, chunk_size, 1) == so_far[..., None]
+
+
+def _until_a_decision(begins: Tensor, share: float) -> Tensor:
+    """Return (B, T): False after a decision, in the share of episodes (B, T) that end at one.
+
+    An episode without any decision does not end early.
+    """
+    draws = torch.rand(begins.shape, device=begins.device).masked_fill(~begins, -1.0)
+    last = draws.argmax(dim=1)
+    ends = begins.any(dim=1) & (torch.rand(len(begins), device=begins.device) < share)
+    steps = torch.arange(begins.shape[1], device=begins.device)
+    return ~ends[:, None] | (steps <= last[:, None])
+
+
+def _with_other_things(
+    images: Tensor, n_frames: Tensor, n_before: Tensor, empty: Tensor, config: EpisodeConfig, may_stay: float
+) -> Tensor:
+    """Change the things in a share of the episodes, see `changed_things`.
+
+    Args:
+        images: (N, cameras, 3, H, W), one episode after the other.
+        n_frames: (B,) how many are of each.
+        n_before: (B,) how many of these are before the first decision; 0: there is none.
+        empty: (B, cameras, 3, H, W) the frames before the first decisions.
+        config: of the policy.
+        may_stay: see `changed_things`.
+    """
+    exchanges, erases = (
+        (torch.rand(len(n_frames)) < share).tolist() for share in (config.exchange_share, config.erase_share)
+    )
+    nothing = in_bytes(empty)
+    parts = list(torch.split(in_bytes(images), n_frames.tolist()))
+    for row in n_before.nonzero().flatten().tolist():
+        if exchanges[row] or erases[row]:
+            parts[row] = changed_things(
+                parts[row],
+                nothing[row],
+                n_before=int(n_before[row]),
+                erases=erases[row],
+                exchanges=exchanges[row],
+                may_stay=may_stay,
+            )
+    changed = torch.cat(parts)
+    return changed if images.dtype == torch.uint8 else in_numbers(changed)
+
+
+def _mixed(images: Tensor, episodes: Tensor, n_episodes: int) -> Tensor:
+    """Let the three colours of each episode change places; an order of its own for each."""
+    orders = torch.rand(n_episodes, 3, device=images.device).argsort(dim=1)[episodes]
+    return images.take_along_dim(orders[:, None, :, None, None], dim=-3)
+
+
+def _moved(images: Tensor, episodes: Tensor, n_episodes: int, most_px: int) -> Tensor:
+    """Move what each camera saw of each episode; the edges are repeated."""
+    moved = torch.empty_like(images)
+    by = torch.randint(-most_px, most_px + 1, (n_episodes, images.shape[1], 2)).tolist()
+    lengths = episodes.bincount(minlength=n_episodes).tolist()
+    for seen, place, cameras in zip(
+        torch.split(images, lengths), torch.split(moved, lengths), by, strict=True
+    ):
+        for camera, (down, right) in enumerate(cameras):
+            place[:, camera] = _moved_along(_moved_along(seen[:, camera], down, dim=-2), right, dim=-1)
+    return moved
+
+
+def _moved_along(images: Tensor, px: int, *, dim: int) -> Tensor:
+    """Move images by so many pixels; whole pieces are copied, which is much faster than pixels by number."""
+    size = images.shape[dim]
+    if px > 0:
+        first = [images.narrow(dim, 0, 1)] * px
+        return torch.cat([*first, images.narrow(dim, 0, size - px)], dim=dim)
+    if px < 0:
+        last = [images.narrow(dim, size - 1, 1)] * -px
+        return torch.cat([images.narrow(dim, -px, size + px), *last], dim=dim)
+    return images
+
+
+def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the mean of values with these weights, of the same shape; 0 if all weights are."""
+    return (values * weights).sum() / weights.sum().clamp(min=LEAST_WEIGHT)

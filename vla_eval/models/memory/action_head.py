@@ -1,0 +1,73 @@
+"""The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
+
+Where the arm goes is predicted from how far away the goal is, axis by axis, in a layer that sees nothing
+else: so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
+paths still finds the way. When to go is decided with all that is known.
+
+Not every task is a way to a place: to meet a rolling ball an arm has to follow it first. There a part of
+the translation may be free, predicted from all that is known.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vla_eval.models.episodes.eef_state import SPACE
+from vla_eval.models.memory.layers import three_layers
+
+WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
+WAY_HIDDEN = 64
+WAY_SEEN = 4  # numbers that describe the way along one axis
+LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
+
+
+class ActionHead(nn.Module):
+    """Decides when to go, the rest of the action, and how large the error of each action will be.
+
+    Args:
+        hidden: numbers of what was decided.
+        chunk: actions.
+        action: dimensions of an action, the first three of them a translation.
+        free: whether a part of the translation does not depend on the goal.
+    """
+
+    upright: Tensor
+
+    def __init__(self, *, hidden: int, chunk: int, action: int, free: bool) -> None:
+        super().__init__()
+        self.chunk = chunk
+        self.free = nn.Linear(hidden, chunk * SPACE) if free else None
+        self.goes = nn.Linear(hidden, chunk)
+        self.way = three_layers(WAY_SEEN, WAY_HIDDEN, chunk)
+        self.others = nn.Linear(hidden, chunk * (action - SPACE))
+        self.doubts = nn.Linear(hidden, chunk)
+        self.register_buffer("upright", torch.eye(SPACE)[-1], persistent=False)
+        with torch.no_grad():
+            self.doubts.bias.fill_(-3.0)  # about the error of actions at the beginning
+
+    def forward(self, decided: Tensor, way_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions (N, chunk, action), and the squared error expected of each (N, chunk) > 0.
+
+        Args:
+            decided: (N, hidden).
+            way_m: (N, 3) from the tool centre point to the goal.
+        """
+        goes = self.goes(decided).sigmoid()[..., None]  # (N, chunk, 1)
+        ways = self.way(self._along_each_axis(way_m)).transpose(1, 2)  # (N, chunk, 3)
+        others = self.others(decided).reshape(len(decided), self.chunk, -1)
+        doubts = functional.softplus(self.doubts(decided.detach())) + LEAST_DOUBT
+        translation = goes * ways
+        if self.free is not None:
+            translation = translation + self.free(decided).reshape(translation.shape)
+        return torch.cat([translation, others], dim=-1), doubts
+
+    def _along_each_axis(self, way_m: Tensor) -> Tensor:
+        """(N, 3) to (N, 3, WAY_SEEN): the way along the axis, up and aside, and which kind of axis it is.
+
+        The two horizontal axes share their weights: what is learned of one holds for the other.
+        """
+        way = way_m / WAY_SCALE_M
+        up, aside = way[:, 2:], way[:, :2].norm(dim=1, keepdim=True)
+        shared = torch.cat([up, aside], dim=1)[:, None].expand(-1, SPACE, -1)
+        kind = self.upright.expand(len(way), -1)
+        return torch.cat([way[..., None], shared, kind[..., None]], dim=-1)

@@ -1,0 +1,92 @@
+"""lerobot's configuration of the positive control; `docs/positive_control.md` explains it."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import PreTrainedConfig
+
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, EE_DELTA_POSE, JOINT_POS
+from vla_eval.errors import RecipeError, SpecMismatchError, check_names
+from vla_eval.features import CAMERA_KEYS
+from vla_eval.models.episodes.config import EpisodeConfig
+from vla_eval.models.memory.sizes import SPOTS
+
+TYPE = "mikasa_memory"
+LEARNED_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_POS)
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaMemoryConfig(EpisodeConfig):
+    """A small policy with a memory, or its twin without one.
+
+    Attributes:
+        remembers: False for the twin, whose memory is reset at each step.
+        arm_cameras: the images whose camera is on the arm and moves with it.
+        free_translation: a part of the translation does not depend on where the demonstration ends, for
+            tasks that are more than a way to a place.
+        goal_of_one_motion: episodes in which the arm begins to move more than once do not teach the goal:
+            theirs is that of the last motion, and wrong until then. On ten tasks that kept the goal from
+            being learned at all.
+        joint_targets: actions are those of `pd_joint_pos`; `finetune` sets it by the dataset's control mode.
+        channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
+        doubt_weight: of the loss that teaches the policy how large its error will be.
+    """
+
+    remembers: bool = True
+    arm_cameras: list[str] = field(default_factory=lambda: [CAMERA_KEYS["hand_camera"]])
+
+    channels: int = 32
+    patch_px: int = 4
+    heads: int = 8
+    key: int = 16
+    memory: int = 128
+    hidden: int = 256
+    longest_span_steps: float = 100.0
+    free_translation: bool = False
+    goal_of_one_motion: bool = False
+    joint_targets: bool = False
+
+    doubt_weight: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.patch_px < 1 or self.patch_px % SPOTS:
+            raise RecipeError(
+                f"patch_px is {self.patch_px}, expected a multiple of {SPOTS}: so many spots has an edge"
+            )
+
+    def fit_to_control_mode(self, mode: str) -> None:
+        """Take the control mode of a dataset.
+
+        Raises:
+            SpecMismatchError: this network does not learn its actions.
+        """
+        if mode not in LEARNED_MODES:
+            raise SpecMismatchError(
+                f"'{TYPE}' learns actions of {', '.join(LEARNED_MODES)}; the dataset's are for {mode}. "
+                f"Convert it: mikasa-vla dataset convert DATASET --control-mode {JOINT_POS} --out OUT."
+            )
+        self.joint_targets = mode == JOINT_POS
+        if self.joint_targets and self.goal_of_one_motion:
+            raise SpecMismatchError(
+                "goal_of_one_motion is true: expected actions that translate the tool, found those of "
+                f"{mode}. Set policy.goal_of_one_motion to false."
+            )
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        super().validate_features()
+        n_numbers = int(self.action_feature.shape[0])
+        if self.joint_targets != (n_numbers == len(CONTROL_MODES[JOINT_POS].dims)):
+            raise ValueError(
+                f"'{TYPE}' with joint_targets: {self.joint_targets} does not fit actions of {n_numbers} "
+                f"numbers; it is for those of {JOINT_POS}"
+            )
+        where = f"policy.arm_cameras ({TYPE}; those whose camera is on the arm, [] if none is)"
+        check_names("image", self.arm_cameras, self.image_features, where=where)
+        _, height_px, width_px = next(iter(self.image_features.values())).shape
+        if height_px != width_px or height_px % self.patch_px:
+            raise ValueError(
+                f"'{TYPE}' needs square images whose edge is a multiple of patch_px ({self.patch_px}), "
+                f"found {height_px}×{width_px}"
+            )

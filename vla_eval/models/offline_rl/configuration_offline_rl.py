@@ -1,0 +1,125 @@
+"""lerobot's configuration of policies that learn from rewards; `docs/offline_rl.md` explains them."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, get_args  # lerobot is untyped
+
+from lerobot.configs import PreTrainedConfig
+
+from vla_eval.control_modes import ABSOLUTE_MODES, CONTROL_MODE, JOINT_DELTA_POS
+from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.features import RewardKind
+from vla_eval.models.offline_rl.algorithms import ALGORITHMS
+from vla_eval.models.shared.ported_config import PortedConfig
+
+TYPE = "mikasa_offline_rl"
+REWARDS: tuple[str, ...] = get_args(RewardKind)
+UNIT_INTERVAL = ("dropout", "discount", "expectile", "target_rate")
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaOfflineRLConfig(PortedConfig):
+    """An actor and a critic on one encoder of both cameras' images; no proprioception, no memory.
+
+    A training sample is a transition: images of a frame and of the next one, action, reward, and whether the
+    episode ends. Nothing is normalised by statistics: actions lie in [-1, 1].
+
+    Attributes:
+        masks_padding: there is none: one action per sample.
+        reads_state: the encoder of the paper's baselines has none.
+        algorithm: a name of `ALGORITHMS`.
+        reward: `dense`, `success` (1 in every step at which the success rule holds) or `sparse` (1 at the
+            first of them); None for an algorithm that reads none.
+        width: numbers that the encoder returns.
+        hidden: units of the two layers of actor and critics.
+        dropout: in these layers.
+        discount: of the rewards.
+        target_rate: share by which the slow critics follow in each step (Polyak averaging).
+        conservative_weight: of the conservative penalty of CQL.
+        n_sampled_actions: drawn for it from each of three distributions.
+        imitation_weight: of the squared distance between the actor's mean and the recorded action in CQL.
+        expectile: of the values of IQL; 0.5 is the mean.
+        advantage_scale: by how much better actions count more in the imitation of IQL.
+        scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
+    """
+
+    masks_padding: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = False
+
+    chunk_size: int = 1
+    n_action_steps: int = 1
+
+    algorithm: str = "iql"
+    reward: str | None = "success"
+    width: int = 64
+    hidden: int = 256
+    dropout: float = 0.0
+    discount: float = 0.99
+    target_rate: float = 0.005
+    conservative_weight: float = 1.0
+    n_sampled_actions: int = 10
+    imitation_weight: float = 1.0
+    expectile: float = 0.7
+    advantage_scale: float = 3.0
+
+    optimizer_lr: float = 3e-4
+    optimizer_weight_decay: float = 0.1
+    scheduler_decay_steps: int = 50_000
+    scheduler_decay_lr: float = 3e-5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.algorithm not in ALGORITHMS:
+            raise unknown_name("algorithm", self.algorithm, ALGORITHMS, where=f"policy ({TYPE})")
+        if self.reward is not None and self.reward not in REWARDS:
+            raise unknown_name("reward", self.reward, REWARDS, where=f"policy ({TYPE})")
+        if ALGORITHMS[self.algorithm].reads_rewards != (self.reward is not None):
+            needed = "one of " + ", ".join(REWARDS) if self.reward is None else "null: it reads none"
+            raise RecipeError(f"reward of '{self.algorithm}' is {self.reward}, expected {needed}.")
+        if self.chunk_size != 1:
+            raise RecipeError(f"chunk_size is {self.chunk_size}, expected 1: a critic judges single actions.")
+        for name in ("width", "hidden", "n_sampled_actions"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1")
+        for name in UNIT_INTERVAL:
+            if not 0 <= getattr(self, name) <= 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
+
+    def fit_to_control_mode(self, mode: str) -> None:
+        """Check that the actions lie in [-1, 1], where those of the actor do.
+
+        Raises:
+            RecipeError: they do not.
+        """
+        if mode in ABSOLUTE_MODES:
+            raise RecipeError(
+                f"'{TYPE}' acts in [-1, 1], found a dataset of {mode}, whose actions are m and rad: record "
+                f"with env.{CONTROL_MODE}={JOINT_DELTA_POS}, or another mode of deltas."
+            )
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        if not self.image_features or self.action_feature is None:
+            raise ValueError(f"'{TYPE}' needs images and action")
+        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
+        if len(shapes) != 1:
+            raise ValueError(f"'{TYPE}' needs images of one size, found {sorted(shapes)}")
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The frame and the next one."""
+        return [0, 1]
+
+    @property
+    def inference_delta_indices(self) -> None:
+        """Only the frame itself."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """One action."""
+        return [0]
+
+    def get_scheduler_preset(self) -> Any:
+        """Return lerobot's configuration of the schedule."""
+        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)

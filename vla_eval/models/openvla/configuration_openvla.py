@@ -1,0 +1,139 @@
+"""lerobot's configuration of OpenVLA and OpenVLA-OFT; `docs/openvla.md` explains it."""
+
+from dataclasses import dataclass
+from typing import Any  # lerobot is untyped
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from vla_eval.errors import RecipeError
+from vla_eval.features import STATE_KEY
+from vla_eval.models.openvla.lora import FULL_MODULES, LORA_TARGETS
+from vla_eval.models.openvla.sizes import Head, NetworkOptions, NetworkSizes
+from vla_eval.models.shared.images import Augmentation
+from vla_eval.models.shared.network_sizes import with_changes
+from vla_eval.models.shared.normalization import Normalization, mask_all_but
+from vla_eval.models.shared.ported_config import PromptedConfig
+
+TYPE = "mikasa_openvla"
+HEADS: tuple[Head, ...] = ("l1", "parallel_tokens", "tokens")
+# Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
+# prismatic/vla/datasets/datasets.py#L152-L166
+AUGMENTATION = Augmentation(
+    crop_area=(0.9, 0.9), brightness=0.2, contrast=(0.8, 1.2), saturation=(0.8, 1.2), hue=0.05
+)
+
+
+@LRSchedulerConfig.register_subclass("mikasa_step_decay")
+@dataclass
+class StepDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
+    """Divides the learning rate by ten once, after so many steps; 0: never.
+
+    Attributes:
+        num_decay_steps: so many.
+        num_warmup_steps: linear, from nothing.
+    """
+
+    num_decay_steps: int = 0
+    num_warmup_steps: int | None = 0
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """Return torch's scheduler."""
+
+        def factor(step: int) -> float:
+            warm = min(1.0, (step + 1) / self.num_warmup_steps) if self.num_warmup_steps else 1.0
+            return warm * (0.1 if self.num_decay_steps and step >= self.num_decay_steps else 1.0)
+
+        return LambdaLR(optimizer, factor)
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaOpenVLAConfig(PromptedConfig):
+    """OpenVLA, or OpenVLA-OFT, as one type; `head` says which.
+
+    Attributes:
+        head: see `NetworkOptions`.
+        chunk_size: a part of the model: K = 4 and K = 8 are two trainings.
+        pictures: empty: all images of the dataset.
+        use_proprio: read `observation.state` as one more token. The paper does not.
+        dtype: of vision encoders, projector and Llama. The continuous head is always float32.
+        image_augmentation: change training images at random and crop those of an evaluation alike.
+        do_mask_loss_for_padding: False, as the original: no chunk begins so late that it goes beyond the end.
+        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
+            scheduler_decay_steps: AdamW, constant, divided by ten after `scheduler_decay_steps` (0: never).
+    """
+
+    head: str = "l1"
+    chunk_size: int = 8
+    n_action_steps: int = 8
+    use_proprio: bool = False
+    image_augmentation: bool = True
+    tokenizer_name: str = "openvla/openvla-7b"
+
+    optimizer_grad_clip_norm: float = 0.0
+    scheduler_decay_steps: int = 100_000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_choice("head", HEADS)
+        self.network_sizes()
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        super().validate_features()
+        if self.use_proprio and self.robot_state_feature is None:
+            raise RecipeError(f"'{TYPE}' with use_proprio needs {STATE_KEY}.")
+
+    @property
+    def image_fields(self) -> tuple[str, ...]:
+        """Fields of the images that are read, in order."""
+        return tuple(self.pictures) or tuple(self.image_features)
+
+    @property
+    def reads_state(self) -> bool:
+        """Whether the policy has any use for `observation.state`."""
+        return self.use_proprio
+
+    def network_sizes(self) -> NetworkSizes:
+        """Return the sizes of the network."""
+        return with_changes(NetworkSizes, self.sizes)
+
+    def network_options(self) -> NetworkOptions:
+        """Return what the network has beside its sizes; needs the dataset's fields."""
+        proprio = int(self.robot_state_feature.shape[0]) if self.use_proprio else 0
+        head: Any = self.head  # checked in `__post_init__`
+        return NetworkOptions(
+            head=head, chunk=self.chunk_size, action=int(self.action_feature.shape[0]), proprio=proprio
+        )
+
+    def normalizations(self) -> dict[str, Normalization]:
+        """Return how fields are normalised; proprioception, if it is read, like the action."""
+        fields = super().normalizations()
+        if self.use_proprio:
+            n_state = int(self.robot_state_feature.shape[0])
+            # In an evaluation the original cuts the whole state: experiments/robot/openvla_utils.py#L669.
+            fields[STATE_KEY] = Normalization(
+                kind="q01_q99", mask=mask_all_but(n_state), clip=True, clip_unmasked=True
+            )
+        return fields
+
+    def lora_defaults(self) -> dict[str, Any]:
+        """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
+        full = [name for name in FULL_MODULES if self._has(name)]
+        return {
+            "target_modules": LORA_TARGETS,
+            "modules_to_save": full or None,
+            "init_lora_weights": "gaussian",
+        }
+
+    def _has(self, module: str) -> bool:
+        return self.head == "l1" if module == "action_head" else self.use_proprio
+
+    def get_scheduler_preset(self) -> Any:
+        """Return the configuration of the schedule."""
+        return StepDecaySchedulerConfig(
+            num_decay_steps=self.scheduler_decay_steps, num_warmup_steps=self.scheduler_warmup_steps
+        )

@@ -1,0 +1,88 @@
+"""The token heads: actions as tokens, all at once or one after the other, and their loss.
+
+Legend as in `network`. Decoding is greedy, as the original's.
+"""
+
+from typing import Any  # transformers is untyped here
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+from transformers import DynamicCache
+
+from vla_eval.models.openvla.action_tokens import from_tokens, to_tokens
+from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
+from vla_eval.models.shared.greedy import Prefix, greedy_tokens
+
+
+def parallel_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
+    """Return normalised actions (B, K, A) of the tokens that are predicted for the placeholders."""
+    hidden = network.action_states(network.sequence(inputs))
+    tokens = network.llm.lm_head(hidden).argmax(dim=-1)
+    return _chunk(network, tokens)
+
+
+def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
+    """Return normalised actions (B, K, A), predicted token after token, for prompts of several lengths."""
+    sequence = network.sequence(inputs)
+    n = int(sequence.first_action.max())
+    lengths = sequence.first_action
+    seen = torch.arange(n, device=lengths.device) < lengths[:, None]
+    causal = torch.ones(n, n, dtype=torch.bool, device=lengths.device).tril()
+    prefix = Prefix(sequence.embeddings[:, :n], seen[:, None, :] & causal, lengths)
+    decoded = greedy_tokens(_Llama(network.llm), prefix, network.options.n_action_tokens)
+    return _chunk(network, decoded.tokens)
+
+
+def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts: Tensor) -> Tensor:
+    """Return the cross-entropy of the action tokens and of the stop token behind them.
+
+    Args:
+        network: with a token head.
+        inputs: see there.
+        actions: (B, K, A) normalised.
+        counts: (B, K) float, 0 for actions that are left out; the stop token counts as the last action.
+
+    Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
+    prismatic/vla/datasets/datasets.py#L32-L74: `predict_stop_token`, whichever way the tokens are predicted.
+    """
+    one_by_one = network.options.head == "tokens"
+    ids = to_tokens(actions.flatten(1), network.sizes.text_vocabulary)
+    sequence = network.sequence(inputs, ids if one_by_one else None)
+    hidden = network.action_states(sequence, causal=one_by_one, n_more=1)
+    ids = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
+    weights = counts.repeat_interleave(network.options.action, dim=1)
+    weights = torch.cat([weights, weights[:, -1:]], dim=1)
+    logits = network.llm.lm_head(hidden).float()
+    losses = functional.cross_entropy(logits.flatten(0, 1), ids.flatten(), reduction="none")
+    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
+
+
+class _Llama:
+    """OpenVLA's Llama, for greedy decoding."""
+
+    def __init__(self, llm: Any) -> None:
+        self._llm = llm
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        embeddings: Tensor = self._llm.model.embed_tokens(tokens)
+        return embeddings
+
+    def read(self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None) -> Tensor:
+        hidden: Tensor = self._llm.model(
+            inputs_embeds=embeddings,
+            attention_mask=mask[:, None],
+            position_ids=places,
+            past_key_values=cache,
+            use_cache=cache is not None,
+        ).last_hidden_state
+        return hidden
+
+    def logits(self, hidden: Tensor) -> Tensor:
+        logits: Tensor = self._llm.lm_head(hidden)
+        return logits
+
+
+def _chunk(network: OpenVLANetwork, tokens: Tensor) -> Tensor:
+    actions = from_tokens(tokens, network.sizes.text_vocabulary)
+    return actions.reshape(len(tokens), network.options.chunk, network.options.action)

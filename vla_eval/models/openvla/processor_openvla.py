@@ -1,0 +1,40 @@
+"""lerobot's processors of OpenVLA: prompt, tokens and normalised targets in, actions out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any  # lerobot is untyped
+
+from lerobot.processor import ProcessorStepRegistry
+
+from vla_eval.models.openvla.configuration_openvla import MikasaOpenVLAConfig
+from vla_eval.models.openvla.prompt import prompt_text
+from vla_eval.models.shared.language_processors import InstructionStep, language_processors
+from vla_eval.models.shared.normalization import Normalization
+
+PROMPT_STEP = "mikasa_openvla_prompt"
+
+
+@dataclass
+@ProcessorStepRegistry.register(name=PROMPT_STEP)
+class OpenVLAPromptStep(InstructionStep):
+    """Puts OpenVLA's words around the instruction."""
+
+    def prompt(self, instruction: str) -> str:
+        """Return the prompt."""
+        return prompt_text(instruction)
+
+
+def make_mikasa_openvla_pre_post_processors(
+    config: MikasaOpenVLAConfig,
+    dataset_stats: dict[str, dict[str, Any]] | None = None,
+    *,
+    fields: Mapping[str, Normalization] | None = None,
+) -> tuple[Any, Any]:
+    """Return pre- and postprocessor; lerobot finds this function by its name.
+
+    Args:
+        config: of the policy.
+        dataset_stats: field -> statistics; None: they come from a checkpoint.
+        fields: how fields are normalised with foreign statistics; None: as the configuration says.
+    """
+    return language_processors(config, OpenVLAPromptStep(), dataset_stats, fields=fields)

@@ -1,0 +1,149 @@
+"""lerobot's configuration of the plain policies that remember; `docs/sequence_policies.md` explains them."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args  # lerobot is untyped
+
+import numpy as np
+from lerobot.configs import PreTrainedConfig
+from numpy.typing import NDArray
+
+from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
+from vla_eval.models.episodes.config import EpisodeConfig
+from vla_eval.models.sequence.sizes import (
+    CORES,
+    ENCODERS,
+    HEADS,
+    TOKENS,
+    TransformerXLOptions,
+    options_of,
+)
+
+TYPE = "mikasa_sequence"
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaSequenceConfig(EpisodeConfig):
+    """A plain network: an encoder of images, a core over time, a head that predicts a chunk.
+
+    Attributes:
+        core: what is kept from step to step, a name of `CORES`.
+        core_options: sizes of the core that differ from its row there.
+        encoder: of images, a name of `ENCODERS`.
+        head: a name of `HEADS`. `gated` reads the observation and the core's answer; `linear`, of the
+            sequence models' papers, reads the answer alone and bounds actions by tanh.
+        tokens: of a step, a name of `TOKENS`.
+        state_in_token: the token of an observation has the state in it, not only the images.
+        reward: whose return to go is a token, a `RewardKind`. None: no token needs one.
+        target_return: the return to go at inference, the same at every step. None: 1 for sparse rewards; for
+            others the highest return of the dataset's episodes.
+        width: units of a token, of the core and of the head.
+        layers: of the core.
+        heads: of its attention, where it has any.
+        context_steps: the steps, the newest among them, that a layer of a transformer sees; of cores that
+            read an episode in segments, the steps of one.
+        dropout: of the core.
+    """
+
+    core: str = "gru"
+    core_options: dict[str, Any] = field(default_factory=dict)
+    encoder: str = "keypoints"
+    head: str = "gated"
+    tokens: str = "step"
+    state_in_token: bool = True
+    reward: str | None = None
+    target_return: float | None = None
+    width: int = 256
+    layers: int = 1
+    heads: int = 4
+    context_steps: int = 200
+    dropout: float = 0.0
+
+    optimizer_lr: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known: dict[str, Collection[str]] = {
+            "core": CORES,
+            "encoder": ENCODERS,
+            "head": HEADS,
+            "tokens": TOKENS,
+        }
+        for name, names in known.items():
+            if getattr(self, name) not in names:
+                raise unknown_name(name, getattr(self, name), names, where=f"policy ({TYPE})")
+        for name in ("width", "layers", "heads", "context_steps"):
+            if getattr(self, name) < 1:
+                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1")
+        if not 0 <= self.dropout < 1:
+            raise RecipeError(f"dropout is {self.dropout}, expected a number in [0, 1)")
+        self._check_width()
+        self._check_returns()
+
+    @property
+    def reads_returns(self) -> bool:
+        """Whether the return to go is a token."""
+        return self.tokens != "step"
+
+    @property
+    def reads_actions(self) -> bool:
+        """Whether the action of a step is a token."""
+        return self.tokens == "return_observation_action"
+
+    @property
+    def tokens_per_step(self) -> int:
+        """Tokens of a step."""
+        return TOKENS[self.tokens]
+
+    @property
+    def reward_delta_indices(self) -> list[int] | None:
+        """The steps of the window, if the return to go is read."""
+        return list(range(1 - self.n_window_steps, 1)) if self.reads_returns else None
+
+    @property
+    def return_at_inference(self) -> float:
+        """`target_return`, once it is known."""
+        if self.target_return is None:
+            raise ValueError(f"'{TYPE}': target_return is not set (`mikasa-vla finetune` sets it)")
+        return self.target_return
+
+    def fit_to_rewards(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Take the target return from a dataset, where it is not given.
+
+        Args:
+            columns: field -> (N,) of the dataset's frames.
+        """
+        key = REWARD_KEY if self.reward == "dense" else SUCCESS_KEY
+        if self.reward is None or self.target_return is not None or key not in columns:
+            return
+        _, episodes = np.unique(columns["episode_index"], return_inverse=True)
+        sums = np.bincount(episodes.reshape(-1), weights=columns[key].reshape(-1).astype(np.float64))
+        self.target_return = float(sums.max())
+
+    def _check_width(self) -> None:
+        row, options = CORES[self.core], options_of(self.core, self.core_options)
+        multiple = (self.heads if row.heads_divide else 1) * (2 if row.is_even else 1)
+        if self.width % multiple:
+            parts = f"2 · heads ({multiple})" if row.heads_divide else str(multiple)
+            raise RecipeError(
+                f"width is {self.width}, expected a multiple of {parts} for the core '{self.core}'"
+            )
+        valve = options.valve_heads if isinstance(options, TransformerXLOptions) else 0
+        if valve and self.width % valve:
+            raise RecipeError(f"width is {self.width}, expected a multiple of valve_heads ({valve})")
+
+    def _check_returns(self) -> None:
+        kinds = get_args(RewardKind)
+        if self.reads_returns and self.reward not in kinds:
+            raise RecipeError(
+                f"reward is {self.reward}, expected {' or '.join(kinds)}: tokens={self.tokens} reads the "
+                "return to go"
+            )
+        if not self.reads_returns and (self.reward is not None or self.target_return is not None):
+            raise RecipeError(
+                f"reward and target_return belong to tokens=return_observation[_action], found {self.tokens}"
+            )
+        if self.reward == "sparse" and self.target_return is None:
+            self.target_return = 1.0

@@ -1,0 +1,181 @@
+"""Plain encoders of images: the one of the paper's baselines, and keypoints of shapes and of colours."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from vla_eval.models.sequence.sizes import ENCODERS, NATURE_LAYERS, nature_edges
+from vla_eval.models.sequence.spatial_softmax import spatial_softmax
+from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.precision import in_float32
+
+RGB = 3
+NUMBERS_OF_A_KEYPOINT = 3  # x, y, how strong
+CELL_PX = 4
+FRAMES_AT_ONCE = 64  # on a CPU
+
+
+class Nature(nn.Sequential):
+    """The encoder of the paper's sequence baselines: three convolutions, a linear layer, tanh.
+
+    Sizes: Mnih et al. 2015, as in https://github.com/CognitiveAISystems/RATE (commit 5aa88f0, image encoder
+    of the MIKASA-Robo configurations), which has both cameras as six channels.
+
+    Args:
+        image_px: height and width of an image.
+        outputs: numbers that are returned.
+        channels: of an image.
+    """
+
+    def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
+        (first, second, third), edge = NATURE_LAYERS, nature_edges(image_px)[-1]
+        super().__init__(
+            nn.Conv2d(channels, 32, *first),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, *second),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, *third),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(64 * edge**2, outputs),
+            nn.Tanh(),
+        )
+
+
+SHAPE_MAPS, COLOR_MAPS = 32, 64
+
+
+def _shapes() -> nn.Sequential:
+    """Two convolutions, and one of 1 x 1."""
+    return nn.Sequential(
+        nn.Conv2d(RGB, 32, 2 * CELL_PX, stride=CELL_PX, padding=2),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(32, SHAPE_MAPS, 1),
+    )
+
+
+class ShapesAndColors(nn.Module):
+    """Beside the maps of convolutions, some of each cell's mean colour alone, by three layers.
+
+    They find a colour in a fraction of the steps in which convolutions find it (docs/learning_the_rule.md).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shapes = _shapes()
+        self.colors = nn.Sequential(
+            nn.AvgPool2d(CELL_PX),
+            nn.Conv2d(RGB, 64, 1),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 1),
+            nn.ReLU(),
+            nn.Conv2d(64, COLOR_MAPS, 1),
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (N, maps, H / 4, W / 4) of images (N, 3, H, W)."""
+        return torch.cat([self.shapes(images), self.colors(images)], dim=1)
+
+
+class FeatureRow(NamedTuple):
+    """Features of each cell of 4 x 4 pixels, and how many maps they are."""
+
+    make: Callable[[], nn.Module]
+    n_maps: int
+
+
+FEATURES = {
+    "keypoints": FeatureRow(_shapes, SHAPE_MAPS),
+    "color_keypoints": FeatureRow(ShapesAndColors, SHAPE_MAPS + COLOR_MAPS),
+}
+
+
+class Keypoints(nn.Module):
+    """Features of each cell of 4 x 4 pixels and a spatial softmax: where each is, and how strong it is there.
+
+    Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies", section 5.1; the strength, which
+    says whether the feature is in the image at all, is ours.
+
+    Args:
+        image_px: height and width of an image, a multiple of 4.
+        outputs: numbers that are returned.
+        features: a name of `FEATURES`.
+    """
+
+    places: Tensor
+
+    def __init__(self, *, image_px: int, outputs: int, features: str = "keypoints") -> None:
+        super().__init__()
+        make, n_maps = FEATURES[features]
+        self.features = make()
+        self.sharpness = nn.Parameter(torch.full((n_maps,), 4.0).log())
+        self.reads = nn.Linear(NUMBERS_OF_A_KEYPOINT * n_maps, outputs)
+        line = torch.linspace(-1, 1, image_px // CELL_PX)
+        places = torch.cartesian_prod(line, line).flip(-1)  # (H · W, 2): x, y
+        self.register_buffer("places", places, persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (N, outputs) of images (N, 3, H, W) in [-1, 1]."""
+        read: Tensor = self.reads_out(self.features(images))
+        return read
+
+    @in_float32
+    def reads_out(self, features: Tensor) -> Tensor:
+        """Return (N, outputs) of maps (N, maps, H, W); half precision would round places to a pixel."""
+        # In one piece: after convolutions in channels_last order, a map's numbers are far apart.
+        maps = features.flatten(2).contiguous()
+        found = spatial_softmax(maps, self.sharpness.exp(), self.places)
+        read: Tensor = self.reads(found.transpose(1, 2).flatten(1))  # all x, all y, all strengths
+        return read
+
+
+class Cameras(nn.ModuleList):
+    """The images of all cameras as one vector: an encoder for each, or one whose channels they all are.
+
+    Args:
+        name: of the encoder in `ENCODERS`.
+        n_cameras: number of cameras.
+        image_px: height and width of an image.
+        outputs: numbers that an encoder returns.
+    """
+
+    def __init__(self, name: str, *, n_cameras: int, image_px: int, outputs: int) -> None:
+        channels = RGB * n_cameras if ENCODERS[name].shared else RGB
+        n_encoders = RGB * n_cameras // channels
+        self.outputs = n_encoders * outputs
+        make: Callable[..., nn.Module] = (
+            partial(Keypoints, features=name) if name in FEATURES else partial(Nature, channels=channels)
+        )
+        super().__init__(make(image_px=image_px, outputs=outputs) for _ in range(n_encoders))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (B, T, `outputs`) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes.
+
+        On a CPU, 64 frames at a time. In training their number differs from step to step; maps of ever new
+        sizes would find no room where those of the last step were, and the process would grow and grow.
+        """
+        frames = images.flatten(0, 1)
+        at_once = FRAMES_AT_ONCE if images.device.type == "cpu" else len(frames)
+        seen = torch.cat([self._seen(part) for part in torch.split(frames, at_once)])
+        return seen.reshape(*images.shape[:2], self.outputs)
+
+    def _seen(self, frames: Tensor) -> Tensor:
+        """Return (N, `outputs`) of frames (N, cameras, 3, H, W)."""
+        parts = frames.flatten(1, 2).chunk(len(self), dim=1)
+        # Convolutions on a CPU are a fifth faster in this order of the same numbers.
+        ordered = (part.contiguous(memory_format=torch.channels_last) for part in parts)
+        return torch.cat(
+            [encoder(_around_zero(part)) for encoder, part in zip(self, ordered, strict=True)], dim=-1
+        )
+
+
+def _around_zero(images: Tensor) -> Tensor:
+    """Return images in [-1, 1] of images in [0, 1] or bytes, the same numbers of both."""
+    if images.dtype == torch.uint8:  # a new tensor, so that the rest can be done in place: it is large
+        return in_numbers(images).mul_(2).sub_(1)
+    return 2 * images - 1

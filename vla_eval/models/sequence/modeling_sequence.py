@@ -1,0 +1,243 @@
+"""Plain policies as a LeRobot policy: imitation over whole episodes, memory from frame to frame."""
+
+from typing import Any, NamedTuple  # lerobot is untyped
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vla_eval.features import STATE_KEY
+from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
+from vla_eval.models.episodes.policy import EpisodePolicy
+from vla_eval.models.episodes.returns import returns_to_go, rewards_in
+from vla_eval.models.episodes.samples import (
+    Episodes,
+    goal_missed,
+    stacked_images,
+    weighted_mean,
+)
+from vla_eval.models.episodes.sentence import SentenceEncoder, said_at_each_step, with_sentence
+from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
+from vla_eval.models.sequence.core import CoreMemory
+from vla_eval.models.sequence.cores import make_core
+from vla_eval.models.sequence.encoders import Cameras
+from vla_eval.models.sequence.sizes import CORES
+from vla_eval.models.shared.precision import in_float32
+
+
+class Predicted(NamedTuple):
+    """What the network predicts at each step.
+
+    Attributes:
+        actions: (B, T, chunk, action).
+        goal_m: (B, T, 3) where the demonstration's tool centre point ends.
+    """
+
+    actions: Tensor
+    goal_m: Tensor
+
+
+class Gated(nn.Module):
+    """A layer whose outputs are products: a linear map, gated by another one (Shazeer 2020, SwiGLU)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.values, self.gates = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return (…, outputs) of (…, inputs)."""
+        gated: Tensor = functional.silu(self.gates(inputs)) * self.values(inputs)
+        return gated
+
+
+class Demonstrated(NamedTuple):
+    """What the tokens of a demonstration's steps are made of, beside the observations.
+
+    Attributes:
+        returns: (B, T) to go.
+        actions: (B, T, action) executed at these steps.
+    """
+
+    returns: Tensor
+    actions: Tensor
+
+
+class SequenceNetwork(nn.Module):
+    """Encoders of images, tokens for each step, a core over the tokens, a head.
+
+    Args:
+        config: sizes and names of the parts.
+    """
+
+    def __init__(self, config: MikasaSequenceConfig) -> None:
+        super().__init__()
+        width, images = config.width, config.image_features
+        image_px = int(next(iter(images.values())).shape[-1])
+        self.config = config
+        self.encoders = Cameras(config.encoder, n_cameras=len(images), image_px=image_px, outputs=width)
+        n_state = int(config.robot_state_feature.shape[0]) if config.state_in_token else 0
+        self.token = nn.Sequential(
+            nn.Linear(self.encoders.outputs + n_state, width), nn.LayerNorm(width), nn.GELU()
+        )
+        self.core = make_core(
+            config.core,
+            width=width,
+            layers=config.layers,
+            heads=config.heads,
+            context_steps=config.context_steps,
+            dropout=config.dropout,
+            tokens_per_step=config.tokens_per_step,
+            given=config.core_options,
+        )
+        if config.head == "gated":
+            self.head = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width), Gated(width, width))
+        self.shape = (config.chunk_size, int(config.action_feature.shape[0]))
+        self.actions = nn.Linear(width, self.shape[0] * self.shape[1])
+        self.goal = nn.Linear(width, SPACE)
+        if config.reads_returns:
+            self.returns = nn.Linear(1, width)
+        if config.reads_actions:
+            self.executed = nn.Linear(self.shape[1], width)
+        self.sentence = SentenceEncoder(width) if config.reads_sentence else None
+
+    def begin(self, n_episodes: int) -> CoreMemory:
+        """Return the memory before the first step; its last tensor is the core's answer, (B, width)."""
+        nothing = self.actions.weight.new_zeros(n_episodes, self.actions.in_features)
+        return (*self.core.begin(n_episodes), nothing)
+
+    def tokens(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Tensor:
+        """Return (B, T, width) of what is seen.
+
+        Args:
+            images: (B, T, cameras, 3, H, W) in [0, 1], or bytes.
+            state: (B, T, state).
+            said: (B, T, width) by `sentence`; None where no instruction is read.
+        """
+        return self._told(self.encoders(images), state, said)
+
+    # Under autocast the encoders alone are in half precision: they are nearly all of the work.
+    @in_float32
+    def _told(self, seen: Tensor, state: Tensor, said: Tensor | None) -> Tensor:
+        read = [seen, state * POSITION_SCALE] if self.config.state_in_token else [seen]
+        return with_sentence(self.token, torch.cat(read, dim=-1), said)
+
+    @in_float32
+    def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
+        """Return the core's answers (B, T, width) to the observations of whole demonstrations.
+
+        Args:
+            tokens: (B, T, width) of the observations.
+            demonstrated: what the other tokens are made of, if there are others.
+        """
+        begun = self.core.begin(len(tokens))
+        if demonstrated is None:
+            alone: Tensor = self.core(tokens, begun)[0]
+            return alone
+        parts = [self.returns(demonstrated.returns[..., None]), tokens]
+        if self.config.reads_actions:
+            parts.append(self.executed(demonstrated.actions))
+        steps = torch.stack(parts, dim=2)
+        read: Tensor = self.core(steps.flatten(1, 2), begun)[0]
+        return read[:, 1 :: steps.shape[2]]
+
+    @in_float32
+    def read(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
+        """Return the core's answers (B, T, width) to observations, and the memory after the last step.
+
+        The return to go is the target at every step: no reward is known. The action, where it is read, is
+        the one that the policy itself decides on at the step.
+        """
+        if not self.config.reads_returns:
+            answers, kept = self.core(tokens, memory[:-1])
+            return answers, (*kept, answers[:, -1])
+        kept, found = memory[:-1], []
+        target = tokens.new_full((len(tokens), 1, 1), self.config.return_at_inference)
+        for step in range(tokens.shape[1]):
+            token = tokens[:, step : step + 1]
+            told = torch.cat([self.returns(target), token], dim=1)
+            answer, kept = self.core(told, kept)
+            found.append(answer[:, 1:])
+            if not self.config.reads_actions:
+                continue
+            action = self.predict(token, found[-1]).actions[:, :, 0].clamp(-1, 1)
+            _, kept = self.core(self.executed(action.to(token.dtype)), kept)
+        return torch.cat(found, dim=1), (*kept, found[-1][:, 0])
+
+    @in_float32
+    def predict(self, tokens: Tensor, answers: Tensor) -> Predicted:
+        """Return what is predicted at each step, both inputs (B, T, width)."""
+        is_gated = self.config.head == "gated"
+        decided = self.head(torch.cat([tokens, answers], dim=-1)) if is_gated else answers
+        actions = self.actions(decided).unflatten(-1, self.shape)
+        return Predicted(
+            actions=actions if is_gated else actions.tanh(),
+            goal_m=self.goal(decided) / POSITION_SCALE,
+        )
+
+
+class MikasaSequencePolicy(EpisodePolicy):
+    """See `MikasaSequenceConfig`; it has a memory if its core has one."""
+
+    config_class = MikasaSequenceConfig
+    name = TYPE
+
+    def __init__(self, config: MikasaSequenceConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        self.config: MikasaSequenceConfig = config
+        self.network = SequenceNetwork(config)
+        self.set_memory(self.network.begin, remembers=CORES[config.core].remembers)
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a batch of training samples, and its parts."""
+        config, network = self.config, self.network
+        episodes = self.samples(batch)
+        # Images are most of the work: each is encoded once, those of padding not at all.
+        first = episodes.first
+        said = said_at_each_step(network.sentence, batch, first.shape[1])
+        said = None if said is None else said[first][None]
+        encoded = network.tokens(episodes.images[None], episodes.state[first][None], said)[0]
+        tokens = encoded[episodes.frames]
+        answers = network.answers(tokens, self._demonstrated(batch, episodes))
+        predicted = network.predict(tokens, answers)
+        errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
+        imitation = weighted_mean(errors, episodes.counts)
+        # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
+        # at which the choice has to be made from memory would count for little.
+        goal = goal_missed(predicted.goal_m, episodes.goal_m, episodes.goal_counts)
+        parts = {"imitation": imitation, "goal": goal}
+        loss = imitation + config.goal_weight * goal
+        return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    def _demonstrated(self, batch: dict[str, Tensor], episodes: Episodes) -> Demonstrated | None:
+        if not self.config.reads_returns:
+            return None
+        kind: Any = self.config.reward  # the configuration has checked it
+        returns = returns_to_go(rewards_in(batch, kind)).gather(1, episodes.steps)
+        return Demonstrated(returns=returns, actions=episodes.actions[:, :, 0])
+
+    @torch.no_grad()
+    def _remember(self, batch: dict[str, Tensor], memory: CoreMemory | None) -> CoreMemory:
+        """Return the memory after the frames (B, T, …) of a batch; None: an episode begins."""
+        self.eval()
+        state = batch[STATE_KEY]
+        before = self.network.begin(len(state)) if memory is None else memory
+        said = said_at_each_step(self.network.sentence, batch, state.shape[1])
+        tokens = self.network.tokens(stacked_images(batch, self.config), state, said)
+        _, after = self.network.read(tokens, before)
+        return after
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self, batch: dict[str, Tensor], memory: CoreMemory | None = None, **kwargs: Any
+    ) -> Tensor:
+        """Return (B, chunk, action) for one frame per episode, (B, …); `memory` has that frame in it already.
+
+        A policy without a memory takes none.
+        """
+        self.eval()
+        self.check_shown(memory)
+        images, state = stacked_images(batch, self.config)[:, None], batch[STATE_KEY][:, None]
+        tokens = self.network.tokens(images, state, said_at_each_step(self.network.sentence, batch, 1))
+        if memory is None:
+            _, memory = self.network.read(tokens, self.network.begin(len(tokens)))
+        return self.network.predict(tokens, memory[-1][:, None]).actions[:, 0].clamp(-1, 1)

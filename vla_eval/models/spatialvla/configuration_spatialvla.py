@@ -1,0 +1,203 @@
+"""lerobot's configuration of SpatialVLA; `docs/spatialvla.md` explains it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any  # lerobot is untyped
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from vla_eval.errors import RecipeError
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS
+from vla_eval.models.shared.network_sizes import with_changes
+from vla_eval.models.shared.normalization import Normalizer
+from vla_eval.models.shared.ported_config import PromptedConfig
+from vla_eval.models.spatialvla.action_grid import (
+    ActionGrid,
+    fitted_gaussians,
+    gaussian_grid,
+    uniform_grid,
+)
+from vla_eval.models.spatialvla.lora import LORA_TARGETS, SPATIAL_EMBEDDINGS
+from vla_eval.models.spatialvla.sizes import (
+    ATTENTIONS,
+    N_ACTION,
+    Attention,
+    NetworkSizes,
+)
+
+TYPE = "mikasa_spatialvla"
+GRIDS = ("refitted", "kept", "uniform")
+
+
+@LRSchedulerConfig.register_subclass("mikasa_linear_decay")
+@dataclass
+class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
+    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step.
+
+    Attributes:
+        num_warmup_steps: how long it rises.
+    """
+
+    num_warmup_steps: int | None = 0
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """Return torch's scheduler."""
+        n_warmup = self.num_warmup_steps or 0
+
+        def factor(step: int) -> float:
+            if step < n_warmup:
+                return step / n_warmup
+            return max(0.0, (num_training_steps - step) / max(1, num_training_steps - n_warmup))
+
+        return LambdaLR(optimizer, factor)
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class MikasaSpatialVLAConfig(PromptedConfig):
+    """SpatialVLA.
+
+    Attributes:
+        chunk_size: actions of a chunk, three tokens each.
+        pictures: the base camera alone, as the original does; with the wrist's it is an extension of ours.
+        camera_fov_rad: vertical field of view of their cameras, from which their matrices are made. MIKASA's
+            cameras have a quarter turn; an evaluation with others is refused.
+        action_grid: where a fine-tuning has the bins: `refitted` to the dataset's actions (tokens of a base
+            are moved along), `kept` as the base has them, `uniform`.
+        grid: edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion.
+        base_grid: those of the base, if they were others; set by a fine-tuning.
+        prefix_attention: what images and prompt attend to, see `sizes.Attention`.
+        inference_attention: the same for inference; None becomes that of training. A converted checkpoint has
+            `bidirectional`, because the original predicts so, though its scripts train with `causal`. What is
+            fine-tuned here predicts as it was trained, whatever its base does.
+        train_spatial_embeddings: train the embeddings of the action tokens.
+        train_word_embeddings: train Gemma's own embeddings, and the matrix that predicts tokens.
+        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps: AdamW, and
+            `mikasa_linear_decay`.
+    """
+
+    chunk_size: int = 4
+    n_action_steps: int = 4
+    pictures: list[str] = field(default_factory=lambda: [CAMERA_KEYS["base_camera"]])
+    camera_fov_rad: float = math.pi / 2
+    action_grid: str = "refitted"
+    grid: list[list[float]] = field(default_factory=list)
+    base_grid: list[list[float]] = field(default_factory=list)
+    prefix_attention: str = "causal"
+    inference_attention: str | None = None
+    train_spatial_embeddings: bool = False
+    train_word_embeddings: bool = False
+    gripper: str = "unit_open"
+    do_mask_loss_for_padding: bool = True
+    tokenizer_name: str = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
+
+    optimizer_weight_decay: float = 0.0
+    scheduler_warmup_steps: int = 250
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.inference_attention = self.inference_attention or self.prefix_attention
+        self.check_choice("action_grid", GRIDS)
+        self.check_choice("prefix_attention", ATTENTIONS)
+        self.check_choice("inference_attention", ATTENTIONS)
+        if not 0 < self.camera_fov_rad < math.pi:
+            raise RecipeError(f"camera_fov_rad is {self.camera_fov_rad}, expected radians in (0, π).")
+        if not self.pictures:
+            raise RecipeError(f"'{TYPE}': `pictures` is empty, expected the fields that are read, in order.")
+        self.network_sizes()
+
+    def validate_features(self) -> None:
+        """Check the fields of the dataset."""
+        super().validate_features()
+        found = tuple(self.action_feature.shape)
+        if found != (N_ACTION,):
+            raise RecipeError(
+                f"'{TYPE}' predicts translation, rotation and gripper: expected actions of {N_ACTION} "
+                f"numbers, found shape {found}."
+            )
+
+    not_of_base = ("inference_attention",)  # a fine-tuning does not take it over
+
+    @property
+    def reads_state(self) -> bool:
+        """Whether the policy has any use for `observation.state`: it has none."""
+        return False
+
+    def network_sizes(self) -> NetworkSizes:
+        """Return the sizes of the network."""
+        return with_changes(NetworkSizes, self.sizes)
+
+    def attention(self, *, training: bool) -> Attention:
+        """Return what images and prompt attend to."""
+        name: Any = self.prefix_attention if training else self.inference_attention
+        chosen: Attention = name  # checked in `__post_init__`
+        return chosen
+
+    def fit_to_actions(self, actions: Tensor, statistics: Mapping[str, Any]) -> None:
+        """Set the grid for a dataset; `grid` is then what a base had, if there is one.
+
+        Args:
+            actions: (N, 7) of all frames, as the environment takes them.
+            statistics: of the dataset's actions.
+
+        Raises:
+            RecipeError: the base's grid is to be kept, and there is none.
+        """
+        base, self.base_grid = self.grid, []
+        if self.action_grid == "kept":
+            if not base:
+                raise RecipeError(
+                    f"'{TYPE}': action_grid is 'kept', but there is no base with a grid. Name a "
+                    "base_checkpoint, or choose 'refitted' or 'uniform'."
+                )
+            return
+        bins = self.network_sizes().n_bins
+        if self.action_grid == "uniform":
+            chosen = uniform_grid(bins)
+        else:
+            spec = self.normalizations()[ACTION_KEY]
+            normalizer = Normalizer(spec, statistics, where="statistics of the dataset's actions")
+            normalized = normalizer.normalize(self.gripper_spec().encode(actions.to(torch.float64)))
+            chosen = gaussian_grid(fitted_gaussians(normalized), bins)
+        self.grid, self.base_grid = [list(edges) for edges in chosen.edges], base
+
+    def current_grid(self) -> ActionGrid:
+        """Return where the bins lie.
+
+        Raises:
+            RecipeError: it is not set, or it has other bins than the network has tokens.
+        """
+        if not self.grid:
+            raise RecipeError(
+                f"'{TYPE}': there is no action grid. A fine-tuning sets it (action_grid), and so does "
+                "`mikasa-vla checkpoint convert-spatialvla`."
+            )
+        return self._checked(self.grid)
+
+    def former_grid(self) -> ActionGrid | None:
+        """Return where the base's bins lay; None: where they lie now."""
+        return self._checked(self.base_grid) if self.base_grid else None
+
+    def _checked(self, edges: list[list[float]]) -> ActionGrid:
+        grid = ActionGrid(edges=tuple(map(tuple, edges)))
+        if grid.n_bins != self.network_sizes().n_bins:
+            raise RecipeError(
+                f"'{TYPE}': the action grid has {grid.n_bins} bins, expected {self.network_sizes().n_bins} "
+                "(sizes)."
+            )
+        return grid
+
+    def lora_defaults(self) -> dict[str, Any]:
+        """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
+        full = [SPATIAL_EMBEDDINGS] if self.train_spatial_embeddings else None
+        return {"target_modules": LORA_TARGETS, "modules_to_save": full}
+
+    def get_scheduler_preset(self) -> Any:
+        """Return the configuration of the schedule."""
+        return LinearDecaySchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)

@@ -1,0 +1,72 @@
+"""Action tokens: their loss, and predicting them one after the other.
+
+Legend as in `network`. Decoding is greedy, as the original's. A chunk has a fixed length: exactly its tokens
+are predicted, and only their columns' tokens are taken for it (`action_tokens.from_tokens`).
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from vla_eval.models.shared.greedy import Decoded, Prefix, greedy_tokens
+from vla_eval.models.spatialvla.action_grid import ActionGrid
+from vla_eval.models.spatialvla.action_tokens import from_tokens, to_tokens
+from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
+from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, Attention
+
+
+def token_loss(
+    network: SpatialVLANetwork,
+    grid: ActionGrid,
+    inputs: Inputs,
+    actions: Tensor,
+    counts: Tensor,
+    attention: Attention,
+) -> Tensor:
+    """Return the mean cross-entropy of the action tokens and of stop.
+
+    Args:
+        network: see there.
+        grid: where the bins lie.
+        inputs: see there.
+        actions: (B, K, 7) normalised, with the gripper 0 to 1.
+        counts: (B, K) float, 0 for actions that are left out; stop counts as the last action does.
+        attention: what the prefix attends to.
+    """
+    ids = to_tokens(actions, grid, network.sizes).flatten(1)
+    sequence = network.sequence(inputs, ids)
+    hidden = network.hidden(sequence, attention)
+    # A token is predicted at the place before it.
+    places = sequence.first_action[:, None] - 1 + torch.arange(ids.shape[1] + 1, device=ids.device)
+    logits = network.logits(hidden.take_along_dim(places[..., None], dim=1))
+    wanted = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
+    weights = torch.cat([counts.repeat_interleave(TOKENS_PER_ACTION, dim=1), counts[:, -1:]], dim=1)
+    losses = functional.cross_entropy(logits.flatten(0, 1), wanted.flatten(), reduction="none")
+    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
+
+
+def generated_tokens(
+    network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention
+) -> Decoded:
+    """Return the tokens (B, 3 · K) of a chunk; stop is never predicted, whatever is likeliest.
+
+    Args:
+        network: see there.
+        inputs: see there; prompts of several lengths go together.
+        chunk: K.
+        attention: what the prefix attends to; padding is attended to in no case.
+    """
+    if attention == "bidirectional_with_padding":
+        attention = "bidirectional"
+    sequence = network.sequence(inputs)
+    prefix = Prefix(sequence.embeddings, network.mask(sequence, attention), sequence.lengths)
+    return greedy_tokens(network, prefix, chunk * TOKENS_PER_ACTION, never=(network.sizes.stop_token,))
+
+
+def generated_actions(
+    network: SpatialVLANetwork, grid: ActionGrid, inputs: Inputs, *, chunk: int, attention: Attention
+) -> Tensor:
+    """Return normalised actions (B, K, 7), float32, with the gripper 0 or 1."""
+    decoded = generated_tokens(network, inputs, chunk=chunk, attention=attention)
+    tokens = decoded.tokens.reshape(len(decoded.tokens), chunk, TOKENS_PER_ACTION)
+    return from_tokens(tokens, grid, network.sizes).float()

@@ -1,0 +1,1 @@
+"""Scripted controls: policies without a model, against which a learned one is measured."""

@@ -1,0 +1,157 @@
+"""Controls: policies without a model, against which a learned one is measured.
+
+- `random`: uniform in the action space. The floor: how often random motion succeeds, which is hardly ever.
+- `hold`: moves nothing, keeps the gripper's width.
+- `oracle`: the privileged expert: the ceiling at this chunk length.
+- `cue_blind`: the same arm, not knowing the cue: what a perfect arm without memory gets (chance).
+- `tour`: the same arm begins with a random candidate and continues with the nearest that is left, without
+  ever knowing which one is right: what can be had by searching.
+- `cue_reader`: the same arm goes to what was in view at its own inferences, and guesses what was not: the
+  ceiling of a policy that reads only the last frame, at this chunk length and first inference.
+
+The last four see the true state of the world, but not the answer before the choice can be made, and
+plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.errors import SpecMismatchError
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.controls.base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.policies.controls.candidate_controls import (
+    CandidateExpert,
+    ChoicePolicy,
+    Mode,
+    VisitExpert,
+    VisitPolicy,
+)
+from vla_eval.policies.controls.in_control_mode import in_any_control_mode
+from vla_eval.task_state import PrivilegedState
+
+
+class BallExpert(Protocol):
+    """Meets a rolling ball; one object per episode."""
+
+    def plan(self, state: PrivilegedState, step: int, n_actions: int) -> NDArray[np.float32]:
+        """Return (n_actions, 7)."""
+
+
+class BallExpertFactory(Protocol):
+    """Makes a ball expert; with `imagined` it meets a ball drawn from `rng` instead of the real one."""
+
+    def __call__(self, *, rng: np.random.Generator, imagined: bool) -> BallExpert:
+        """Make one for a new episode."""
+
+
+class RandomPolicy(ScriptedPolicy):
+    """Uniform actions in the action space, drawn from the episode's own generator."""
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Draw a chunk."""
+        spec = self._context.env.action
+        drawn = self._rng[window.slot].uniform(spec.low, spec.high, (self._n_actions, self._n_dims))
+        return ActionChunk(actions=drawn.astype(np.float32))
+
+
+class HoldPolicy(ScriptedPolicy):
+    """No motion; the gripper keeps the width it has when the chunk is planned."""
+
+    states = ("qpos",)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Hold for a chunk."""
+        width_m = float(window.last.state["qpos"][-2:].sum())
+        return ActionChunk(actions=hold_rows(width_m, self._n_actions, self._n_dims))
+
+
+class BallPolicy(ScriptedPolicy):
+    """Meets the ball with the expert; the blind one meets a ball that it imagines."""
+
+    privileged = True
+
+    def __init__(self, context: PolicyContext, make_expert: BallExpertFactory, *, imagined: bool) -> None:
+        super().__init__(context)
+        self._make_expert = make_expert
+        self._imagined = imagined
+        self._experts: dict[int, BallExpert] = {}
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin with a new expert in each slot."""
+        super().reset(episodes)
+        for episode in episodes:
+            self._experts[episode.slot] = self._make_expert(
+                rng=self._rng[episode.slot], imagined=self._imagined
+            )
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Plan a chunk."""
+        expert = self._experts[window.slot]
+        state = self.privileged_state(window)
+        return ActionChunk(actions=expert.plan(state, window.last.step, self._n_actions))
+
+
+def make_random(context: PolicyContext) -> RandomPolicy:
+    """Make the `random` control."""
+    return RandomPolicy(context)
+
+
+@in_any_control_mode
+def make_hold(context: PolicyContext) -> ScriptedPolicy:
+    """Make the `hold` control."""
+    return HoldPolicy(context)
+
+
+@in_any_control_mode
+def make_oracle(context: PolicyContext) -> ScriptedPolicy:
+    """Make the `oracle` for the task of the context."""
+    return _make_expert_policy(context, "oracle")
+
+
+@in_any_control_mode
+def make_cue_blind(context: PolicyContext) -> ScriptedPolicy:
+    """Make the `cue_blind` control for the task of the context."""
+    return _make_expert_policy(context, "cue_blind")
+
+
+@in_any_control_mode
+def make_tour(context: PolicyContext) -> ScriptedPolicy:
+    """Make the `tour` control.
+
+    Raises:
+        SpecMismatchError: the task has no candidates to tour.
+    """
+    if context.n_candidates == 0:
+        raise SpecMismatchError(
+            f"policy '{context.name}' touches one candidate after another; {context.env.task} has none. "
+            "Leave this task out for this policy."
+        )
+    return _make_expert_policy(context, "tour")
+
+
+@in_any_control_mode
+def make_cue_reader(context: PolicyContext) -> ScriptedPolicy:
+    """Make the `cue_reader` control.
+
+    Raises:
+        SpecMismatchError: the task has no candidates, so that no cue names one.
+    """
+    if context.n_candidates == 0:
+        raise SpecMismatchError(
+            f"policy '{context.name}' reads which candidate the cue shows; {context.env.task} has none. "
+            "Leave this task out for this policy."
+        )
+    return _make_expert_policy(context, "cue_reader")
+
+
+def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
+    expert = task_expert(context)
+    if hasattr(expert, "plan_visits"):
+        return VisitPolicy(context, cast(VisitExpert, expert), mode)
+    if context.n_candidates > 0:
+        return ChoicePolicy(context, cast(CandidateExpert, expert), mode)
+    return BallPolicy(context, cast(BallExpertFactory, expert), imagined=mode == "cue_blind")

@@ -1,0 +1,1 @@
+"""Run any LeRobot policy in our loop. Knows no family."""

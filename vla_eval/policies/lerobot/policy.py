@@ -1,0 +1,307 @@
+"""Run any LeRobot policy in our loop: frames in, whole chunks out.
+
+The policy's own queue of actions is never used: `predict_action_chunk` is asked at each inference, and
+the loop executes as much of the chunk as it wants. Its own queue of observations is not used either:
+the frames of an episode are kept here, per slot, at control rate, however long the chunk is.
+
+Three kinds of policies, told apart by their configuration:
+
+- `observation_delta_indices` is None, or has frames of the future, which only training has (FastWAM): it
+  reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
+- with indices, such as [-1, 0] or [0]: it gets these frames, (B, T, …), as in training (Diffusion
+  Policy, SmolVLA); before the first frame of an episode there is the first frame again. One whose
+  configuration says `masks_history = True` gets `FIELD_is_pad`, which marks these frames (Octo).
+- with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
+  (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
+  gets `memory` (a recurrent policy of your own). One that also has `begin_memory(n_episodes) -> memory`,
+  a tuple of tensors (B, …), infers for several episodes in one pass: see `lerobot_memory.py`.
+
+Any of them may be shown earlier frames as further images: see `vla_memory/`.
+
+Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
+they are asked for one action at each control step, with queues of each episode; see `lerobot_steps.py`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple  # lerobot is untyped
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vla_eval.checkpoints.bases import first_fetch
+from vla_eval.checkpoints.files import read_facts
+from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
+from vla_eval.checkpoints.plain_errors import plain_errors
+from vla_eval.checkpoints.policy_types import (
+    ASKED_FOR_STEPS,
+    DETERMINISTIC,
+    chunk_size,
+    history,
+    noise_shape,
+)
+from vla_eval.checkpoints.select_step import select_step
+from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
+from vla_eval.features import PROPRIO_STATES, StateKind
+from vla_eval.models.episodes.memory import (
+    memory_of,
+    recall,
+    remembers,
+    remembers_in_rows,
+    remembers_singly,
+)
+from vla_eval.models.episodes.running import (
+    Episode,
+    Frame,
+    batch_of,
+    frames_in_time,
+    given_noise,
+    in_rows,
+)
+from vla_eval.models.shared.sentence_reading import SentenceReading
+from vla_eval.models.shared.tokens_read import Readings
+from vla_eval.models.vla_memory.fields import FrameMemory
+from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot.device import autocast, choose_device, cuda_devices
+from vla_eval.policies.lerobot.inputs import (
+    InputMap,
+    InputOptions,
+    check_training,
+    default_cameras,
+    input_map,
+)
+from vla_eval.specs import PolicySpec
+
+
+class _Inferred(NamedTuple):
+    """A chunk, and what the policy remembers now; None if it has no memory."""
+
+    chunk: ActionChunk
+    memory: Any
+
+
+class LeRobotPolicy:
+    """`Policy` around a loaded LeRobot policy; see the module's text.
+
+    Args:
+        name: for messages.
+        loaded: policy and processors.
+        inputs: how observations become inputs.
+        batch: infer for all due slots in one forward pass; None: if there are several slots and the
+            policy can. Sums are then made in another order, so that actions agree with those of a pass
+            of its own only up to rounding.
+        n_slots: how many rows a pass has, due or not: with the same shape and the same place in it, an
+            episode's actions are the same bits whoever is beside it. Its place is `EpisodeStart.row`; what
+            is known of it is kept by its slot, and there may be more slots than rows.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        loaded: LoadedPolicy,
+        inputs: InputMap,
+        *,
+        batch: bool | None = False,
+        n_slots: int = 1,
+    ) -> None:
+        self._loaded, self._inputs = loaded, inputs
+        self._remembers = remembers(loaded.policy)
+        self._by_step = loaded.config.type in ASKED_FOR_STEPS
+        self._earlier = _earlier_frames(loaded.config)
+        self._deltas = history(loaded.config)
+        self._masks_history = bool(getattr(loaded.config, "masks_history", False))
+        self._noise_shape = noise_shape(loaded.config)
+        draws_nothing = loaded.config.type in DETERMINISTIC or getattr(loaded.policy, "draws_nothing", False)
+        can_batch = draws_nothing or self._noise_shape is not None
+        if batch and not can_batch:
+            raise SpecMismatchError(
+                f"policy '{name}' (type '{loaded.config.type}') draws random numbers that cannot be given "
+                f"from outside: in one pass the episodes would depend on each other. Leave `batch` out of "
+                "its recipe."
+            )
+        if batch and self._remembers and not remembers_in_rows(loaded.policy):
+            raise SpecMismatchError(
+                f"policy '{name}' (type '{loaded.config.type}') has `remember` but no `begin_memory`, which "
+                "says what the memory of several episodes is. Leave `batch` out of its recipe, or add the "
+                "method (docs/lerobot_policies.md)."
+            )
+        if batch is None:
+            batch = n_slots > 1 and can_batch and (not self._remembers or remembers_in_rows(loaded.policy))
+        # One episode that remembers is shown all its new frames at once, which is faster.
+        self._batch = batch and (n_slots > 1 or not self._remembers)
+        self._n_slots = n_slots
+        self._slots: dict[int, Episode] = {}
+        self._readings = Readings()
+        self.spec = PolicySpec(
+            name=name,
+            reads="every" if self._sees_every_frame() else "last",
+            cameras=tuple(inputs.cameras),
+            states=PROPRIO_STATES if inputs.state is not None else (),
+            chunk_size=chunk_size(loaded.config),
+        )
+
+    def _sees_every_frame(self) -> bool:
+        return self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin these episodes; nothing of their slots' earlier ones is kept."""
+        for episode in episodes:
+            self._slots[episode.slot] = Episode(start=episode, earlier=self._earlier)
+
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release the frames and the memory of these slots."""
+        for slot in slots:
+            self._slots.pop(slot, None)
+
+    @property
+    def readings(self) -> Mapping[str, SentenceReading]:
+        """What the network was given of each sentence."""
+        return self._readings.known
+
+    @property
+    def proprioception(self) -> StateKind | None:
+        """Which proprioception it reads."""
+        return self._inputs.state
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Infer for one episode."""
+        return self.act_batch([window])[0]
+
+    def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
+        """Infer for each window; the draws of an episode are its own.
+
+        Raises:
+            InvalidActionError: two windows are of the same row of a pass, or a row is beyond it.
+        """
+        due = [self._shown(window) for window in windows]
+        if not self._batch:
+            inferred = [self._infer([episode])[0] for episode in due]
+        elif self._n_slots == 1:
+            inferred = self._infer(due)
+        else:
+            of_rows = self._infer(in_rows(due, self._n_slots))
+            inferred = [of_rows[episode.start.row] for episode in due]
+        # Only now: a call that raises leaves all episodes as they were, and may be made again.
+        for episode, (_, memory) in zip(due, inferred, strict=True):
+            self._slots[episode.start.slot] = replace(episode, unseen=(), memory=memory)
+        return [chunk for chunk, _ in inferred]
+
+    def _shown(self, window: ObservationWindow) -> Episode:
+        return self._slots[window.slot].shown(
+            [self._inputs.tensors(observation) for observation in window.frames],
+            step=window.last.step,
+            n_kept=1 - min(self._deltas, default=0),
+        )
+
+    @torch.no_grad()
+    def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
+        policy, config = self._loaded.policy, self._loaded.config
+        seeds = [episode.seed() for episode in rows]
+        devices = cuda_devices(config.device)
+        heard = self._readings.of(row.start.instruction for row in rows)
+        with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting(), heard:
+            torch.manual_seed(seeds[0])
+            policy.reset()  # whatever a policy keeps by itself would be shared by all slots
+            extra: dict[str, Any] = {}
+            if self._noise_shape is not None:
+                extra["noise"] = given_noise(seeds, self._noise_shape).to(config.device)
+            memories: list[Any] = [None] * len(rows)
+            if self._remembers:
+                extra["memory"], memories = self._recall(rows)
+            frames = [episode.read(self._deltas, masks_history=self._masks_history) for episode in rows]
+            batch = self._loaded.preprocessor(batch_of(frames, rows))
+            if self._by_step:
+                (episode,) = rows
+                self._check_shown(episode)
+                raw, *memories = select_step(policy, batch, episode.memory)
+            else:
+                raw = policy.predict_action_chunk(batch, **extra)
+            actions = self._loaded.postprocessor(raw)
+        chunks = self._chunks(actions, len(rows))
+        return [_Inferred(*one) for one in zip(chunks, memories, strict=True)]
+
+    def _check_shown(self, episode: Episode) -> None:
+        if len(episode.unseen) != 1:
+            raise InvalidActionError(
+                f"policy '{self.spec.name}' (type '{self._loaded.config.type}') is asked for one action at "
+                f"each control step; expected one new frame, found {len(episode.unseen)}. Ask it with "
+                "n_action_steps 1."
+            )
+
+    def _recall(self, rows: Sequence[Episode]) -> tuple[Any, list[Any]]:
+        """Return what the policy remembers now: of all rows, as it takes it, and of each."""
+
+        def preprocessed(frames: Sequence[Frame]) -> dict[str, Any]:
+            batch: dict[str, Any] = self._loaded.preprocessor(batch_of(frames, rows))
+            return batch
+
+        policy = self._loaded.policy
+        if not self._batch and not remembers_singly(policy):
+            (episode,) = rows
+            memory = policy.remember(preprocessed([frames_in_time(episode.unseen)]), episode.memory)
+            return memory, [memory]
+        memory = recall(policy, rows, preprocessed)
+        return memory, [memory_of(memory, row) for row in range(len(rows))]
+
+    def _chunks(self, actions: Tensor, n_rows: int) -> list[ActionChunk]:
+        rows = actions.detach().to("cpu", torch.float32).numpy()
+        expected = (n_rows, self.spec.chunk_size)
+        if rows.shape[:2] != expected:
+            raise InvalidActionError(
+                f"policy '{self.spec.name}': expected chunks of shape {expected} before the action's "
+                f"dimensions, found {rows.shape}. Its `action_delta_indices` and `predict_action_chunk` "
+                "disagree."
+            )
+        return [ActionChunk(actions=np.ascontiguousarray(row)) for row in rows]
+
+
+def _earlier_frames(config: Any) -> FrameMemory | None:
+    """Return the memory of a policy that is shown earlier frames before the first one; None: it is not."""
+    choice = config.frame_choice() if hasattr(config, "frame_choice") else None
+    return None if choice is None else FrameMemory(choice=choice, cameras=tuple(config.memory_cameras))
+
+
+def make_lerobot(
+    context: PolicyContext,
+    *,
+    checkpoint: str | None = None,
+    cameras: Mapping[str, str] | None = None,
+    state: StateKind | None = None,
+    absent_cameras: Sequence[str] = (),
+    device: str = "auto",
+    dtype: Literal["float32", "bfloat16"] | None = None,
+    tokenizer: str | None = None,
+    base_checkpoint: str | None = None,
+    batch: bool | None = None,
+) -> LeRobotPolicy:
+    """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments.
+
+    Raises:
+        CheckpointError: no checkpoint, or one that is not complete.
+        SpecMismatchError: the policy and the environment do not fit.
+    """
+    if checkpoint is None:
+        raise CheckpointError(
+            f"policy '{context.name}' has no weights: its recipe says how to fine-tune it."
+            f"{first_fetch(context.name)} Run `mikasa-vla finetune --policy {context.name} --dataset DIR "
+            "--out RUN`, then `mikasa-vla eval --policy RUN`; or name a folder with `checkpoint` in the "
+            "recipe's args."
+        )
+    options = LoadOptions(
+        device=choose_device(device), dtype=dtype, tokenizer=tokenizer, base_checkpoint=base_checkpoint
+    )
+    loaded = load_checkpoint(Path(checkpoint), options)
+    asked = InputOptions(
+        cameras=default_cameras() if cameras is None else cameras, state=state, absent_cameras=absent_cameras
+    )
+    with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
+        facts = read_facts(loaded.folder)
+        # First what is wrong by itself: another control mode has other dimensions, too.
+        refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
+        inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
+        check_training(facts, inputs, loaded, context.env, policy=context.name)
+        return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)

@@ -1,0 +1,1 @@
+"""Published results and protocols, for tables below a success table."""

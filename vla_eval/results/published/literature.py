@@ -1,0 +1,180 @@
+"""Published results as data, from `published.yaml`, which ships with the package. Knows no format.
+
+A value that a source does not state is None. They are printed beside measured rows, never among them.
+"""
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vla_eval.errors import unknown_name
+from vla_eval.strict.bounds import require
+from vla_eval.strict.decoding import decode
+from vla_eval.strict.yaml_data import load_yaml
+
+PUBLISHED_FILE = Path(__file__).with_name("published.yaml")
+PAPER = "mikasa"  # key of the benchmark's paper among the sources
+PAPER_FAMILY = "VLA"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reference:
+    """Where a result is from; without a link: this repository."""
+
+    title: str
+    link: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishedRate:
+    """A success rate in [0, 1], and its spread if one is stated; `PublishedResult.spread` says which."""
+
+    rate: float
+    spread: float | None = None
+
+    def __post_init__(self) -> None:
+        require(0 <= self.rate <= 1, "rate", self.rate, "a number from 0 to 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Board:
+    """Results that are listed together.
+
+    Attributes:
+        title: what is compared.
+        tasks: columns of the table.
+        mean_over_tasks: whether the mean of all tasks is the figure that is compared; then it is computed
+            where a source states every task but no mean.
+    """
+
+    title: str
+    tasks: tuple[str, ...]
+    mean_over_tasks: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishedResult:
+    """One method as one source reports it. None, or nothing, is what the source does not state.
+
+    Attributes:
+        method, family: its name and kind.
+        source: key of `Published.sources`; where: the place in it.
+        board: key of `Published.boards`.
+        control_mode, image_px, n_action_steps: of the policy.
+        training: one model per task, or one for all tasks.
+        runs, episodes, seeds: of the evaluation.
+        spread: which spread the rates have.
+        rates: task -> rate.
+        mean: as the source states it.
+        differs: what is known to differ from the protocol or from other rows.
+        contested: task -> what contradicts its rate.
+        is_measured_here: whether it was measured by this project.
+    """
+
+    method: str
+    family: str
+    source: str
+    board: str
+    where: str | None = None
+    control_mode: str | None = None
+    image_px: int | None = None
+    n_action_steps: int | None = None
+    training: str | None = None
+    runs: int | None = None
+    episodes: int | None = None
+    seeds: str | None = None
+    spread: str | None = None
+    rates: dict[str, PublishedRate] = field(default_factory=dict)
+    mean: PublishedRate | None = None
+    differs: tuple[str, ...] = ()
+    contested: dict[str, str] = field(default_factory=dict)
+    is_measured_here: bool = False
+
+    @property
+    def label(self) -> str:
+        """The method, with a mark if it was measured by this project."""
+        return f"{self.method} [measured here]" if self.is_measured_here else self.method
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Published:
+    """The whole file.
+
+    Raises:
+        RecipeError: a result names a source, a board or a task that is not there.
+    """
+
+    checked: str
+    sources: dict[str, Reference]
+    boards: dict[str, Board]
+    results: tuple[PublishedResult, ...]
+
+    def __post_init__(self) -> None:
+        for one in self.results:
+            require(one.source in self.sources, f"{one.method}: source", one.source, "one of sources")
+            require(one.board in self.boards, f"{one.method}: board", one.board, "one of boards")
+            tasks = self.boards[one.board].tasks
+            others = [task for task in (*one.rates, *one.contested) if task not in tasks]
+            require(not others, f"{one.method}: rates", others, "tasks of its board")
+            unrated = [task for task in one.contested if task not in one.rates]
+            require(not unrated, f"{one.method}: contested", unrated, "tasks with a rate")
+
+    def of_board(self, name: str) -> tuple[PublishedResult, ...]:
+        """Return the results of a board, in the file's order.
+
+        Raises:
+            UnknownNameError: there is no such board.
+        """
+        if name not in self.boards:
+            raise unknown_name("list of published results", name, self.boards, where="--published")
+        return tuple(one for one in self.results if one.board == name)
+
+    def mean_of(self, result: PublishedResult) -> float | None:
+        """Return the mean over the board's tasks: as stated, or computed if every task has a rate."""
+        if result.mean is not None:
+            return result.mean.rate
+        board = self.boards[result.board]
+        if not board.mean_over_tasks or set(result.rates) != set(board.tasks):
+            return None
+        return sum(one.rate for one in result.rates.values()) / len(board.tasks)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperFigure:
+    """One cell of the paper's table of VLA models."""
+
+    task: str
+    model: str
+    n_action_steps: int
+    success_once: float
+    sem: float
+
+
+@functools.cache
+def load_published() -> Published:
+    """Read the file that ships."""
+    text = PUBLISHED_FILE.read_text(encoding="utf-8")
+    return decode(Published, load_yaml(text, where=PUBLISHED_FILE.name), where=PUBLISHED_FILE.name)
+
+
+def paper_figures() -> Iterator[PaperFigure]:
+    """Yield the cells of the paper's table of VLA models, model by model.
+
+    Source: "Memory, Benchmark & Robots" (ICLR 2026), appendix "VLA baselines", table "Performance of VLA
+    models on selected memory-intensive tasks from the MIKASA-Robo benchmark". Its caption: success rates
+    over 100 evaluation episodes, mean ± SEM; three training runs, seeds 1 to 100 (appendix "Experiments
+    Reproducing and Compute Resources").
+    """
+    for one in load_published().results:
+        if one.source != PAPER or one.family != PAPER_FAMILY:
+            continue
+        for task, rate in one.rates.items():
+            assert one.n_action_steps is not None and rate.spread is not None  # tested
+            yield PaperFigure(
+                task=task,
+                model=one.method,
+                n_action_steps=one.n_action_steps,
+                success_once=rate.rate,
+                sem=rate.spread,
+            )

@@ -1,0 +1,156 @@
+"""Published results as tables below a success table: the rates, and how they were measured."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+
+from vla_eval.config.files import to_data
+from vla_eval.results.published.literature import Published, PublishedResult, load_published, paper_figures
+from vla_eval.results.side_table import SideTable
+from vla_eval.results.success_table import Table
+from vla_eval.results.table_columns import UNDEFINED
+
+CONTESTED, COMPUTED = "‡", "(computed)"
+PAPER_SOURCE = "“Memory, Benchmark & Robots” (ICLR 2026), appendix “VLA baselines”, table of VLA models"
+PAPER_PROTOCOL = "mean ± SEM, 3 runs × 100 episodes"
+
+
+def published_side_tables(board: str) -> list[SideTable]:
+    """Return the published results of a board, and how they were measured.
+
+    Raises:
+        UnknownNameError: there is no such board.
+    """
+    published = load_published()
+    results = published.of_board(board)
+    tasks = published.boards[board].tasks
+    rates = SideTable(
+        title=f"Published results, not measured here unless marked: {published.boards[board].title}",
+        titles=["method (published)", "K", *(task.removesuffix("-v0") for task in tasks), "mean"],
+        rows=[
+            [
+                one.label,
+                _text(one.n_action_steps),
+                *(_rate(one, task) for task in tasks),
+                _mean(published, one),
+            ]
+            for one in results
+        ],
+        is_number=[False, True, *(True for _ in tasks), True],
+        notes=list(_notes(published, results)),
+        csv_columns=("reference", "contested"),
+        csv_rows=[row for one in results for row in _csv_rows(published, one)],
+        json={"published": {"board": board, "checked": published.checked, "rows": _json(published, results)}},
+    )
+    return [rates, _how_measured(published, results)]
+
+
+def paper_side_table(table: Table) -> SideTable:
+    """Return the paper's results of VLA models for the tasks of a table."""
+    tasks = dict.fromkeys(row.task for row in table.rows)
+    cells = list(paper_figures())
+    figures = [figure for task in tasks for figure in cells if figure.task == task]
+    fields = [asdict(one) for one in figures]
+    return SideTable(
+        title=f"The paper's figures, not measured here ({PAPER_PROTOCOL})",
+        titles=["task", "model (paper)", "K", "success once (paper)"],
+        rows=[
+            [one.task, one.model, str(one.n_action_steps), f"{one.success_once:.2f} ± {one.sem:.2f}"]
+            for one in figures
+        ],
+        is_number=[False, False, True, True],
+        notes=[
+            f"Source: {PAPER_SOURCE}."
+            if figures
+            else "The paper's table of VLA models has none of these tasks."
+        ],
+        csv_rows=[{"source": "paper", "policy": one["model"], **one} for one in fields],
+        json={"paper": {"source": PAPER_SOURCE, "protocol": PAPER_PROTOCOL, "rows": fields}},
+        ruled_by_first=True,
+    )
+
+
+def _how_measured(published: Published, results: Sequence[PublishedResult]) -> SideTable:
+    return SideTable(
+        title="How the published results were measured, as far as the sources say",
+        titles=["method", "kind", "source", "control mode", "image", "models", "runs", "episodes", "seeds"],
+        rows=[
+            [
+                one.label,
+                one.family,
+                ", ".join(filter(None, (published.sources[one.source].title, one.where))),
+                one.control_mode or UNDEFINED,
+                UNDEFINED if one.image_px is None else f"{one.image_px} px",
+                one.training or UNDEFINED,
+                _text(one.runs),
+                _text(one.episodes),
+                one.seeds or UNDEFINED,
+            ]
+            for one in results
+        ],
+        is_number=[False] * 6 + [True, True, False],
+        notes=[],
+    )
+
+
+def _rate(result: PublishedResult, task: str) -> str:
+    found = result.rates.get(task)
+    if found is None:
+        return UNDEFINED
+    spread = "" if found.spread is None else f" ± {found.spread:.2f}"
+    return f"{found.rate:.2f}{spread}{f' {CONTESTED}' if task in result.contested else ''}"
+
+
+def _mean(published: Published, result: PublishedResult) -> str:
+    mean = published.mean_of(result)
+    if mean is None:
+        return UNDEFINED
+    stated = result.mean
+    spread = "" if stated is None or stated.spread is None else f" ± {stated.spread:.3f}"
+    marks = [*([COMPUTED] if stated is None else []), *([CONTESTED] if result.contested else [])]
+    return " ".join([f"{mean:.3f}{spread}", *marks])
+
+
+def _notes(published: Published, results: Sequence[PublishedResult]) -> Iterator[str]:
+    if any(one.mean is None and published.mean_of(one) is not None for one in results):
+        yield f"{COMPUTED}: mean of the rates in the row; the source states none."
+    for kind in dict.fromkeys(one.spread for one in results if one.spread):
+        yield f"±: {kind}, where the source states it."
+    for one in results:
+        for task, text in one.contested.items():
+            yield f"{CONTESTED} contested: {one.method} on {task}, {text}."
+    for one in results:
+        if one.differs:
+            yield f"{_named(one)}: {'; '.join(one.differs)}."
+
+
+def _named(result: PublishedResult) -> str:
+    k = "" if result.n_action_steps is None else f" at K = {result.n_action_steps}"
+    return f"{result.label}{k}"
+
+
+def _csv_rows(published: Published, result: PublishedResult) -> Iterator[dict[str, object]]:
+    common: dict[str, object] = {
+        "source": "measured here, not in these runs" if result.is_measured_here else "published",
+        "policy": result.method,
+        "n_action_steps": result.n_action_steps,
+        "reference": published.sources[result.source].title,
+    }
+    for task, found in result.rates.items():
+        contested = result.contested.get(task)
+        cells = {"task": task, "success_once": found.rate, "sem": found.spread, "contested": contested}
+        yield common | cells
+    if (mean := published.mean_of(result)) is not None:
+        spread = result.mean.spread if result.mean is not None else None
+        yield common | {"task": f"mean of {result.board}", "success_once": mean, "sem": spread}
+
+
+def _json(published: Published, results: Sequence[PublishedResult]) -> list[dict[str, object]]:
+    rows = []
+    for one in results:
+        reference = to_data(published.sources[one.source])
+        rows.append({**to_data(one), "source": reference, "mean_over_tasks": published.mean_of(one)})
+    return rows
+
+
+def _text(value: int | None) -> str:
+    return UNDEFINED if value is None else str(value)

@@ -1,0 +1,239 @@
+"""Turn plain data of YAML or JSON strictly into frozen dataclasses. Knows nothing of what the recipes mean.
+
+Strict means: no unknown field, no field twice, no text where a list or a number is expected, no
+`true` where a number is expected, no number that is infinite. A mistyped name or value is an error,
+never a default.
+"""
+
+import dataclasses
+import functools
+import math
+import reprlib
+import types
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
+from vla_eval.strict.renamed import current_names, use_current_names, warn_renamed
+from vla_eval.strict.yaml_data import MAX_DEPTH
+from vla_eval.strict.yaml_data import load_yaml as load_yaml
+
+_short = reprlib.Repr(maxstring=80, maxlist=8, maxdict=8, maxother=80, maxlong=30).repr
+
+
+def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
+    """Return `data` as an object of the dataclass.
+
+    Args:
+        cls: a frozen dataclass.
+        data: what the YAML or JSON holds.
+        where: the file, for messages.
+
+    Raises:
+        RecipeError: unknown or missing field, wrong type, or a value that the dataclass refuses.
+    """
+    try:
+        decoded: T = _decoded(cls, data, path="")
+    except RecipeError as exc:
+        raise RecipeError(f"{where}: {exc}") from exc
+    return decoded
+
+
+def check_value(hint: Any, value: object, *, path: str) -> None:  # Any: a type annotation
+    """Raise `RecipeError` unless the value is what the annotation says; `path` names it in the message."""
+    _decoded(hint, value, path=path)
+
+
+def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: str) -> None:
+    """Put a value at a dotted path of plain data; in a mapping all names are free.
+
+    Args:
+        cls: the dataclass that the data will be decoded as.
+        data: changed in place.
+        path: `chunking.mode`.
+        value: plain data.
+        where: the flag, for messages.
+
+    Raises:
+        RecipeError: there is no such field, or a part of the path has no fields.
+    """
+    steps = _walk(cls, path, where=where)
+    for step in steps[:-1]:
+        _rename(step, data)
+        if data.get(step.name) is None:  # not given, or given without a value
+            data[step.name] = {}
+        child = data[step.name]
+        if not isinstance(child, dict):
+            raise RecipeError(f"{where}: '{step.name}' is {_short(child)}, which has no fields.")
+        data = child
+    _rename(steps[-1], data)
+    data[steps[-1].name] = value
+
+
+class _Step(NamedTuple):
+    """One name of a dotted path, the dataclass that has the field (None: a mapping), and what precedes it."""
+
+    cls: type | None
+    prefix: str
+    name: str
+
+
+def _walk(cls: type, path: str, *, where: str) -> list[_Step]:
+    """Return the steps of a dotted path, by their current names; in a mapping all names are free.
+
+    Raises:
+        RecipeError: a dataclass on the way has no such field.
+    """
+    current: Any = cls  # Any: a type annotation
+    names = path.split(".")
+    if len(names) > MAX_DEPTH:
+        raise RecipeError(f"{where}: nested more than {MAX_DEPTH} deep.")
+    steps: list[_Step] = []
+    prefix = ""
+    for index, name in enumerate(names):
+        options = _options(current)
+        found = next((option for option in options if _is_dataclass_type(option)), None)
+        if found is None:
+            if any(option is Any or get_origin(option) in (dict, Mapping) for option in options):
+                return [*steps, *(_Step(None, "", free) for free in names[index:])]
+            raise RecipeError(f"{where}: '{prefix[:-1]}' is {_describe(current)}, which has no fields.")
+        hints = _hints(found)
+        known = current_names(found).get(name, name)
+        if known not in hints:
+            raise RecipeError(f"{where}: {_no_such_field(f'{prefix}{name}', name, list(hints))}")
+        if known != name:
+            warn_renamed(f"'{prefix}{name}'", f"'{prefix}{known}'")
+        steps.append(_Step(found, prefix, known))
+        current, prefix = hints[known], f"{prefix}{known}."
+    return steps
+
+
+def _rename(step: _Step, data: dict[str, Any]) -> None:
+    if step.cls is not None:
+        use_current_names(step.cls, data, prefix=step.prefix)
+
+
+def _decoded(hint: Any, value: Any, *, path: str) -> Any:  # Any: type annotations and plain data
+    """Return the value as the annotation says: dataclasses, tuples for lists, floats; refuse the rest."""
+    for option in _options(hint):
+        origin = get_origin(option)
+        if _is_dataclass_type(option) and isinstance(value, Mapping):
+            return _decoded_fields(option, value, path=path)
+        if origin in (tuple, Sequence) and isinstance(value, list | tuple):
+            item_hint = get_args(option)[0]
+            return tuple(_decoded(item_hint, item, path=f"{path}[{i}]") for i, item in enumerate(value))
+        if origin is dict and isinstance(value, Mapping):
+            item_hint = get_args(option)[1]
+            return {key: _decoded(item_hint, item, path=f"{path}.{key!s:.60}") for key, item in value.items()}
+        if option is float and type(value) in (int, float):
+            return _finite(value, path=path)
+        if option is Any:
+            _check_plain(value, path=path, depth=0)
+            return value
+        if isinstance(option, type) and type(value) is option:
+            return value
+        if origin is Literal and value in get_args(option) and not isinstance(value, bool):
+            return value
+    raise RecipeError(_wrong(path, _describe(hint), value))
+
+
+def _decoded_fields(cls: type, data: Mapping[str, Any], *, path: str) -> Any:  # Any: an object of `cls`
+    hints = _hints(cls)
+    prefix = f"{path}." if path else ""
+    data = dict(data)
+    use_current_names(cls, data, prefix=prefix)
+    fields = [field for field in dataclasses.fields(cls) if field.init]
+    for name in data:
+        if name not in hints:
+            raise RecipeError(_no_such_field(f"{prefix}{name}", name, [field.name for field in fields]))
+    values = {name: _decoded(hints[name], value, path=f"{prefix}{name}") for name, value in data.items()}
+    for field in fields:
+        is_required = field.default is field.default_factory is dataclasses.MISSING
+        if is_required and field.name not in values:
+            raise RecipeError(f"the field '{prefix}{field.name}' is missing.")
+    return cls(**values)
+
+
+def _finite(value: float, *, path: str) -> float:
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise RecipeError(f"'{path}': expected a finite number, found {_short(value)}.")
+    return number
+
+
+def _check_plain(value: object, *, path: str, depth: int) -> None:
+    """Raise `RecipeError` unless this is what JSON can hold: free values are stored as JSON."""
+    if depth > MAX_DEPTH:
+        raise RecipeError(f"'{path.split('.')[0]}': nested more than {MAX_DEPTH} deep.")
+    if isinstance(value, float):
+        _finite(value, path=path)
+    elif isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            _check_plain(item, path=f"{path}[{i}]", depth=depth + 1)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_plain(item, path=f"{path}.{key!s:.60}", depth=depth + 1)
+    elif value is not None and not isinstance(value, str | int):
+        raise RecipeError(_wrong(path, "text, a number, a list or a mapping", value))
+
+
+_hints = functools.cache(get_type_hints)
+
+
+def _options(hint: Any) -> tuple[Any, ...]:  # Any: type annotations
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+
+
+def _is_dataclass_type(hint: Any) -> bool:  # Any: a type annotation
+    return isinstance(hint, type) and dataclasses.is_dataclass(hint)
+
+
+def _no_such_field(path: str, name: str, known: list[str]) -> str:
+    return f"there is no field '{path:.{MAX_SHOWN}}'.{did_you_mean(name, known)} Known: {', '.join(known)}."
+
+
+def _wrong(path: str, expected: str, value: object) -> str:
+    hint = ""
+    if expected.startswith("a list") and isinstance(value, str):
+        hint = f" Write it in brackets: [{value:.80}]."
+    elif "number" in expected and isinstance(value, str) and _reads_as_number(value):
+        hint = " Write it without quotes or leading zeros, with a point and a sign in the exponent: 1.0e-3."
+    found = _TYPE_WORDS.get(type(value), "something else")
+    return f"'{path}': expected {expected}, found {_short(value)} ({found}).{hint}"
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+_TYPE_WORDS: dict[type, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    dict: "a mapping",
+    list: "a list",
+    tuple: "a list",
+    type(None): "nothing",
+}
+
+
+def _describe(hint: Any) -> str:  # Any: a type annotation
+    """Say in words what an annotation allows."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_describe(option) for option in get_args(hint))
+    if origin is Literal:
+        return " or ".join(f"'{option}'" for option in get_args(hint))
+    if origin in (tuple, Sequence):
+        return f"a list, each entry {_describe(get_args(hint)[0])}"
+    if origin is dict or _is_dataclass_type(hint):
+        return "a mapping"
+    return _TYPE_WORDS.get(hint, str(hint))

@@ -1,0 +1,108 @@
+"""Fine-tunings of a table side by side on a cluster, each in a process of its own."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from vla_eval.config.evaluation import TimeoutConfig
+from vla_eval.errors import FolderInUseError, TrainingError
+from vla_eval.evaluation.model_table import Finetuning
+from vla_eval.strict.bounds import MAX_SECONDS
+from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob, finetune_main
+from vla_eval.workers.backend import Backend, Pool
+from vla_eval.workers.job_list import JobList
+from vla_eval.workers.jobs import Answered
+from vla_eval.workers.messages import Failed
+
+MAX_TRIES = 2  # of one fine-tuning, since a machine may hiccup; each resumes from its last checkpoint
+
+
+def finetune_on(
+    backend: Backend,
+    todo: Sequence[Finetuning],
+    *,
+    logs: Path,
+    is_tiny: bool,
+    command: str,
+    say: Callable[[str], None],
+    is_stopping: Callable[[], bool],
+) -> bool:
+    """Run the fine-tunings; a GPU each, where there are GPUs.
+
+    Args:
+        backend: where they run.
+        todo: the fine-tunings.
+        logs: folder for what the workers write, on storage that all machines share.
+        is_tiny: build lerobot's π0 in its tiny form.
+        command: what the user typed, for the record.
+        say: gets lines for a person.
+        is_stopping: asked from time to time, whether to stop.
+
+    Returns:
+        Whether it came to its end.
+
+    Raises:
+        TrainingError: one of them failed, after the others were finished; the message names all.
+    """
+    logs.mkdir(parents=True, exist_ok=True)
+    main = finetune_main
+    if is_tiny:
+        from vla_eval.testing.tiny_models import tiny_finetune_main
+
+        main = tiny_finetune_main
+    jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]
+    pool: Pool[FinetuneJob, Finetuned] = backend.pool(
+        main,
+        answers=(Finetuned,),
+        size=max(1, min(len(jobs), backend.n_gpus or backend.n_cores)),
+        timeouts=TimeoutConfig(setup_seconds=MAX_SECONDS),
+        logs=logs,
+        takes_gpu=True,
+    )
+    failed = _run(pool, JobList(jobs), n_jobs=len(jobs), say=say, is_stopping=is_stopping)
+    if failed is None:
+        return False
+    if failed:
+        raise TrainingError(
+            f"{len(failed)} of {len(jobs)} fine-tunings failed; the others are finished. The same command "
+            f"resumes these. Their output is in {logs}.\n" + "\n".join(failed)
+        )
+    return True
+
+
+def _run(
+    pool: Pool[FinetuneJob, Finetuned],
+    queue: JobList[FinetuneJob],
+    *,
+    n_jobs: int,
+    say: Callable[[str], None],
+    is_stopping: Callable[[], bool],
+) -> list[str] | None:
+    """Run the jobs; return a sentence about each that failed, or None if it was asked to stop."""
+    n_tries: Counter[str] = Counter()
+    failed: list[str] = []
+    n_done = 0
+    with pool as running:
+        for event in running.run(queue):
+            if event is None and is_stopping():
+                return None
+            if not isinstance(event, Answered):
+                continue
+            job, answer = event.job, event.answer
+            if isinstance(answer, Failed) and answer.error.kind != FolderInUseError.__name__:
+                n_tries[job.name] += 1
+                if n_tries[job.name] < MAX_TRIES and not answer.refused:
+                    queue.give_back(job)
+                    continue
+                failed.append(f"{job.name}: {answer.error.kind}: {answer.error.message}")
+            n_done += 1
+            say(f"[{n_done}/{n_jobs}] {job.name}: {_outcome(answer)}")
+    return failed
+
+
+def _outcome(answer: Finetuned | Failed) -> str:
+    if isinstance(answer, Finetuned):
+        return "finished"
+    if answer.error.kind == FolderInUseError.__name__:
+        return "another process is training it"
+    return f"{answer.error.kind}: {answer.error.message:.200}"

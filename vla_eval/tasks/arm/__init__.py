@@ -1,0 +1,1 @@
+"""The arms: which there are, how an action reaches them, their wrist cameras."""

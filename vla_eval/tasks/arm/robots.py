@@ -1,0 +1,98 @@
+"""The arm with its wrist camera, with meshes of that camera that render faster.
+
+The camera's mesh takes most of the rendering time on a CPU (`camera_mesh`). Each variant replaces it, for
+rendering only: physics and collision shapes are the same. The files are created on first use in the user's
+cache.
+"""
+
+import functools
+import hashlib
+import os
+from pathlib import Path
+from xml.etree import ElementTree
+
+from mani_skill import PACKAGE_ASSET_DIR
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
+
+from vla_eval.storage.cache import cached
+from vla_eval.tasks.arm.camera_mesh import (
+    GRID_M,
+    VISIBLE_FILE,
+    MeshChange,
+    simplified,
+    without_hidden,
+    write_binary_stl,
+)
+
+_PANDA_DIR = Path(PACKAGE_ASSET_DIR) / "robots" / "panda"
+_CAMERA_MESH = "realsense2_description/meshes/d415.stl"
+
+
+@functools.cache  # asked for at each reset, and the sources have 21 MB
+def changed_urdf(name: str, change: MeshChange) -> Path:
+    """Return the URDF of the Panda with a changed camera mesh; create it if it is not in the cache.
+
+    The folder's name is a digest of its sources. It is created atomically by a rename, so workers that
+    start together cannot see a partial file.
+
+    Args:
+        name: of the variant, for the files.
+        change: returns the triangles to draw.
+    """
+    source_urdf, stl = _PANDA_DIR / "panda_v3.urdf", (_PANDA_DIR / _CAMERA_MESH).read_bytes()
+    digest = hashlib.sha256(f"{name} {GRID_M} {_PANDA_DIR}".encode() + source_urdf.read_bytes())
+    digest.update(stl)
+    digest.update(Path(__file__).with_name(VISIBLE_FILE).read_bytes())
+    folder = cached(f"robots/{digest.hexdigest()[:16]}")
+    urdf = folder / f"panda_v3_{name}.urdf"
+    if urdf.exists():
+        return urdf
+    draft = folder.with_name(f"{folder.name}.{os.getpid()}.tmp")
+    draft.mkdir(parents=True, exist_ok=True)
+    mesh_name = f"d415_{name}.stl"
+    write_binary_stl(draft / mesh_name, change(stl))
+    tree = ElementTree.parse(source_urdf)
+    for mesh in tree.iter("mesh"):
+        file = mesh.attrib["filename"]
+        mesh.set("filename", str(folder / mesh_name if file == _CAMERA_MESH else _PANDA_DIR / file))
+    tree.write(draft / urdf.name)
+    (draft / f"panda_v3_{name}.srdf").write_bytes((_PANDA_DIR / "panda_v3.srdf").read_bytes())
+    try:
+        draft.rename(folder)
+    except OSError:
+        if not urdf.exists():  # otherwise another worker was faster
+            raise
+    return urdf
+
+
+@register_agent()
+class PandaWristCamSeen(PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
+    """`panda_wristcam`, drawn without the triangles inside the camera's housing: the same images."""
+
+    uid = "panda_wristcam_seen"
+
+    @property
+    def urdf_path(self) -> str:
+        """Path of the URDF; created when the first such arm is loaded."""
+        return str(changed_urdf("seen", without_hidden))
+
+
+@register_agent()
+class PandaWristCamLight(PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
+    """`panda_wristcam`, drawn with a simpler mesh of the camera: images differ a little."""
+
+    uid = "panda_wristcam_light"
+
+    @property
+    def urdf_path(self) -> str:
+        """Path of the URDF; created when the first such arm is loaded."""
+        return str(changed_urdf("light", simplified))
+
+
+WRIST_MESH_ROBOTS = {
+    "shipped": "panda_wristcam_seen",
+    "whole": "panda_wristcam",
+    "simplified": "panda_wristcam_light",
+}
+"""Value of the render option `wrist_mesh` -> robot uid."""

@@ -1,0 +1,1 @@
+"""Rows of tasks that `tasks.catalog` puts together. Importing them starts no simulator."""

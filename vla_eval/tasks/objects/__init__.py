@@ -1,0 +1,1 @@
+"""What lies on the table: items, names, places, a mug, the state of a body."""

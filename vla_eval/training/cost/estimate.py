@@ -1,0 +1,175 @@
+"""What a fine-tuning takes, before it is started: parameters, memory, steps, hours, and what is assumed."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any  # lerobot is untyped
+
+import torch
+
+from vla_eval.checkpoints.loading import make_unfilled_policy
+from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.evaluation.model_table import SUSTAINED_TFLOPS
+from vla_eval.models.shared.empty_weights import empty_weights
+from vla_eval.training.cost.description import GIB, ModelDescription, describe_model
+from vla_eval.training.cost.sample_cost import SampleCost, sample_cost
+from vla_eval.training.lora import peft_config
+
+KEPT_FREE = 0.05  # of a device's memory, for its runtime and fragmentation
+CPU_TFLOPS = 0.1
+ASSUMED_STEPS = 50
+"""After so many steps, a training compares the assumed rate with its own."""
+TERA = 1e12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """What a fine-tuning takes.
+
+    Attributes:
+        model: its parameters and the memory for weights, gradients and optimizer.
+        cost: of a sample; None for a type of policy whose tokens are not known.
+        steps, batch_size, micro_batch_size: of the recipe; the last is what passes through at once.
+        tflops: assumed rate of the device, 10^12 operations per second.
+    """
+
+    model: ModelDescription
+    cost: SampleCost | None
+    steps: int
+    batch_size: int
+    micro_batch_size: int
+    tflops: float
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Weights, gradients and optimizer."""
+        return self.model.weights_bytes + self.model.training_bytes
+
+    @property
+    def total_bytes(self) -> float | None:
+        """With the activations of a micro batch; None if they are not known."""
+        return None if self.cost is None else self.fixed_bytes + self.micro_batch_size * self.cost.saved_bytes
+
+    @property
+    def step_seconds(self) -> float | None:
+        """Of a step at the assumed rate."""
+        if self.cost is None:
+            return None
+        return self.batch_size * self.cost.step_operations / (self.tflops * TERA)
+
+    def largest_batch(self, device_bytes: float) -> int | None:
+        """Return how many samples fit at once: 0 if not even the model does, None if it is not known."""
+        if self.cost is None:
+            return None
+        room = device_bytes * (1 - KEPT_FREE) - self.fixed_bytes
+        return max(0, math.floor(room / self.cost.saved_bytes)) if self.cost.saved_bytes else None
+
+
+def estimate(
+    model: Any, policy: Any, recipe: FinetuneRecipe, *, device: str, tflops: float | None = None
+) -> Estimate:
+    """Estimate what a fine-tuning of a model takes.
+
+    Args:
+        model: as it is trained; its weights need no memory.
+        policy: lerobot's configuration of it.
+        recipe: see there.
+        device: `cpu` or a GPU.
+        tflops: rate to assume; None: a usual one of the device.
+    """
+    usual = CPU_TFLOPS if device == "cpu" else SUSTAINED_TFLOPS
+    return Estimate(
+        model=describe_model(model),
+        cost=sample_cost(model, policy),
+        steps=recipe.steps,
+        batch_size=recipe.batch_size,
+        micro_batch_size=recipe.micro_batch_size or recipe.batch_size,
+        tflops=usual if tflops is None else tflops,
+    )
+
+
+def unfilled_model(policy: Any, recipe: FinetuneRecipe) -> Any:
+    """Return the model that a recipe trains, with adapters where it has LoRA, without memory for weights."""
+    return with_adapters(make_unfilled_policy(policy), recipe)
+
+
+def with_adapters(model: Any, recipe: FinetuneRecipe) -> Any:
+    """Return a model with adapters where the recipe has LoRA; they get no memory."""
+    adapters = peft_config(recipe)
+    if adapters is None:
+        return model
+    model.config.pretrained_path = Path(str(recipe.base_checkpoint))
+    with empty_weights(), torch.no_grad():
+        return model.wrap_with_peft(peft_cli_overrides=asdict(adapters))
+
+
+def estimate_lines(found: Estimate, *, device_bytes: float | None) -> Iterator[str]:
+    """Yield lines for a person, the assumptions last."""
+    yield from found.model.lines()
+    cost, total, seconds = found.cost, found.total_bytes, found.step_seconds
+    samples = found.steps * found.batch_size
+    yield f"steps: {found.steps:,} of {found.batch_size} samples, {samples:,} samples"
+    if cost is None or total is None or seconds is None:
+        yield "no estimate of activations and hours: the tokens of this type of policy are not known here"
+        return
+    yield (
+        f"memory, estimated: {total / GIB:.1f} GiB with {found.micro_batch_size} samples at once, whose "
+        f"activations take {found.micro_batch_size * cost.saved_bytes / GIB:.1f} "
+        f"({cost.saved_bytes / GIB:.3f} per sample)"
+    )
+    if device_bytes is not None:
+        largest = found.largest_batch(device_bytes)
+        yield f"largest batch in {device_bytes / 1e9:.0f} GB, estimated: {_fits(largest)}"
+    yield (
+        f"time, estimated: {found.steps * seconds / 3600:.1f} h ({seconds:.2f} s per step, "
+        f"{found.batch_size * cost.step_operations / TERA:.1f} TFLOP) at {found.tflops:g} TFLOP/s"
+    )
+    yield (
+        f"assumptions: the rate; {KEPT_FREE:.0%} of the device kept free; activations from the shapes of "
+        "layers by a measured factor (vla_eval/training/cost/sample_cost.py); loading, decoding, attention "
+        "scores and checkpoints not counted"
+    )
+
+
+def _fits(largest: int | None) -> str:
+    if largest is None:
+        return "not known"
+    return str(largest) if largest else "none, not even one sample"
+
+
+class RateWatch:
+    """Compares the assumed rate with the real one, once, after the first steps.
+
+    Args:
+        found: the estimate.
+        first_step: steps that were done before.
+        say: gets the line.
+    """
+
+    def __init__(self, found: Estimate, first_step: int, say: Any) -> None:
+        self._found, self._first, self._say = found, first_step, say
+        self._seconds: list[float] = []
+
+    def on_step(self, step: int, seconds: float) -> None:
+        """Take the duration of a step, loading included."""
+        if len(self._seconds) >= ASSUMED_STEPS:
+            return
+        self._seconds.append(seconds)
+        if len(self._seconds) < ASSUMED_STEPS:
+            return
+        # The first steps also fill caches and compile; the later half is what the rest will be like.
+        later = self._seconds[ASSUMED_STEPS // 2 :]
+        self._say(rate_line(self._found, sum(later) / len(later), self._found.steps - step))
+
+
+def rate_line(found: Estimate, measured_s: float, n_left: int) -> str:
+    """Return what the rate is, what was assumed, and what is left at the real one."""
+    left = f"{n_left * measured_s / 3600:.1f} h left for {n_left:,} steps"
+    if found.step_seconds is None or found.cost is None:
+        return f"rate: {measured_s:.3f} s per step; {left}"
+    reached = found.batch_size * found.cost.step_operations / measured_s / TERA
+    return (
+        f"rate: {measured_s:.3f} s per step, {reached:.2g} TFLOP/s; assumed were {found.step_seconds:.3f} s "
+        f"at {found.tflops:g} TFLOP/s: {measured_s / found.step_seconds:.2f} times as long; {left}"
+    )

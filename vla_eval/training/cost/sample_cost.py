@@ -1,0 +1,161 @@
+"""What one training sample costs: operations, and numbers that are kept for the backward pass.
+
+An estimate from the shapes of the linear layers and the tokens that pass through them; attention scores and
+the optimizer's own operations are not counted, convolutions only in small networks. Knows only torch modules.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple  # Any: lerobot is untyped
+
+from torch import Tensor, nn
+
+from vla_eval.training.cost.network_stages import EPISODE_STEPS, HEAD, STAGES, stage_of
+
+SAVED_PER_LINEAR = 1.3
+"""Numbers that a layer keeps for the backward pass, per token and per input and output of its linear layers.
+
+Measured on a CPU (torch 2.11, bfloat16, 256 tokens, SDPA) by counting the tensors that autograd saves in
+one layer of true width: SigLIP-so400m 0.89, Llama-2-7B 1.20, Gemma-300M 1.32, Gemma-2B 1.34. Gemma 2 with
+its capped eager attention: 1.91, of which the scores grow with the number of tokens.
+"""
+SAVED_PER_LINEAR_OF = {
+    "mikasa_spatialvla": 1.9,
+    "act": 1.04,
+    "diffusion": 1.19,
+    "mikasa_memory": 1.91,
+    "mikasa_sequence": 1.1,
+    "mikasa_offline_rl": 1.4,
+}
+"""Where it is another number. For all but the first, whole networks were measured in float32, at the sizes of
+their recipes, by `scripts/activation_constants.py`; convolutions and attention count like linear layers.
+"""
+ALL_LAYERS = frozenset(SAVED_PER_LINEAR_OF) - {"mikasa_spatialvla"}
+LAYER = re.compile(r"(.*\.(?:layers|layer|blocks|block)\.\d+)\.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleCost:
+    """What a sample costs.
+
+    Attributes:
+        inference_operations: of one forward pass, without repeated denoising or decoding.
+        inference_bytes: what the linear layers of the largest layer read and write in it.
+        step_operations: of forward and backward pass, what is computed again included.
+        saved_bytes: kept for the backward pass, and what the largest linear layer reads and writes.
+    """
+
+    inference_operations: float
+    inference_bytes: float
+    step_operations: float
+    saved_bytes: float
+
+
+class Layer(NamedTuple):
+    """A layer that multiplies by a matrix.
+
+    Attributes:
+        name: of the module.
+        weight: its matrix.
+        n_read, n_written: numbers per token, or per place of its output.
+    """
+
+    name: str
+    weight: Tensor
+    n_read: int
+    n_written: int
+
+
+@dataclass(slots=True, kw_only=True)
+class Counted:
+    """What the layers of a network do with a sample.
+
+    Attributes:
+        forward, step: operations of a forward pass, and of a training step.
+        saved: numbers that the layers which gradients reach read and write, but for those computed again.
+        inputs: numbers from which layers are computed again.
+        working: numbers that the largest matrix reads and writes; `largest`: that the largest layer does.
+    """
+
+    forward: float = 0.0
+    step: float = 0.0
+    saved: float = 0.0
+    inputs: float = 0.0
+    working: float = 0.0
+    largest: float = 0.0
+
+
+def sample_cost(model: Any, config: Any) -> SampleCost | None:
+    """Estimate it; None for a type of policy whose tokens are not known here.
+
+    Args:
+        model: a torch module of lerobot's; its weights need no memory.
+        config: of the policy.
+    """
+    if config.type not in STAGES:
+        return None
+    counted = count(model, config)
+    saved = counted.saved * SAVED_PER_LINEAR_OF.get(config.type, SAVED_PER_LINEAR)
+    saved += counted.inputs + counted.working
+    alone, through = config.n_passes(EPISODE_STEPS) if hasattr(config, "n_passes") else (0, 1)
+    n_bytes = 2 if getattr(config, "dtype", None) == "bfloat16" or getattr(config, "use_amp", False) else 4
+    return SampleCost(
+        inference_operations=counted.forward,
+        inference_bytes=counted.largest * n_bytes,
+        step_operations=counted.forward * alone + counted.step * through,
+        saved_bytes=saved * n_bytes * through,
+    )
+
+
+def count(model: Any, config: Any) -> Counted:
+    """Count operations and numbers of a sample; see `sample_cost`, whose types it knows."""
+    stages = STAGES[config.type](config)
+    first_trained = min(
+        (stage_of(stages, name).order for name, x in model.named_parameters() if x.requires_grad),
+        default=HEAD + 1,
+    )
+    is_recomputed = bool(getattr(config, "gradient_checkpointing", False))
+    found = Counted()
+    inputs: dict[str, float] = {}
+    again: dict[str, float] = {}
+    blocks: dict[str, float] = {}
+    for layer in _layers(model, every=config.type in ALL_LAYERS):
+        stage = stage_of(stages, layer.name)
+        operations = 2.0 * layer.weight.numel() * stage.tokens
+        numbers = float(stage.tokens * (layer.n_read + layer.n_written))
+        matched = LAYER.match(layer.name)
+        block = layer.name if matched is None else matched[1]
+        blocks[block] = blocks.get(block, 0.0) + numbers
+        found.forward += operations
+        found.step += operations
+        found.working = max(found.working, numbers)
+        if stage.order < first_trained:
+            continue
+        found.step += operations * (1 + layer.weight.requires_grad + is_recomputed)
+        if is_recomputed and matched is not None:
+            inputs.setdefault(block, float(stage.tokens * layer.n_read))
+            again[block] = again.get(block, 0.0) + numbers
+        else:
+            found.saved += numbers
+    found.saved += max(again.values(), default=0.0)
+    found.inputs = sum(inputs.values())
+    found.largest = max(blocks.values(), default=0.0)
+    return found
+
+
+def _layers(model: Any, *, every: bool) -> Iterator[Layer]:
+    """Yield the linear layers; if `every`, also convolutions and the projections of torch's attention."""
+    for name, module in model.named_modules():
+        if isinstance(module, nn.Linear):
+            yield Layer(name, module.weight, module.in_features, module.out_features)
+        elif every and isinstance(module, nn.Conv1d | nn.Conv2d | nn.ConvTranspose1d):
+            n_read = module.in_channels * math.prod(module.stride)
+            yield Layer(name, module.weight, n_read, module.out_channels)
+        elif every and isinstance(module, nn.GRU | nn.LSTM):
+            for key, weight in module.named_parameters():
+                if key.startswith("weight"):  # of an input or a state, to all gates
+                    yield Layer(name, weight, weight.shape[1], weight.shape[0])
+        elif every and isinstance(module, nn.MultiheadAttention) and module.in_proj_weight is not None:
+            yield Layer(name, module.in_proj_weight, module.embed_dim, 3 * module.embed_dim)
