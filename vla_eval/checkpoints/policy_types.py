@@ -17,7 +17,7 @@ ASKED_FOR_STEPS = {
     "vqbet": ("_queues",),
 }
 """Types of lerobot 0.6 whose `predict_action_chunk` reads the frames that their own `select_action` collected
--> what `reset` empties. They are asked for one action at a time; see `lerobot_steps.py`."""
+-> what `reset` empties. They are asked for one action at a time; see `select_step.py`."""
 
 CANNOT_BE_ASKED = {
     "gaussian_actor": "it has no chunks, and learns by reinforcement, not from demonstrations",

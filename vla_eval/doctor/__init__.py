@@ -1,7 +1,7 @@
 """Check the machine: one small function per possible problem, with advice.
 
 `CHECKS` is the table; each function returns a `Finding` and never raises. What could crash the
-process (a graphics driver, a broken package) runs in another process, by `doctor.probe`.
+process (a graphics driver, a broken package) runs in another process, by `doctor.subprocess_checks`.
 """
 
 from collections.abc import Callable, Mapping

@@ -36,11 +36,11 @@ class ProbeFailure(Exception):
 
 
 type Probe = Callable[[str], Mapping[str, Any]]  # Any: JSON
-"""Name of a function of `doctor.probe` -> its answer; raises `ProbeFailure`."""
+"""Name of a function of `doctor.subprocess_checks` -> its answer; raises `ProbeFailure`."""
 
 
 def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
-    """Call a function of `doctor.probe` in another process.
+    """Call a function of `doctor.subprocess_checks` in another process.
 
     Raises:
         ProbeFailure: it failed, crashed or hung.

@@ -12,14 +12,14 @@ from mani_skill.utils.structs import Pose
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.objects.bodies import Body, moving_body
-from vla_eval.tasks.without_cue import OnePhaseEnv, check_positive
+from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 SPAWN_X_M = (-0.35, -0.05)
 SPAWN_Y_M = (-0.9, -0.65)
 SIDE_VELOCITY_M_S = (0.0, 0.05)
 
 
-class RollingBallEnv(OnePhaseEnv):
+class RollingBallEnv(WithoutCueEnv):
     """A red ball rolls along y past the robot; the families define the goal.
 
     Args:

@@ -41,7 +41,7 @@ class InterceptEnv(RollingBallEnv):
     Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases:
     the whole episode is response, and the ball is always visible.
 
-    Arguments: `goal_radius_m`, and those of `RollingBallEnv` and `OnePhaseEnv`.
+    Arguments: `goal_radius_m`, and those of `RollingBallEnv` and `WithoutCueEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates. A slow ball sometimes rolls over
     the disc by itself (`docs/tasks.md` says how often).

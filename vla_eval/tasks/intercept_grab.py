@@ -38,7 +38,7 @@ class InterceptGrabEnv(RollingBallEnv):
     Episode end: 90 control steps; success is reported but ends nothing by itself. There are no phases.
 
     Arguments: `lift_height_m` (0: the ball need not be lifted, as in the official code), and those of
-    `RollingBallEnv` and `OnePhaseEnv`.
+    `RollingBallEnv` and `WithoutCueEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates.
 

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Pose
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
-from vla_eval.tasks.without_cue import OnePhaseEnv, check_positive, check_range
+from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive, check_range
 
 PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
@@ -21,7 +21,7 @@ STRICT_REACH_M = 0.04
 OFFICIAL_SIGN_SPLIT = 0.5
 
 
-class RotateEnv(OnePhaseEnv):
+class RotateEnv(WithoutCueEnv):
     """Rotate: turn the peg by the target angle; in the strict variant, without moving its centre.
 
     Description: a blue peg lies on the table in a random orientation. It must be turned about the vertical
@@ -45,7 +45,7 @@ class RotateEnv(OnePhaseEnv):
     `official_signs` (only the larger half of the angles positive, the smaller half negative, as in the
     official code); `angle_threshold_rad`; `position_threshold_m` for the centre's x and y, None: any
     position; `tilt_threshold_rad` for the tilt of the peg's top from the vertical, None: not checked;
-    `peg_half_length_m`, `peg_half_width_m`; and those of `OnePhaseEnv`.
+    `peg_half_length_m`, `peg_half_width_m`; and those of `WithoutCueEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates.
 

@@ -12,7 +12,7 @@ from vla_eval.seeding import Stream
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness
 from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body
-from vla_eval.tasks.without_cue import OnePhaseEnv, check_positive
+from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 START_X_M = (-0.05, 0.05)
 START_BANDS_Y_M = (-0.1, 0.0, 0.1)
@@ -29,7 +29,7 @@ RED_RGBA = (194 / 255, 19 / 255, 22 / 255, 1.0)
 VIOLET_RGBA = (147 / 255, 0.0, 211 / 255, 1.0)
 
 
-class TakeItBackEnv(OnePhaseEnv):
+class TakeItBackEnv(WithoutCueEnv):
     """TakeItBack: move the cube into the goal region, then back to its first position.
 
     Description: a green cube lies in front of the robot, behind it a red disc. Once the cube has been on
@@ -50,7 +50,7 @@ class TakeItBackEnv(OnePhaseEnv):
 
     Arguments: `goal_radius_m` and `return_radius_m`, maximum distance of the cube's centre from the centre
     of the disc and from its first position; `cube_half_size_m`; `latch_goal_color` (off: the disc is violet
-    only while the cube is on it, as in the official code on the GPU); and those of `OnePhaseEnv`.
+    only while the cube is on it, as in the official code on the GPU); and those of `WithoutCueEnv`.
 
     Chance level: to be measured (`cue_blind`); there are no candidates.
 

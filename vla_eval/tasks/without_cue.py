@@ -8,7 +8,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import MemoryTableEnv
 
 
-class OnePhaseEnv(MemoryTableEnv):
+class WithoutCueEnv(MemoryTableEnv):
     """A memory task whose whole episode is the response phase; nothing is hidden or revealed.
 
     Arguments: those of `MemoryTableEnv` without `cue_steps` and `delay_steps`.

@@ -16,7 +16,7 @@ from tests.models.stored_frames import StoredFrames, context, executed
 from vla_eval.checkpoints.conversion.octo import convert
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk, FloatArray, ObservationWindow
-from vla_eval.policies.lerobot.policy import policy as lerobot
+from vla_eval.policies.lerobot import policy as lerobot
 from vla_eval.specs import PolicySpec
 
 CAMERAS = {"primary": "base_camera", "wrist": "hand_camera"}

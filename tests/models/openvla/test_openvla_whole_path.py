@@ -15,8 +15,8 @@ from tests.models.stored_frames import StoredFrames, context, executed
 from vla_eval.checkpoints.conversion.openvla import ConvertOptions, convert_openvla
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.policies.lerobot import inputs as lerobot_inputs
 from vla_eval.policies.lerobot.openvla_paper import make_openvla
-from vla_eval.policies.lerobot.policy import inputs as lerobot_inputs
 
 # The stored images have the model's size, and the original ran without the crop.
 OPTIONS = ConvertOptions(

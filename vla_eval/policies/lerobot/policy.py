@@ -14,12 +14,12 @@ Three kinds of policies, told apart by their configuration:
 - with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
   (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
   gets `memory` (a recurrent policy of your own). One that also has `begin_memory(n_episodes) -> memory`,
-  a tuple of tensors (B, …), infers for several episodes in one pass: see `lerobot_memory.py`.
+  a tuple of tensors (B, …), infers for several episodes in one pass: see `models.episodes.memory`.
 
 Any of them may be shown earlier frames as further images: see `vla_memory/`.
 
 Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
-they are asked for one action at each control step, with queues of each episode; see `lerobot_steps.py`.
+they are asked for one action at each control step, with queues of each episode; see `checkpoints.select_step`.
 """
 
 from collections.abc import Mapping, Sequence

@@ -47,7 +47,7 @@ def _row(line: dict[str, str]) -> TaskSpec:
 
 
 def _read_table() -> dict[str, TaskSpec]:
-    text = files("vla_eval.tasks").joinpath(TABLE).read_text(encoding="utf-8")
+    text = files("vla_eval.tasks.catalogs").joinpath(TABLE).read_text(encoding="utf-8")
     rows = [_row(line) for line in csv.DictReader(text.splitlines(), delimiter=";")]
     return {row.id: row for row in rows}
 

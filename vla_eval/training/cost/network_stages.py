@@ -179,7 +179,7 @@ def _offline_rl(config: Any) -> tuple[Stage, ...]:
 
 
 def _encoder_stages(config: Any, n_images: int, *, nature: bool) -> tuple[Stage, ...]:
-    """Return the places of plain encoders of images (`policies/sequence/encoders.py`)."""
+    """Return the places of plain encoders of images (`models/sequence/encoders.py`)."""
     n_px = _image_shape(config)[-1]
     encoder = r"network\.(?:encoder|encoders\.\d+)\."
     if not nature:
