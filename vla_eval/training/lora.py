@@ -6,7 +6,7 @@ from lerobot.configs.default import PeftConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 
-from vla_eval.checkpoints.loading import config_class
+from vla_eval.checkpoints.policy_types import wrapped_type
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.models.shared.trainable import check_lora
@@ -19,33 +19,34 @@ LORA_TARGETS = {
 leaves them frozen (https://github.com/huggingface/lerobot/pull/4494)."""
 
 
-def peft_config(recipe: FinetuneRecipe) -> PeftConfig | None:
-    """Return lerobot's settings of the adapters; None: all weights are trained."""
+def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
+    """Return lerobot's settings of the adapters; None: all weights are trained.
+
+    Args:
+        recipe: see there.
+        policy: lerobot's configuration.
+    """
     lora = recipe.lora
     if lora is None:
         return None
     return PeftConfig(
         r=lora.rank,
         lora_alpha=lora.alpha or lora.rank,
-        target_modules=lora.target_modules or LORA_TARGETS.get(_wrapped(recipe.type)),
+        target_modules=lora.target_modules or LORA_TARGETS.get(wrapped_type(policy)),
         full_training_modules=list(lora.full_modules) or None,
     )
 
 
-def _wrapped(kind: str) -> str:
-    """Return lerobot's type of a policy, or of the one to which it adds something."""
-    return str(getattr(config_class(kind, where="finetune.type"), "wraps", kind))
+def check_lora_targets(recipe: FinetuneRecipe, cls: Any) -> None:
+    """Raise `RecipeError` where neither the recipe nor the policy says which layers get an adapter.
 
-
-def check_lora_targets(recipe: FinetuneRecipe) -> None:
-    """Refuse LoRA where neither the recipe nor the policy says which layers get an adapter.
-
-    Raises:
-        RecipeError: neither does.
+    Args:
+        recipe: see there.
+        cls: class of the policy's configuration.
     """
     if recipe.lora is None or recipe.lora.target_modules is not None:
         return
-    if hasattr(config_class(recipe.type, where="finetune.type"), "lora_defaults"):
+    if hasattr(cls, "lora_defaults"):
         return
     chosen = get_policy_class(recipe.type)._get_default_peft_targets
     if chosen is PreTrainedPolicy._get_default_peft_targets:
@@ -74,8 +75,6 @@ def check_adapters(model: Any, recipe: FinetuneRecipe, policy: Any) -> None:
             "finetune.lora.full_modules: [memory_tokens]"
         )
     own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
-    target = (
-        recipe.lora.target_modules or LORA_TARGETS.get(_wrapped(policy.type)) or own.get("target_modules")
-    )
+    target = recipe.lora.target_modules or LORA_TARGETS.get(wrapped_type(policy)) or own.get("target_modules")
     if target is not None:
         check_lora(model, target, tuple(recipe.lora.full_modules or own.get("modules_to_save") or ()))

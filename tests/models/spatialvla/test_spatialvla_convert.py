@@ -16,6 +16,7 @@ from torch import Tensor
 from tests.models.golden_values import GoldenFields
 from tests.models.spatialvla import spatialvla_golden as golden
 from tests.models.stored_frames import StoredFrames, context, executed
+from tests.training.fitted_policies import policy_config
 from vla_eval.checkpoints.conversion.spatialvla import ConvertOptions, convert_spatialvla
 from vla_eval.checkpoints.conversion.spatialvla_described import _NOT_OF_ENCODER, _NOT_OF_ZOE, check_described
 from vla_eval.checkpoints.conversion.spatialvla_sections import OF_NO_EFFECT
@@ -32,7 +33,6 @@ from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, NetworkSizes
 from vla_eval.models.spatialvla.weight_names import EMBEDDINGS, HEAD
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.training.dataset import training_dataset
-from vla_eval.training.policy_config import policy_config
 
 SMALL = {**golden.SMALL, **golden.DEPTH}
 (UNNORM_KEY,) = golden.config()["statistics"]
