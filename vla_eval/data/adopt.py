@@ -30,9 +30,8 @@ from vla_eval.tasks.spec import TaskSpec
 def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
     """Check a dataset, compute its statistics again, and write what it is; return that.
 
-    Args:
-        root: its folder. `meta/stats.json` is replaced, and `meta/mikasa/import.json` is written last.
-        task: of which the demonstrations are; None if there are several, or it is not known.
+    Replaces `meta/stats.json`, and writes `meta/mikasa/import.json` last. `task` is the demonstrations',
+    None if there are several or it is not known.
 
     Raises:
         DatasetError: it has such records already, has other fields than ours, or breaks a rule.

@@ -41,15 +41,7 @@ class Said:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """What was found in a dataset.
-
-    Attributes:
-        path: its folder.
-        kind: what it is.
-        demonstrations: its numbers and sentences.
-        said: what was found.
-        next_step: what can be done with it.
-    """
+    """What was found in a dataset, and the command that can be run with it next."""
 
     path: Path
     kind: str

@@ -43,11 +43,6 @@ Statistics = dict[str, NDArray[np.float64]]
 _Fields = Mapping[str, Mapping[str, Any]]  # Any: lerobot's plain data
 
 
-class _Moments(NamedTuple):
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
-
-
 def empty_histogram() -> Histogram:
     """Return a histogram of nothing."""
     return np.zeros((N_CHANNELS, N_LEVELS), dtype=np.int64)
@@ -79,7 +74,9 @@ def image_statistics(histogram: Histogram, *, n_frames: int) -> Statistics:
     """
     levels = np.arange(N_LEVELS) / (N_LEVELS - 1)
     total = histogram.sum(axis=1)
-    moments = _moments(histogram, levels)
+    weights = histogram / histogram.sum(axis=1, keepdims=True)
+    mean = weights @ levels
+    variance = (weights * (levels[None] - mean[:, None]) ** 2).sum(axis=1)
     cumulated = histogram.cumsum(axis=1)
 
     def level_at(share: float) -> NDArray[np.float64]:
@@ -91,28 +88,12 @@ def image_statistics(histogram: Histogram, *, n_frames: int) -> Statistics:
     by_name = {
         "min": levels[present.argmax(axis=1)],
         "max": levels[N_LEVELS - 1 - present[:, ::-1].argmax(axis=1)],
-        "mean": moments.mean,
-        "std": moments.std,
+        "mean": mean,
+        "std": np.sqrt(variance),
         **{name: level_at(q) for name, q in QUANTILES.items()},
     }
     shaped = {name: value.reshape(N_CHANNELS, 1, 1) for name, value in by_name.items()}
     return {**shaped, "count": np.array([n_frames])}
-
-
-def dataset_statistics(
-    columns: Mapping[str, NDArray[np.generic]], histograms: Mapping[str, Histogram]
-) -> dict[str, Statistics]:
-    """Return field -> statistics.
-
-    Args:
-        columns: field -> (N,) or (N, D) numbers of all frames.
-        histograms: camera field -> histogram of all its frames.
-    """
-    n_frames = len(next(iter(columns.values())))
-    return {
-        **{key: vector_statistics(rows.reshape(n_frames, -1)) for key, rows in columns.items()},
-        **{key: image_statistics(histogram, n_frames=n_frames) for key, histogram in histograms.items()},
-    }
 
 
 def usable_statistics(statistics: _Fields | None, features: _Fields) -> dict[str, dict[str, Any]]:
@@ -200,10 +181,3 @@ def _fields(statistics: _Fields | None, features: _Fields) -> Iterator[_Field]:
         named = [str(name) for name in names]
         resolution = [RESOLUTION * (FPS if name.endswith(VELOCITY) else 1) for name in named]
         yield _Field(key, named, found, np.array(resolution))
-
-
-def _moments(histogram: Histogram, levels: NDArray[np.float64]) -> _Moments:
-    weights = histogram / histogram.sum(axis=1, keepdims=True)
-    mean = weights @ levels
-    variance = (weights * (levels[None] - mean[:, None]) ** 2).sum(axis=1)
-    return _Moments(mean, np.sqrt(variance))

@@ -33,15 +33,10 @@ class DatasetFacts:
     """What a recorded dataset is, and how it came about; for the rest see `Facts`.
 
     Attributes:
-        name: the recipe's name.
-        task, task_version, instruction: the one task of the dataset.
-        n_episodes, n_frames, n_failed_seeds: counts.
-        recipe: the resolved recipe; `recipe_sha256` is the digest of the part that content depends on.
-        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts, and the weights of a
-            learned expert.
+        name, recipe: of the resolved recipe; `recipe_sha256` is the digest of what content depends on.
+        recipe_files: `policies/oracle` -> sha256 of the file; likewise prompts and weights.
         environment: commit, versions and machine, see `provenance.collect_environment`.
         device: the device that rendered, as the environment describes it.
-        files: digests of lerobot's files and of the manifest.
     """
 
     complete: bool
@@ -93,8 +88,6 @@ class ImportedEpisode:
 
     Attributes:
         name: its file, or its number in the source.
-        n_steps: number of frames.
-        instruction: the language instruction.
         source_seed: its seed in the source's environment; ours gives another episode for it.
         success: whether the source's success flag holds at any frame; None if it has none.
     """
@@ -111,16 +104,11 @@ class ImportFacts:
     """What a converted dataset is, where it came from, and what it does not have; for the rest see `Facts`.
 
     Attributes:
-        source_layout: `npz_joints`, `npz_proprio`, `lerobot_official`, `lerobot_suite90`, `lerobot_mikasa`;
-            or `adopted`, if the files are those of the source.
-        task: the task id that the user named.
-        instruction_source: where the instruction comes from: `source`, or the prompt set of that task.
+        source_layout: see `foreign.episodes.Layout`; or `adopted`, if the files are those of the source.
+        instruction_source: where the instruction comes from: `source`, or the prompt set of the task.
         executable_by_pd_ee_delta_pose: whether this project's environments can execute the actions.
         absent: fields of our own datasets that the source does not have.
         left_out: arrays of the source that were not taken over.
-        episodes: the source's description of each.
-        source_files: path below the source -> digest.
-        vla_eval_version: what converted it.
         is_checked: False for what an older version wrote.
         converted: what was changed because it was asked for, a sentence each.
     """
@@ -160,14 +148,10 @@ class MixtureSource:
     """A dataset of one task, whose episodes follow those of the sources before it.
 
     Attributes:
-        name: its folder's name.
-        task: task id; None for an import that names none.
-        task_version: of the task's rules; None for an import.
+        task, task_version: None for an import that names none.
         instructions: every sentence that occurs in it.
-        n_episodes, n_frames: counts.
         sha256: digest of the digests of all its files.
         seeds: of its episodes, in their order; None for an import, whose seeds are not ours.
-        failed_seeds: at which the expert did not succeed.
         was_replayed: whether a replay had confirmed it when it was mixed.
     """
 
@@ -185,12 +169,7 @@ class MixtureSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MixtureFacts:
-    """What a dataset of several tasks is; for the rest see `Facts`.
-
-    Attributes:
-        sources: in the order of their episodes.
-        vla_eval_version: what mixed it.
-    """
+    """What a dataset of several tasks is, with its sources in their order; for the rest see `Facts`."""
 
     complete: bool
     state: str
@@ -278,15 +257,7 @@ type Facts = DatasetFacts | ImportFacts | MixtureFacts
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
-    """A kind of dataset.
-
-    Attributes:
-        cls: its facts.
-        file: where they are, below the dataset.
-        made: `recorded`, for messages.
-        again: what to do if it is not finished.
-        repair: what to do if its files are damaged.
-    """
+    """A kind of dataset: its facts and their file; for messages, how it was made, resumed and repaired."""
 
     cls: type[Facts]
     file: Path

@@ -16,8 +16,7 @@ REMEDY = "It is not read. Copy the dataset with `cp -rL` if you trust where it l
 def check_folder(root: Path) -> None:
     """Raise `DatasetError` unless all that lies below a folder is a regular file in it, or a folder.
 
-    Args:
-        root: the folder; it may be a link itself, since the user named it.
+    The folder itself may be a link, since the user named it.
     """
     distrust(root)
     inside = root.resolve()

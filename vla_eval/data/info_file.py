@@ -36,16 +36,7 @@ NOT_IN_PATHS = frozenset(":*?[]%\\|")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetInfo:
-    """The fields of lerobot's `info.json` that it computes with; it may hold others.
-
-    Attributes:
-        codebase_version, robot_type: text.
-        fps: frames per second.
-        features: name -> its description.
-        total_episodes, total_frames, total_tasks: counts.
-        chunks_size, data_files_size_in_mb, video_files_size_in_mb: limits of files.
-        data_path, video_path: templates of paths below the dataset.
-    """
+    """The fields of lerobot's `info.json` that it computes with; it may hold others."""
 
     codebase_version: str
     fps: Positive

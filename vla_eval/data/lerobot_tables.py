@@ -5,7 +5,7 @@ Each function below replaces one of `lerobot.datasets.io_utils`, which reads by 
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any  # pyarrow and datasets are untyped
 
@@ -48,59 +48,13 @@ SENTENCE_COLUMNS = ("task", "__index_level_0__")  # what pandas calls an index w
 IMAGE_BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  # PNG, JPEG, TIFF of depth
 
 
-class Tables:
-    """What lerobot reads of a dataset, each file read once: when it is first asked for.
-
-    Args:
-        root: the dataset's folder.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-
-    @functools.cached_property
-    def info(self) -> dict[str, Any]:  # Any: JSON
-        """What `meta/info.json` holds; see `read_info`."""
-        return read_info(self.root)
-
-    @functools.cached_property
-    def episodes(self) -> Dataset:
-        """See `read_episodes`."""
-        return read_episodes(self.root)
-
-    @functools.cached_property
-    def tasks(self) -> pd.DataFrame:
-        """See `read_tasks`."""
-        return read_tasks(self.root)
-
-    @functools.cached_property
-    def statistics(self) -> dict[str, dict[str, NDArray[np.generic]]] | None:
-        """See `read_statistics`."""
-        return read_statistics(self.root)
-
-    @functools.cached_property
-    def frames(self) -> list[TableFile]:
-        """See `read_frame_tables`."""
-        return read_frame_tables(self.root)
-
-    @functools.cached_property
-    def columns(self) -> Columns:
-        """See `columns_of`."""
-        return columns_of(self.frames)
-
-
 def frames_for_lerobot(
     files: Sequence[TableFile], features: Features, episodes: Sequence[int] | None = None
 ) -> Dataset:
-    """Return the rows of frames, as lerobot's `load_nested_dataset` does.
-
-    Args:
-        files: of the dataset.
-        features: the columns and their types, of `meta/info.json`.
-        episodes: these; None: all.
+    """Return the rows of frames, of all episodes or of these, as lerobot's `load_nested_dataset` does.
 
     Raises:
-        DatasetError: a table has other columns or types.
+        DatasetError: a table has other columns or types than `features`, those of `meta/info.json`.
     """
     return _as_dataset(pa.concat_tables([_frames(file, features, episodes) for file in files]), features)
 
@@ -166,6 +120,28 @@ def read_statistics(root: Path) -> dict[str, dict[str, NDArray[np.generic]]] | N
         field: {name: _numbers(value, f"{field}: {name}", source) for name, value in values.items()}
         for field, values in fields.items()
     }
+
+
+def _once[T](read: Callable[[Path], T]) -> "functools.cached_property[T]":
+    return functools.cached_property(lambda tables: read(tables._root))
+
+
+class Tables:
+    """What the files of a dataset hold, each read once: when it is first asked for."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    info = _once(read_info)
+    episodes = _once(read_episodes)
+    tasks = _once(read_tasks)
+    statistics = _once(read_statistics)
+    frames = _once(read_frame_tables)
+
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """See `columns_of`."""
+        return columns_of(self.frames)
 
 
 def _frames(file: TableFile, features: Features, episodes: Sequence[int] | None) -> Any:  # Any: pyarrow.Table

@@ -56,10 +56,6 @@ class RecordedEpisode:
     """One demonstration: an episode is a function of (task, arguments, seed, actions).
 
     Attributes:
-        episode_index: its number in the dataset.
-        task, task_version, env_kwargs, seed: what the environment is made and reset with.
-        instruction: the language instruction.
-        expert, expert_version: the policy recipe that acted.
         cue_steps, delay_steps: lengths of the first two phases, in control steps.
         n_steps: number of frames, one per control step.
         success_step: control steps executed when the success rule first held; None if it never did.
@@ -122,15 +118,12 @@ class ReplayReport:
     """What a replay found; `finetune` asks for `passed`.
 
     Attributes:
-        passed: every episode that was replayed is what the manifest says.
         n_episodes: episodes replayed; n_total: episodes of the dataset.
         pixels: whether images were compared, too.
         states_compared: `bit-equal`, or the tolerance where environments differ.
-        mismatches: one sentence each.
         lowest_psnr_db: camera -> how close the video comes to the rendered frames in the worst episode;
             empty where images were not compared.
         manifest_sha256: digest of the manifest that was replayed; another manifest needs another replay.
-        environment: where it was replayed.
     """
 
     passed: bool
@@ -150,11 +143,7 @@ def encode_actions(actions: FloatArray) -> str:
 
 
 def decode_actions(text: str, *, n_dims: int) -> FloatArray:
-    """Return what `encode_actions` was given.
-
-    Raises:
-        DatasetError: the text is no such thing.
-    """
+    """Return what `encode_actions` was given, or raise `DatasetError`."""
     try:
         rows = np.frombuffer(base64.b64decode(text, validate=True), dtype="<f4").reshape(-1, n_dims)
     except (binascii.Error, ValueError) as exc:
@@ -171,11 +160,7 @@ def to_json(entry: Any, *, indent: int | None = None) -> str:  # Any: dataclasse
 
 
 def from_json[E](cls: type[E], text: str | bytes, *, where: str) -> E:
-    """Return the entry that `to_json` wrote.
-
-    Raises:
-        DatasetError: it is something else, or of another version.
-    """
+    """Return the entry that `to_json` wrote; raise `DatasetError` for another one, or another version."""
     source = Source(where=where, what=f"a {cls.__name__}", remedy=FETCH_AGAIN, error=DatasetError)
     data = read_json(text, source)
     read_version(data, "format_version", FORMAT_VERSION, source)
@@ -194,11 +179,7 @@ def write_entry(path: Path, entry: Any) -> None:  # Any: dataclasses have no com
 
 
 def read_manifest(dataset: Path) -> tuple[RecordedEpisode, ...]:
-    """Return the episodes of a dataset, in the order of their numbers.
-
-    Raises:
-        DatasetError: there is no manifest, or it is damaged.
-    """
+    """Return the episodes of a dataset, in the order of their numbers, or raise `DatasetError`."""
     check_folder(dataset)
     episodes = read_entries(dataset / MANIFEST_FILE, RecordedEpisode)
     numbers = [episode.episode_index for episode in episodes]
@@ -215,21 +196,13 @@ def read_failed(dataset: Path) -> tuple[FailedSeed, ...]:
 
 
 def read_replay(dataset: Path) -> ReplayReport | None:
-    """Return what the last replay found; None if there was none.
-
-    Raises:
-        DatasetError: the file is damaged.
-    """
+    """Return what the last replay found; None if there was none."""
     path = dataset / REPLAY_FILE
     return from_json(ReplayReport, read_content(path), where=str(path)) if path.exists() else None
 
 
 def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
-    """Return the entries of a file, one per line.
-
-    Raises:
-        DatasetError: there is no such file, or a line is damaged.
-    """
+    """Return the entries of a file, one per line; raise `DatasetError` if it is missing or damaged."""
     data = read_content(path)
     if data and not data.endswith(b"\n"):
         raise DatasetError(f"{path}: expected a line end at its end; the last line is torn. {FETCH_AGAIN}")
@@ -237,11 +210,7 @@ def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> t
 
 
 def read_content(path: Path) -> bytes:
-    """Return what a file of `meta/mikasa/` holds.
-
-    Raises:
-        DatasetError: it is not there, with what the dataset may be instead.
-    """
+    """Return what a file of `meta/mikasa/` holds, or raise `DatasetError`."""
     remedy = "Name the folder of one task, OUT/TASK, that `mikasa-vla record` has finished."
     try:
         return read_file(path, Source(where=str(path), what="a file", remedy=remedy, error=DatasetError))

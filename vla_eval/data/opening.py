@@ -55,14 +55,8 @@ NEEDED = ("meta/info.json", "meta/tasks.parquet", EPISODE_TABLES, FRAME_TABLES)
 class LocalDataset:
     """A LeRobotDataset (v3) that is there in full, whoever made it. Each of its files is read once.
 
-    Args:
-        root: the dataset's folder.
-
     Raises:
         DatasetError: there is none, or files are missing.
-
-    Attributes:
-        tables: what its files hold.
     """
 
     def __init__(self, root: Path) -> None:
@@ -99,11 +93,13 @@ class LocalDataset:
         """All of it, with lerobot's default options."""
         return self.lerobot()
 
-    def lerobot(self, **options: Any) -> LeRobotDataset:
-        """Return lerobot's dataset of these files, checked.
+    @functools.cached_property
+    def in_bytes(self) -> LeRobotDataset:
+        """All of it, with images in uint8."""
+        return self.lerobot(return_uint8=True)
 
-        Args:
-            options: of `LeRobotDataset`, such as `delta_timestamps` and `episodes`.
+    def lerobot(self, **options: Any) -> LeRobotDataset:
+        """Return lerobot's dataset of these files, checked; `options` are those of `LeRobotDataset`.
 
         Raises:
             DatasetError: files are damaged, or do not belong together.
@@ -121,11 +117,7 @@ class OpenDataset:
     """A complete dataset of this project: what training, cards and mixtures are made from.
 
     Attributes:
-        root: its folder.
-        facts: what it is.
-        manifest: its episodes; empty unless it was recorded here.
-        failed_seeds: at which the expert did not succeed.
-        replay: the last replay's report; None: never replayed.
+        manifest, failed_seeds, replay: of a recording; empty and None for others.
         local: its tables and videos.
         left_out: numbers of the episodes that are not used.
     """
@@ -224,11 +216,7 @@ class OpenDataset:
 
     @property
     def was_replayed(self) -> bool:
-        """Whether a replay has confirmed it; an import cannot be replayed.
-
-        Raises:
-            DatasetError: a replay found a mismatch.
-        """
+        """Whether a replay has confirmed it, which an import cannot have; an error if it found a mismatch."""
         if isinstance(self.facts, MixtureFacts):
             return self.facts.was_replayed
         if not isinstance(self.facts, DatasetFacts):
@@ -290,8 +278,7 @@ def reason(exc: BaseException) -> str:
 def local_readers(tables_of: Callable[[Path], Tables]) -> Iterator[None]:
     """Let lerobot read datasets by our readers, which are given no address, and ask the Hub for nothing.
 
-    Args:
-        tables_of: returns what the files of a folder hold. lerobot gets copies of what it changes.
+    `tables_of` returns what the files of a folder hold; lerobot gets copies of what it changes.
     """
 
     def frames(folder: Path, features: Any, episodes: Sequence[int] | None = None) -> Any:
@@ -317,12 +304,7 @@ def local_readers(tables_of: Callable[[Path], Tables]) -> Iterator[None]:
 
 
 def join_datasets(roots: Sequence[Path], root: Path, **options: Any) -> None:
-    """Put datasets together as a new one, by lerobot.
-
-    Args:
-        roots: of the datasets, in order.
-        root: of the new one; must not exist.
-        options: of lerobot's `aggregate_datasets`.
+    """Put datasets together as a new one, by lerobot's `aggregate_datasets`.
 
     Raises:
         ValueError: they do not have the same fields.

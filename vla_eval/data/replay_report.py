@@ -28,15 +28,10 @@ def keep_report(dataset: Path, report: ReplayReport) -> None:
 
 
 def require_passed(dataset: Path, report: ReplayReport | None, manifest: str) -> ReplayReport | None:
-    """Return the report of a dataset's last replay.
-
-    Args:
-        dataset: its folder, for messages.
-        report: what `read_replay` returned.
-        manifest: digest of its manifest.
+    """Return the report of a dataset's last replay, as `read_replay` returned it.
 
     Raises:
-        DatasetError: the replay has failed, or was one of another manifest.
+        DatasetError: the replay has failed, or was one of another manifest than that of this digest.
     """
     if report is None:
         return None

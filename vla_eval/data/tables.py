@@ -141,11 +141,7 @@ def rows_of_episode(columns: Columns, episode_index: int) -> Columns:
 
 
 def table_paths(root: Path, pattern: str) -> list[Path]:
-    """Return the files of a table in the order of their rows.
-
-    Raises:
-        DatasetError: there are none.
-    """
+    """Return the files of a table in the order of their rows; raise `DatasetError` if there are none."""
     paths = sorted(root.glob(pattern))
     if not paths:
         raise DatasetError(f"{root}: there is no {pattern}. Name the folder of one LeRobotDataset (v3).")

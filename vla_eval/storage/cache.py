@@ -19,13 +19,10 @@ def cache_dir() -> Path:
 
 
 def cached(name: str) -> Path:
-    """Return where something is in the cache, or where it may be made.
+    """Return where something of this relative path is in the cache, or where it may be made.
 
     Where the cache cannot be written, as with a home that is read-only on the nodes of a cluster, that is a
     temporary folder of this process.
-
-    Args:
-        name: a relative path.
     """
     wanted = cache_dir() / name
     if wanted.exists() or (reason := _why_not(wanted.parent)) is None:

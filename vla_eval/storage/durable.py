@@ -30,9 +30,7 @@ def sync_folder(folder: Path) -> None:
 def replace_file(path: Path, text: str) -> None:
     """Write a file so that at any moment either the old content or the new one is there, never a part.
 
-    Args:
-        path: the file; `<name>.tmp` beside it is used on the way.
-        text: the new content.
+    `<name>.tmp` is used on the way.
 
     Raises:
         StorageFullError: it could not be written; the old content is still there.
@@ -93,9 +91,8 @@ def cut_tail(path: Path) -> None:
 class LineFile:
     """A file that lines are appended to, each of them whole or not at all.
 
-    Args:
-        path: the file; it is made if it is not there. It must be empty or end with a newline.
-        durable: whether a line is on the disk, and not just on its way, when `append` returns.
+    It is made if it is not there, and must be empty or end with a newline. `durable`: a line is on the disk,
+    and not just on its way, when `append` returns.
     """
 
     def __init__(self, path: Path, *, durable: bool) -> None:
@@ -105,10 +102,7 @@ class LineFile:
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
 
     def append(self, line: str) -> None:
-        """Append one line.
-
-        Args:
-            line: text without the line's end.
+        """Append one line, given without its end.
 
         Raises:
             StorageFullError: the line could not be written; the file is as it was before.
@@ -160,10 +154,7 @@ class FolderLock:
     """Keeps a second process out of a folder, for as long as this process lives.
 
     The lock belongs to the open file, so the kernel drops it when the process dies, however it dies;
-    the file itself stays and means nothing.
-
-    Args:
-        path: the lock file; it holds the process id of whoever has the lock.
+    the file itself stays, with the process id in it, and means nothing.
 
     Raises:
         FolderInUseError: another process has it.

@@ -21,13 +21,8 @@ MAX_NAMED = 5
 def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
     """Return the record that counts of each key, in the order in which the keys first appear.
 
-    Args:
-        data: whole lines.
-        path: where they are from, for messages.
-        planned: which episodes the run has.
-
     Raises:
-        RunFolderError: a line is no record, a key has two results, or an episode is not the run's.
+        RunFolderError: a line is not a record, a key has two results, or an episode is not planned.
     """
     records: dict[EpisodeKey, EpisodeRecord] = {}
     strangers: list[str] = []
@@ -71,11 +66,7 @@ def _parse_record(line: bytes, where: str) -> EpisodeRecord:
 
 
 def repair_records(path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
-    """Read the records; make a last line that was torn by a kill whole, or cut it off.
-
-    Args:
-        path: the file; nothing is done if it is not there.
-        planned: which episodes the run has.
+    """Read the records, if there are any; make a last line that was torn by a kill whole, or cut it off.
 
     Raises:
         RunFolderError: a line is damaged, or an episode is not the run's; the file is left as it is.

@@ -17,13 +17,10 @@ UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
 
 def make_folder(path: Path) -> None:
-    """Make the folder if it is not there.
-
-    Args:
-        path: the folder that a run is to go into.
+    """Make the folder of a run if it is not there.
 
     Raises:
-        RunFolderError: it is there and somebody else's, or is no folder.
+        RunFolderError: it is there and somebody else's, or is not a folder.
         OSError: it cannot be made.
     """
     if path.exists() and not path.is_dir():
@@ -45,14 +42,7 @@ def make_folder(path: Path) -> None:
 def other_files(
     path: Path, names: Collection[str], *, missing: str, error: type[VlaEvalError]
 ) -> VlaEvalError:
-    """Build the error for a folder that holds something else than what was to be started or resumed in it.
-
-    Args:
-        path: the folder.
-        names: of its files.
-        missing: what it would hold, too.
-        error: class of the error.
-    """
+    """Build the error for a folder that holds other files, and not what is `missing` to be resumed."""
     shown = ", ".join(sorted(names)[:3]) + (", …" if len(names) > 3 else "")
     return error(
         f"{path}: holds other files ({shown}) and no {missing}: nothing is written into it. Use another "

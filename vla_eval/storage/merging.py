@@ -25,14 +25,7 @@ CAPTURES = (video_file, thumbnail_file, rrd_file)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergedRun:
-    """What shards come to.
-
-    Attributes:
-        run_file: the description of the whole run, and the sessions of all shards.
-        runs: the shards.
-        records: of all episodes, in the order of the plan.
-        missing: sentences about shards and episodes that are not there.
-    """
+    """Description and sessions of all shards, their records in the plan's order, and what is missing."""
 
     run_file: RunFile
     runs: tuple[StoredRun, ...]
@@ -46,16 +39,12 @@ class MergedRun:
 
 
 def merge_runs(folders: Sequence[Path], *, allow_environment_change: bool = False) -> MergedRun:
-    """Read shards and put them together; nothing is written.
-
-    Args:
-        folders: run folders, each of another shard of one plan.
-        allow_environment_change: merge although versions or machines differ.
+    """Read shards of one plan and put them together; nothing is written.
 
     Raises:
-        MergeError: a folder is no shard, two are the same one, or they are of different plans or, unless
+        MergeError: a folder is not a shard, two are the same one, or they are of different plans or, unless
             that is allowed, environments.
-        RunFolderError: one is no run folder, or a file in it is damaged.
+        RunFolderError: one is not a run folder, or a file in it is damaged.
     """
     runs = [read_run(folder) for folder in folders]
     parts = [as_part(run.path, RunFile(description=run.description, sessions=run.sessions)) for run in runs]

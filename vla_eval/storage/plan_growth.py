@@ -51,12 +51,7 @@ def _continues(new: JsonValue, old: JsonValue) -> bool:
 
 
 def command_beside(command: str, out: Path) -> str:
-    """Return the command that puts a run into a folder of its own beside `out`.
-
-    Args:
-        command: what the user typed, as a shell takes it.
-        out: the folder that holds another run.
-    """
+    """Return the command that the user typed, with a free folder next to `out`."""
     words = shlex.split(command)
     beside = (out.with_name(f"{out.name}-{n}") for n in itertools.count(2))
     free = next(path for path in beside if not path.exists())

@@ -18,12 +18,7 @@ _NAMED = re.compile(r"(?P<name>\w[\w.-]*)=(?P<checkpoints>.+)", re.DOTALL)
 
 
 class NamedCheckpoints(NamedTuple):
-    """What `NAME=A,B,C` says: one policy whose runs are different checkpoints.
-
-    Attributes:
-        name: of the policy in records and tables.
-        checkpoints: of run 0, 1, 2 …
-    """
+    """What `NAME=A,B,C` says: one policy whose runs 0, 1, 2 … are different checkpoints."""
 
     name: str
     checkpoints: tuple[str, ...]
@@ -71,11 +66,7 @@ class _Described:
 
 
 def planned_config(config: Mapping[str, Any], source: Source) -> PlannedConfig:  # Any: JSON
-    """Return the part of `config` that says which episodes there are; the other fields may be anything.
-
-    Raises:
-        VlaEvalError: of `source.error`: a field has another type.
-    """
+    """Return the part of `config` that says which episodes there are; the other fields may be anything."""
     known = {one.name: config[one.name] for one in fields(PlannedConfig) if one.name in config}
     return as_dataclass(_Described, {"config": known}, source).config
 

@@ -50,9 +50,6 @@ def collect_environment() -> dict[str, JsonValue]:
 def checkout_state(package: Path) -> dict[str, str | None]:
     """Return which source the package consists of, if it is imported from a git checkout.
 
-    Args:
-        package: the package's folder, directly below the checkout's root.
-
     Returns:
         `commit`: the full hash. `changes`: digest of what differs from that commit below `package`,
         tracked or not; None if nothing does. Both None for an installed wheel, or where git is

@@ -100,11 +100,7 @@ class RunFile:
     sessions: tuple[Session, ...]
 
     def save(self, folder: Path) -> None:
-        """Write `run.json`.
-
-        Raises:
-            StorageFullError: it could not be written; the old one is still there.
-        """
+        """Write `run.json`; after a `StorageFullError` the old one is still there."""
         data = {
             "format_version": FORMAT_VERSION,
             **_description(self.description),
@@ -132,11 +128,7 @@ class RunFile:
     def planned(
         self, folder: Path, groups: Collection[tuple[str, str, int]] | None = None
     ) -> PlannedEpisodes:
-        """Return which episodes the run has.
-
-        Args:
-            folder: of the run, for messages.
-            groups: task, policy and n_action_steps of each, where they are known.
+        """Return which episodes the run has; `groups` are known from the plan, or from the shard.
 
         Raises:
             RunFolderError: a field of the configuration has another type than a configuration's.
@@ -194,16 +186,7 @@ def environment_changed(changes: Sequence[Change], where: Path) -> RunChangedErr
 def find_changes(
     old: Mapping[str, JsonValue], new: Mapping[str, JsonValue], *, prefix: str
 ) -> tuple[Change, ...]:
-    """Compare two nested mappings value by value.
-
-    Args:
-        old: what was recorded.
-        new: what there is now.
-        prefix: what the paths begin with.
-
-    Returns:
-        One change per path whose value differs. Lists are compared as wholes.
-    """
+    """Compare two nested mappings value by value, lists as wholes; paths begin with the prefix."""
     old_texts, new_texts = dict(leaves(old, prefix=prefix)), dict(leaves(new, prefix=prefix))
     return tuple(
         Change(path, old_texts.get(path, NOT_SET), new_texts.get(path, NOT_SET))

@@ -48,14 +48,7 @@ class StoredEpisode(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredRun:
-    """What a run folder holds.
-
-    Attributes:
-        path: the folder.
-        description: what the run was started with.
-        records: one per key: the success or failure if there is one, else the last error.
-        sessions: each time that the run was started or continued.
-    """
+    """What a run folder holds; of each key the success or failure if there is one, else the last error."""
 
     path: Path
     description: RunDescription
@@ -154,12 +147,7 @@ class RunFolder:
         self.append_all([StoredEpisode(record, timing)])
 
     def append_all(self, episodes: Sequence[StoredEpisode]) -> None:
-        """Store several episodes at once; all are durable when this returns. See `append`.
-
-        Raises:
-            RunFolderError: as for one; the episodes before it are stored.
-            StorageFullError: they could not be stored; the folder is as it was before.
-        """
+        """Store several episodes at once; all are durable when this returns. For the errors see `append`."""
         sound: list[StoredEpisode] = []
         keys: set[EpisodeKey] = set()
         try:
@@ -202,12 +190,8 @@ class RunFolder:
     def note_machine(self, kind: str, facts: Mapping[str, JsonValue]) -> None:
         """Record that episodes run on a machine of another kind; their timings name it.
 
-        Args:
-            kind: its name.
-            facts: those of the environment's facts in which it may differ.
-
         Raises:
-            RunChangedError: it differs, and changes are not allowed.
+            RunChangedError: its facts differ from the environment's, and changes are not allowed.
             StorageFullError: it could not be recorded.
         """
         environment = self._run_file.description.environment
@@ -217,10 +201,7 @@ class RunFolder:
         self._keep(self._run_file.with_changes(changes))
 
     def note_device(self, device: Mapping[str, JsonValue]) -> None:
-        """Record facts about the device; what is known already must not have changed.
-
-        Args:
-            device: name -> value; names that were given before may be left out.
+        """Record facts about the device, some of which may have been recorded before.
 
         Raises:
             RunChangedError: a value differs from the recorded one, and changes are not allowed.
@@ -229,11 +210,7 @@ class RunFolder:
         self._keep(self._with_device(self._run_file, device))
 
     def note_sentence(self, line: str) -> None:
-        """Record what a policy's tokenizer made of an instruction; tables quote it.
-
-        Raises:
-            StorageFullError: it could not be recorded.
-        """
+        """Record what a policy's tokenizer made of an instruction; tables quote it."""
         if not any(line in session.sentences for session in self._run_file.sessions):
             self._keep(self._run_file.with_sentence(line))
 
@@ -275,11 +252,8 @@ class RunFolder:
 def read_run(path: Path) -> StoredRun:
     """Read a run folder without touching it; a run may be writing to it.
 
-    Args:
-        path: the folder.
-
     Raises:
-        RunFolderError: it is no run folder, or a file in it is damaged.
+        RunFolderError: it is not a run folder, or a file in it is damaged.
     """
     try:
         run_file = RunFile.load(path)

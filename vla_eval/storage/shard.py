@@ -21,7 +21,6 @@ class Shard:
 
     Attributes:
         number: from 1.
-        count: how many parts there are.
         block_size: consecutive episodes that stay together, since they run side by side.
         groups: (task, policy, n_action_steps) of all episodes of the plan, in its order.
     """
@@ -33,11 +32,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `3/8`.
-
-        Raises:
-            RecipeError: it is something else, or there is no such shard.
-        """
+        """Read `3/8`; raise `RecipeError` if there is no such shard."""
         match = WRITTEN.fullmatch(text)
         if match is None:
             raise RecipeError(
@@ -61,11 +56,7 @@ class Shard:
         return tuple(index for index in range(n_episodes) if self.holds(index))
 
     def of_blocks(self, block_size: int, n_episodes: int) -> Self:
-        """Return this shard with its block size.
-
-        Raises:
-            RecipeError: there are fewer blocks than shards, so that one would have no episode.
-        """
+        """Return this shard with its block size; raise `RecipeError` if it would have no episode."""
         n_blocks = -(-n_episodes // block_size)
         if self.count > n_blocks:
             beside = f", {block_size} of which stay together" if block_size > 1 else ""

@@ -23,13 +23,7 @@ from vla_eval.storage.shard import Shard
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShardPart:
-    """A folder that holds a shard.
-
-    Attributes:
-        path: the folder.
-        run_file: its `run.json`.
-        shard: which one it is.
-    """
+    """A folder that holds a shard, and its `run.json`."""
 
     path: Path
     run_file: RunFile
@@ -37,11 +31,7 @@ class ShardPart:
 
 
 def as_part(path: Path, run_file: RunFile) -> ShardPart:
-    """Return the shard that a folder holds.
-
-    Raises:
-        MergeError: it was not made with `--shard`.
-    """
+    """Return the shard that a folder holds; raise `MergeError` if it was not made with `--shard`."""
     shard = run_file.description.shard
     if shard is None:
         raise MergeError(

@@ -23,12 +23,7 @@ DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 class FolderStart:
-    """What a start finds at its place, to be noted before it makes anything there.
-
-    Args:
-        path: the folder that is going to be made, if it is not there.
-        own: names of what the start writes into it.
-    """
+    """What a start finds at its place, noted before it makes anything there; it writes the files of `own`."""
 
     def __init__(self, path: Path, *, own: Collection[str]) -> None:
         self._path = path
@@ -84,9 +79,8 @@ def starting(
         make: makes the folder if it is not there, after checks of its own.
 
     Raises:
-        FolderInUseError: another process has locked it.
+        RunFolderError: the folder cannot be used, or is in use.
         StorageFullError: the disk is full.
-        RunFolderError: the folder cannot be used.
     """
     let_write(path)
     try:

@@ -34,11 +34,7 @@ class Latency:
 
 
 def read_timings(folder: Path) -> dict[EpisodeKey, EpisodeTiming]:
-    """Return the timing of each episode of a run folder, the last one where it was run again.
-
-    Raises:
-        RunFolderError: a line was changed to something that is no timing.
-    """
+    """Return the timing of each episode of a run folder, the last one where it was run again."""
     path = folder / TIMINGS_FILE
     found: dict[EpisodeKey, EpisodeTiming] = {}
     for number, line in enumerate(read_lines(path).split(b"\n"), start=1):
@@ -57,12 +53,7 @@ def _source(where: str) -> Source:
 def measure_latency(
     records: Iterable[EpisodeRecord], timings: Mapping[EpisodeKey, EpisodeTiming]
 ) -> Latency | None:
-    """Return how long the inferences of some episodes took; None if no timing is known.
-
-    Args:
-        records: episodes with a result.
-        timings: by key, of the run folder that the records are from.
-    """
+    """Return how long the inferences of some episodes with results took; None if no timing is known."""
     known = [(record, timings[record.key]) for record in records if record.key in timings]
     each = [timing.inference_seconds / record.n_inferences for record, timing in known if record.n_inferences]
     if not each:

@@ -15,12 +15,7 @@ TrainingSeeds = Mapping[str, Mapping[str, Sequence[SeedRange]]]
 
 
 def seen_in_training(keys: Iterable[EpisodeKey], known: TrainingSeeds) -> list[str]:
-    """Return a sentence for each policy and task with seeds that are those of demonstrations.
-
-    Args:
-        keys: the episodes.
-        known: the seeds that policies were trained on, as far as they are known.
-    """
+    """Return a sentence for each policy and task with seeds that are known to be those of demonstrations."""
     seen: dict[tuple[str, str], set[int]] = defaultdict(set)
     asked: dict[tuple[str, str], set[int]] = defaultdict(set)
     for key in keys:

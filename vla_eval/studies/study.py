@@ -27,11 +27,9 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """A table and its folder.
+    """The rows and tasks of a table that were asked for, and its folder.
 
     Attributes:
-        table: the rows and tasks that were asked for.
-        out: folder of all its trainings and evaluations.
         adapters: of a table of tiny random models: row -> adapter of its own; else empty.
         command: what the user typed, for the record.
     """
@@ -50,15 +48,9 @@ class Study:
 def open_study(
     name: str, *, tasks: Sequence[str], rows: Sequence[str], out: Path | None, is_tiny: bool, command: str
 ) -> Study:
-    """Read a table, or a part of it.
+    """Read a table by its file, or its name in `configs/`; of some tasks and rows, or all if none is named.
 
-    Args:
-        name: file, or name in `configs/`.
-        tasks: of the table; none: all.
-        rows: of the table; none: all.
-        out: None: a folder in `runs/`.
-        is_tiny: with tiny random models in place of those of the rows.
-        command: what the user typed.
+    `out` is by default a folder in `runs/`; `is_tiny` puts tiny random models in place of the rows'.
 
     Raises:
         VlaEvalError: there is no such table, row or task.
@@ -95,11 +87,7 @@ def finetune_study(
     say: Say,
     is_stopping: Callable[[], bool],
 ) -> bool:
-    """Run all fine-tunings that are not finished; leave out those that another process has begun.
-
-    Returns:
-        Whether it came to its end; False if it was asked to stop.
-    """
+    """Run all fine-tunings that are not finished and not begun elsewhere; False if asked to stop."""
     everything = finetunings(study.table, study.out)
     missing = unfinished(study)
     say(describe_effort(study.table, n_finished=len(everything) - len(missing)))

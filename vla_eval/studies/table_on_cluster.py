@@ -27,19 +27,9 @@ def finetune_on(
     say: Callable[[str], None],
     is_stopping: Callable[[], bool],
 ) -> bool:
-    """Run the fine-tunings; a GPU each, where there are GPUs.
+    """Run the fine-tunings; a GPU each, where there are GPUs. Return False if asked to stop.
 
-    Args:
-        backend: where they run.
-        todo: the fine-tunings.
-        logs: folder for what the workers write, on storage that all machines share.
-        is_tiny: build lerobot's π0 in its tiny form.
-        command: what the user typed, for the record.
-        say: gets lines for a person.
-        is_stopping: asked from time to time, whether to stop.
-
-    Returns:
-        Whether it came to its end.
+    `logs` is a folder on storage that all machines share. `is_tiny` builds lerobot's π0 in its tiny form.
 
     Raises:
         TrainingError: one of them failed, after the others were finished; the message names all.

@@ -34,24 +34,15 @@ class Sharing:
     process: int = 0
 
     def position(self, step: int, n_samples: int) -> Position:
-        """Return where a training continues after so many steps.
-
-        Args:
-            step: steps done, by as many processes.
-            n_samples: samples of an epoch.
-        """
+        """Return where a training continues after so many steps, by as many processes."""
         state = compute_sampler_state(step, n_samples, self.batch_size, self.n_processes)
         return Position(epoch=state["epoch"], n_taken=state["start_index"])
 
 
 class StepBatches(Sampler[list[Any]]):
-    """Yields this process's indices for each step, without end.
+    """Yields this process's indices for each step, from `start` on, without end.
 
-    Args:
-        sampler: the order of an epoch.
-        start: where to begin.
-        sharing: which batches are this process's.
-        numbered: yield (index, epoch, number in the epoch) for each sample, see `SeededSamples`.
+    `numbered`: yield (index, epoch, number in the epoch) for each sample, see `SeededSamples`.
     """
 
     def __init__(

@@ -31,8 +31,7 @@ def write_checkpoint(
         job: see there.
         step: counted from 1.
         accelerator: accelerate's `Accelerator`.
-        parts: `cfg`, `policy`, `optimizer`, `scheduler`, `preprocessor`, `postprocessor`, see lerobot's
-            `save_checkpoint`.
+        parts: `cfg`, `policy`, `optimizer`, …, see lerobot's `save_checkpoint`.
         scaler: torch's `GradScaler` of the training; enabled in float16 alone.
 
     Returns:
@@ -90,11 +89,7 @@ def _recurrent_weights_apart(policy: nn.Module) -> Iterator[None]:
 
 
 def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: bool) -> None:
-    """Load the state of a training, which is safetensors and JSON, and that of the random generators.
-
-    Raises:
-        TrainingError: it is damaged.
-    """
+    """Load the state of a training, which is safetensors and JSON, and that of the random generators."""
     try:
         train_utils.load_training_state(folder, optimizer, scheduler, load_optimizer=load_optimizer)
     except Exception as exc:  # lerobot, torch and safetensors raise what they like

@@ -65,11 +65,6 @@ def chosen_episodes(dataset: OpenDataset, recipe: FinetuneRecipe, policy: Any) -
     Unless the recipe says otherwise, failed episodes are left out, except for a policy that is trained on
     rewards, which distinguish them.
 
-    Args:
-        dataset: all of it.
-        recipe: of the policy.
-        policy: its LeRobot configuration.
-
     Raises:
         DatasetError: no episode would be left.
     """
@@ -92,24 +87,14 @@ def about_failures(dataset: OpenDataset) -> str:
 
 
 def n_with_decisions(actions: np.ndarray[Any, Any], lengths: Sequence[int]) -> int:
-    """Return in how many episodes the arm begins to move after it waited.
-
-    Args:
-        actions: (N, A) of all frames.
-        lengths: frames of each episode.
-    """
+    """Return in how many episodes the arm begins to move after it waited; actions are (N, A)."""
     bounds = pairwise(np.cumsum([0, *lengths]).tolist())
     rows = torch.from_numpy(actions.astype(np.float32))
     return sum(bool(decisions(rows[first:stop]).any()) for first, stop in bounds)
 
 
 def about_decisions(dataset: OpenDataset, policy: Any) -> str | None:
-    """Return a line for a person; None for a policy that does not weigh decisions.
-
-    Args:
-        dataset: to train on.
-        policy: its LeRobot configuration.
-    """
+    """Return a line for a person; None for a policy that does not weigh decisions."""
     share = getattr(policy, "decision_share", 0.0)
     if not share:
         return None

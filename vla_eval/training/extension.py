@@ -28,13 +28,7 @@ class OtherRate(NamedTuple):
 
 
 def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int) -> None:
-    """Refuse another number of steps, unless the steps that are done would have been the same.
-
-    Args:
-        job: with the number of steps that is asked for.
-        config: what it was made of.
-        before: the number that there was.
-        done: steps that are done.
+    """Refuse another number of steps than `before`, unless the steps that are done would have been the same.
 
     Raises:
         TrainingError: they would not, or more are done than are asked for.
@@ -58,13 +52,9 @@ def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int
 
 
 def first_other_rate(policy: Any, before: int, now: int, *, n_steps: int) -> OtherRate | None:
-    """Compare the schedules of two numbers of steps, rate by rate; None: they begin alike.
+    """Compare the schedules of two numbers of steps over the first `n_steps`; None: they begin alike.
 
-    Args:
-        policy: lerobot's configuration.
-        before: total number of steps.
-        now: another one.
-        n_steps: how many steps to compare, from the first. The rate of a step is set by the one before it.
+    The rate of a step is set by the one before it.
     """
     pairs = zip(_rates(policy, before), _rates(policy, now), strict=False)
     for step, (rate, other) in zip(range(1, n_steps + 1), pairs, strict=False):

@@ -229,10 +229,9 @@ def _open(job: TrainingJob, config: FinetuneConfig, command: str) -> Path | None
 
 @contextlib.contextmanager
 def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[Path | None]:
-    """Open the run folder; a mistake found before the first step leaves none behind.
+    """Open the run folder, and give the checkpoint to resume from, None at the beginning.
 
-    Yields:
-        The checkpoint to resume from; None at the beginning.
+    A mistake that is found before the first step leaves no folder behind.
     """
 
     def make(folder: Path) -> None:

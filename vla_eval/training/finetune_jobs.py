@@ -14,13 +14,7 @@ WORKER_MODULE = "vla_eval.training.worker"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneJob:
-    """One fine-tuning.
-
-    Attributes:
-        config: what to train on what.
-        command: what the user typed, for the record.
-        name: what messages call it.
-    """
+    """One fine-tuning; `command` is what the user typed, `name` what messages call it."""
 
     config: FinetuneConfig
     command: str

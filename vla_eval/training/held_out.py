@@ -41,12 +41,9 @@ class HeldOut:
     """The evaluations of one training.
 
     Attributes:
-        settings: what is evaluated when.
-        task: the task's id.
         out: run folder of the training.
         last_step: its last step, whose checkpoint is evaluated in any case.
         on_metrics: takes one line of metrics.
-        say: gets lines for a person.
         is_stopping: an evaluation ends early once it says yes, without a figure; `catch_up` resumes it.
         said: warnings of earlier checkpoints' evaluations, without the checkpoint's name.
     """
@@ -72,11 +69,7 @@ class HeldOut:
         return step % self.settings.every_steps == 0 or step == self.last_step
 
     def catch_up(self, done: Iterable[Mapping[str, object]]) -> None:
-        """Evaluate the checkpoints that are there and have no result, until asked to stop.
-
-        Args:
-            done: lines of metrics.
-        """
+        """Evaluate the checkpoints without a result among these lines of metrics, until asked to stop."""
         for checkpoint in self.missing(done):
             if not self.is_stopping():
                 self.evaluate(checkpoint)
@@ -205,12 +198,6 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "Op
 def check_asked(settings: HeldOutConfig, task: str, facts: TrainingFacts, *, policy: str) -> None:
     """Refuse an evaluation that gives a policy something else than it is trained with.
 
-    Args:
-        settings: of the evaluation.
-        task: the task's id.
-        facts: what the policy is trained with.
-        policy: its name, for the message.
-
     Raises:
         SpecMismatchError: it does, in a way that every evaluation would refuse after hours of training.
     """
@@ -221,13 +208,7 @@ def check_asked(settings: HeldOutConfig, task: str, facts: TrainingFacts, *, pol
 
 
 def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> list[str]:
-    """Return what a person should know of evaluations before the training, line by line.
-
-    Args:
-        facts: what the policy is trained with.
-        task: the task of the held-out evaluation; None: there is none.
-        policy: its name.
-    """
+    """Return what a person should know of evaluations before the training; `task` is the held-out one."""
     if task is not None:
         asked = instruction_for(task_spec(task))
         sentence = about_sentence(facts.sentences, asked, policy=policy, task=task)

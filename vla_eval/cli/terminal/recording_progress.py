@@ -1,7 +1,7 @@
 """Progress of a recording or a replay on standard error: a bar or a line per phase."""
 
 import sys
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class RecordingProgress:
-    """Implements `RecordingObserver` and `ReplayObserver`; all but mismatches goes to standard error."""
+    """A `RecordingObserver`; all but mismatches goes to standard error."""
 
     def __init__(self, stop: StopRequest, *, json_progress: int | None = None) -> None:
         """Take the request to stop, and where lines for other programs go."""
@@ -27,9 +27,7 @@ class RecordingProgress:
         """Write a sentence to standard error."""
         self._bar.write(sentence)
 
-    def on_phase(
-        self, task: str, phase: "Phase | Literal['replaying']", *, n_done: int, n_total: int
-    ) -> None:
+    def on_phase(self, task: str, phase: "Phase", *, n_done: int, n_total: int) -> None:
         """Begin a new bar, or a new line."""
         self._lines.on_phase(task, phase, n_done=n_done, n_total=n_total)
         self._bar.begin(n_done=n_done, n_total=n_total, title=f"{task}: {phase}")

@@ -25,13 +25,9 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """One rule.
+    """What is expected, the answer to what breaks it, and what the user can do.
 
-    Attributes:
-        name: what is expected, for the table in the docs.
-        answer: to what breaks it.
-        check: yields a sentence for each kind of breach: where, expected, found.
-        remedy: what the user can do.
+    `check` yields a sentence for each kind of breach: where, expected, found.
     """
 
     name: str
@@ -54,12 +50,7 @@ class Finding:
 def find_breaches(
     demonstrations: Demonstrations, *, rules: Sequence[Rule] | None = None
 ) -> tuple[Finding, ...]:
-    """Return all breaches of rules, in their order.
-
-    Args:
-        demonstrations: what is checked.
-        rules: None: all.
-    """
+    """Return all breaches of rules, by default of all of them, in their order."""
     return tuple(
         Finding(rule=rule, sentence=sentence)
         for rule in (RULES if rules is None else rules)

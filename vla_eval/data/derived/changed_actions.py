@@ -39,16 +39,13 @@ from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 def copy_with_actions(
     source: Path, path: Path, episodes: Sequence[RecordedEpisode], recipe: DatasetRecipe
 ) -> DatasetFacts:
-    """Write a dataset with the images and states of another one; it appears whole.
+    """Write a dataset with the images and states of another one; it appears whole. Return what it is.
 
     Args:
         source: the other dataset; it has the same episodes, with other actions.
         path: the new folder.
         episodes: what the manifest will say.
-        recipe: the recipe of the new one; it says which actions are stored.
-
-    Returns:
-        What the new dataset is.
+        recipe: says which actions are stored.
 
     Raises:
         DatasetError: the folder is there already, or the source is damaged.

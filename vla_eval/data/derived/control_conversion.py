@@ -6,6 +6,7 @@ episode that does not succeed there is left out.
 """
 
 import dataclasses
+import operator
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from vla_eval.data.manifest import RecordedEpisode, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.jobs import TaskPlan
 from vla_eval.data.recording.plan import plan_recording
-from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
+from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, record
 from vla_eval.data.recording.seed_queue import Selection
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.replaying.replay import check_task_versions, recipe_of
@@ -35,11 +36,10 @@ from vla_eval.workers.local import LOCAL
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Converted:
-    """What has come of a conversion.
+    """The outcome of a conversion.
 
     Attributes:
-        dataset: the new dataset.
-        n_episodes: episodes of the old one.
+        n_episodes: episodes of the old dataset.
         n_same_states: how many of the new ones have the old one's states, bit for bit.
         left_out: a sentence for each episode that is not in the new one.
     """
@@ -59,21 +59,10 @@ def convert_control_mode(
     workers: int | Literal["auto"] = "auto",
     backend: Backend = LOCAL,
 ) -> Converted | None:
-    """Write OUT/TASK with the episodes of a recorded dataset in another control mode.
+    """Write OUT/TASK with the episodes of a recorded dataset in another control mode; None if asked to stop.
 
     Where all episodes survive with the states that were recorded, bit for bit, the images are those of the
     recording. Otherwise they are rendered again; after an interruption the same call resumes the rendering.
-
-    Args:
-        dataset: the folder of one recorded dataset.
-        mode: the control mode of the new one.
-        out: another folder.
-        observer: gets the progress.
-        workers: processes that render.
-        backend: where they run.
-
-    Returns:
-        None if the observer asked to stop.
 
     Raises:
         UnknownNameError: there is no such mode.
@@ -104,12 +93,15 @@ def convert_control_mode(
     if n_same_states == len(episodes):
         made = _copied(dataset, out / plan.task, episodes, kept, recipe, begun=begun)
         return Converted(dataset=made, n_episodes=len(episodes), n_same_states=n_same_states, left_out=())
-    summary = run_plan(
+    summary = record(
         recipe,
-        plan_recording(recipe),
         out=out,
         observer=observer,
-        selections={plan.task: Selection(kept=tuple(kept), failed=tuple(sorted(failed, key=_seed)))},
+        selections={
+            plan.task: Selection(
+                kept=tuple(kept), failed=tuple(sorted(failed, key=operator.attrgetter("seed")))
+            )
+        },
         source=manifest_sha256(dataset),
         backend=backend,
     )
@@ -145,10 +137,6 @@ def _copied(
     ]
     copy_with_actions(dataset, path, changed, recipe)
     return RecordedDataset.read(path, seconds=time.monotonic() - begun)
-
-
-def _seed(one: Attempt) -> int:
-    return one.seed
 
 
 def _env_arguments(recipe: DatasetRecipe, mode: str) -> dict[str, object]:

@@ -31,12 +31,7 @@ def convert_episode(
 ) -> tuple[Attempt, str]:
     """Return an episode in the mode of the new environment, and why it does not survive, or an empty text.
 
-    Args:
-        old: the environment of the recording.
-        new: the same with another control mode.
-        episode: what the manifest says of it.
-        columns: the numbers of the recorded dataset.
-        plan: what is recorded.
+    `old` is the environment of the recording, `columns` are the numbers of the recorded dataset.
     """
     aims, log = _aims(old, episode)
     rows = rows_of_episode(columns, episode.episode_index)
@@ -91,11 +86,10 @@ class _AimLog:
     def wants_images(self, step: int) -> bool:
         return False
 
-    def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
-        pass
+    def _ignore(self, *_: object) -> None:
+        """Do nothing."""
 
-    def on_inference(self, episode: EpisodeStart, step: int, chunk: ActionChunk) -> None:
-        pass
+    on_reset = on_inference = _ignore
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
         self.aims.append(self._env.joint_targets(episode.slot))
@@ -105,12 +99,6 @@ class AimFollower:
     """A policy that aims, in another control mode, where the arm was to go in a recorded episode.
 
     Beyond the recorded steps it continues to aim at the last place: a mode with narrower bounds needs longer.
-
-    Args:
-        aims: (n_steps, 7) joint positions, rad.
-        episode: the recorded episode.
-        old_mode: its control mode.
-        mode: the other one.
 
     Attributes:
         intended: the actions that aim where the expert wanted to go before noise was added, step by step.

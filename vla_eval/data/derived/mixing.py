@@ -30,11 +30,7 @@ from vla_eval.storage.durable import storage_full
 
 
 def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
-    """Write one dataset of the episodes of several, in their order; return what it is.
-
-    Args:
-        roots: folders of complete datasets, at least two.
-        out: the folder to make.
+    """Write one dataset of the episodes of two or more complete ones, in their order; return what it is.
 
     Raises:
         DatasetError: one is not complete, its replay found a mismatch, two are the same or differ in what a

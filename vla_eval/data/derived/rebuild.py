@@ -12,8 +12,7 @@ from typing import Literal
 from vla_eval.data.facts import read_facts
 from vla_eval.data.manifest import FAILED_FILE, RecordedEpisode, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
-from vla_eval.data.recording.plan import plan_recording
-from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
+from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, record
 from vla_eval.data.recording.seed_queue import Selection
 from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.replaying.replay import check_task_versions, recipe_of
@@ -38,17 +37,10 @@ def rebuild(
     workers: int | Literal["auto"] = "auto",
     backend: Backend = LOCAL,
 ) -> Rebuilt | None:
-    """Rebuild a dataset in OUT/TASK; after an interruption the same call resumes.
-
-    Args:
-        dataset: the old dataset; only its manifest and its recipe are read.
-        out: another folder.
-        observer: gets the progress.
-        workers: processes.
-        backend: where they run.
+    """Rebuild a dataset in OUT/TASK from its manifest; after an interruption the same call resumes.
 
     Returns:
-        What has come of it; None if the observer asked to stop.
+        The new dataset; None if the observer asked to stop.
 
     Raises:
         DatasetError: there is no manifest or recipe, or the task has changed since.
@@ -65,9 +57,8 @@ def rebuild(
         kept=tuple(_attempt(episode) for episode in episodes),
         failed=tuple(failed_attempt(one.seed, one.n_steps) for one in failed),
     )
-    summary = run_plan(
+    summary = record(
         recipe,
-        plan_recording(recipe),
         out=out,
         observer=observer,
         selections={task: selection},
@@ -84,16 +75,7 @@ def rebuild(
 
 
 def _attempt(episode: RecordedEpisode) -> Attempt:
-    return Attempt(
-        seed=episode.seed,
-        success_step=episode.success_step,
-        n_steps=episode.n_steps,
-        cue_steps=episode.cue_steps,
-        delay_steps=episode.delay_steps,
-        actions=episode.actions,
-        intended_actions=episode.intended_actions,
-        states_sha256=episode.states_sha256,
-    )
+    return Attempt(**{one.name: getattr(episode, one.name) for one in dataclasses.fields(Attempt)})
 
 
 def failed_attempt(seed: int, n_steps: int) -> Attempt:

@@ -51,10 +51,6 @@ def find_source(path: Path) -> Source:
 def convert_to_npz(source: Source, out: Path) -> int:
     """Write the paper's layout, one file per episode; return how many.
 
-    Args:
-        source: must have the 25 joints numbers, reward, success and done.
-        out: the folder to make.
-
     Raises:
         DatasetError: `out` exists, or the source lacks something that the layout has, or breaks a rule.
     """
@@ -70,16 +66,11 @@ def convert_to_npz(source: Source, out: Path) -> int:
 def convert_to_lerobot(
     source: Source, out: Path, *, state: StateKind, changes: Changes | None = None
 ) -> ImportFacts:
-    """Write a LeRobotDataset with what the source has, under our names.
-
-    Args:
-        source: anything but a recording of this project.
-        out: the folder to make.
-        state: which proprioception `observation.state` is.
-        changes: what is to be converted on the way.
+    """Write a LeRobotDataset with what the source has, under our names, after the changes that are asked for.
 
     Raises:
-        DatasetError: `out` exists, the source is damaged, breaks a rule, or lacks what was asked for.
+        DatasetError: `out` exists, the source is a recording of this project, is damaged, breaks a rule, or
+            lacks what was asked for.
     """
     if (source.path / RECORDING_FILE).is_file():
         raise DatasetError(f"{source.path}: is a LeRobotDataset of this project already.")

@@ -40,7 +40,6 @@ class SourceEpisode:
     """One demonstration as its source has it.
 
     Attributes:
-        name: for messages and records: a file's name, or the episode's number.
         numbers: field, by our name -> (T,) or (T, D), in the source's type.
         sentences: (T,) the language instruction at each frame; None if the source has none.
         image_sizes_px: height and width of the base and the wrist camera.
@@ -63,16 +62,13 @@ class SourceEpisode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Demonstrations that were found.
+    """Demonstrations that were found; one or more episodes, which all have the same numbers.
 
     Attributes:
-        path: their folder.
         layout: see docs/dataset_tools.md.
         files: what they were read from.
-        fps: frames per second.
-        episodes: one or more; all have the same numbers.
         left_out: fields of the source that have no place in ours.
-        remarks: what was assumed of it.
+        remarks: what was assumed.
     """
 
     path: Path

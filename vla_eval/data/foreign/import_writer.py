@@ -43,16 +43,10 @@ MAX_FRAMES = 2048  # lerobot drops frames without an error where its queue is fu
 
 
 class ImportWriter:
-    """Writes episodes of one source, whose numbers have the types of our fields.
-
-    Args:
-        draft: the folder to make.
-        source: where the episodes are from.
-        task: whose sentence was used where the source had none.
-        state: which proprioception `observation.state` is.
+    """Writes episodes of one source, whose numbers have the types of our fields, as a dataset at `draft`.
 
     Raises:
-        DatasetError: an episode is too long, or the source lacks that proprioception.
+        DatasetError: an episode is too long, or the source lacks the proprioception of `state`.
     """
 
     def __init__(self, draft: Path, source: Source, *, task: TaskSpec | None, state: StateKind) -> None:
@@ -92,12 +86,7 @@ class ImportWriter:
         )
 
     def finish(self, *, converted: tuple[str, ...], kept: tuple[str, ...]) -> ImportFacts:
-        """Close the dataset and write what it is.
-
-        Args:
-            converted: see `ImportFacts`.
-            kept: see `ImportFacts`.
-        """
+        """Close the dataset and write what it is; for the arguments see `ImportFacts`."""
         self._dataset.finalize()
         write_exact_statistics(self._draft, self._histograms)
         mode, root = self._source.action.control_mode, self._source.path

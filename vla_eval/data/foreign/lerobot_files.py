@@ -73,11 +73,7 @@ def lerobot_source(opened: LocalDataset) -> Source:
 
 
 def lerobot_layout(features: Mapping[str, Any], *, where: Path) -> Layout:  # Any: lerobot's plain data
-    """Return which of the layouts a LeRobotDataset has.
-
-    Raises:
-        DatasetError: none.
-    """
+    """Return which of the layouts a LeRobotDataset has, or raise `DatasetError`."""
     for layout, cameras in LEROBOT_CAMERAS.items():
         if set(cameras) <= set(features):
             return layout
@@ -144,12 +140,7 @@ def _states(
 def _check_vector(
     root: Path, name: str, columns: Columns, features: Mapping[str, Any], lengths: tuple[int, ...]
 ) -> tuple[str, ...]:
-    """Return what is assumed of a field of numbers.
-
-    Raises:
-        DatasetError: it is not a vector of one of the lengths, or its names are those of joints where
-            a pose is expected.
-    """
+    """Return what is assumed of a vector; refuse other lengths, and joints where a pose is expected."""
     rows = columns[name]
     if rows.ndim != 2 or rows.shape[1] not in lengths or rows.dtype.kind not in "biuf":
         wanted = " or ".join(map(str, lengths))

@@ -56,11 +56,7 @@ def npz_files(folder: Path) -> list[Path]:
 
 
 def npz_source(folder: Path, files: Sequence[Path]) -> Source:
-    """Read a folder of such files, without their images.
-
-    Raises:
-        DatasetError: see `read_npz`; or the files differ in what they hold.
-    """
+    """Read a folder of such files, without their images; errors as `read_npz`."""
     read = [read_npz(file) for file in files]
     has_joints = JOINTS_KEY in read[0][0].numbers
     return Source(

@@ -27,6 +27,7 @@ from vla_eval.strict.renamed import warn_renamed
 
 Storage = Literal["disk", "ram"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
+OF_SOURCE = ("num_episodes", "features", "fps", "hf_dataset", "absolute_to_relative_idx")
 TENSOR_TYPES = {"b": np.bool_, "i": np.int64, "u": np.int64, "f": np.float32}
 
 
@@ -94,31 +95,11 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         """Number of samples."""
         return int(self._bounds.shape[0])
 
-    @property
-    def num_episodes(self) -> int:
-        """Number of selected episodes."""
-        return int(self.source.num_episodes)
-
-    @property
-    def features(self) -> Any:
-        """The fields, as lerobot describes them."""
-        return self.source.features
-
-    @property
-    def fps(self) -> int:
-        """Frames per second."""
-        return int(self.source.fps)
-
-    @property
-    def hf_dataset(self) -> Any:
-        """The table of all that is not an image."""
-        return self.source.hf_dataset
-
-    @property
-    def absolute_to_relative_idx(self) -> dict[int, int] | None:
-        """Frame number in the whole dataset -> number here, where only some episodes are selected."""
-        mapping: dict[int, int] | None = self.source.absolute_to_relative_idx
-        return mapping
+    def __getattr__(self, name: str) -> Any:
+        """Return what lerobot's training loop reads of a dataset, too."""
+        if name not in OF_SOURCE:
+            raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
+        return getattr(self.source, name)
 
     def __len__(self) -> int:
         return self.num_frames

@@ -38,14 +38,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeRows:
-    """One episode's frames: rows [first, stop) of the loaded dataset, and when they were taken.
-
-    Attributes:
-        index: the episode's number in the dataset.
-        first: row of its first frame.
-        stop: row after its last frame.
-        timestamps_s: (stop - first) seconds since the episode's beginning.
-    """
+    """One episode's frames: rows [first, stop) of the loaded dataset, and seconds since its beginning."""
 
     index: int
     first: int
@@ -55,13 +48,7 @@ class EpisodeRows:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSource:
-    """What has to be decoded: a loaded dataset's videos.
-
-    Attributes:
-        dataset: the `LeRobotDataset`.
-        shapes: camera key -> (channels, height, width).
-        episodes: the selected episodes, in the order of their rows.
-    """
+    """What has to be decoded: the videos of a loaded `LeRobotDataset`, and the episodes that are selected."""
 
     dataset: Any  # LeRobotDataset: untyped
     shapes: Mapping[str, tuple[int, int, int]]
@@ -79,11 +66,9 @@ class FrameSource:
 
 
 def episode_rows(dataset: Any, columns: Mapping[str, Any]) -> list[EpisodeRows]:
-    """Return where the episodes of a loaded dataset are.
+    """Return where the episodes of a loaded `LeRobotDataset` are.
 
-    Args:
-        dataset: a `LeRobotDataset`, of which some episodes may be selected.
-        columns: its `index`, `episode_index` and `timestamp`, as arrays or tensors of loaded rows.
+    `columns` has `index`, `episode_index` and `timestamp`, as arrays or tensors of the loaded rows.
 
     Raises:
         DatasetError: the frames of an episode do not follow each other.
@@ -200,12 +185,8 @@ def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
 def frames_on_disk(source: FrameSource, cache: Path | None) -> dict[str, Path]:
     """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet.
 
-    The folder appears by a rename, so half a cache is never seen; of several processes that ask at once
-    one decodes and the others wait.
-
-    Args:
-        source: what to decode.
-        cache: a folder; one named after the dataset's digest is made in it. None: the user's cache.
+    The folder, in `cache` or by default the user's, appears by a rename, so half a cache is never seen; of
+    several processes that ask at once one decodes and the others wait.
 
     Raises:
         DatasetError: there is not enough room, or a video cannot be read.

@@ -30,11 +30,6 @@ class RememberedFramesDataset(DecodedFramesDataset):
     With `memory.segments` each field has an axis of time: the frames of the episode at which the policy
     writes its memory, the sample's own frame last. Before the episode's beginning there is its first frame
     again, marked in `SEGMENT_PADDING_KEY`.
-
-    Args:
-        source: a dataset that can be read.
-        memory: what a sample has beside its own frame.
-        options: of `DecodedFramesDataset`.
     """
 
     def __init__(self, source: LeRobotDataset, memory: SampleMemory, **options: Any) -> None:

@@ -37,17 +37,7 @@ ONE_BY_ONE = ChunkingSpec(n_action_steps=1)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attempt:
-    """What the expert did with one seed.
-
-    Attributes:
-        seed: the episode's seed.
-        success_step: control steps executed when the success rule first held; None if it never did.
-        n_steps: control steps executed.
-        cue_steps, delay_steps: lengths of the first two phases.
-        actions: the executed actions, as `manifest.encode_actions` writes them.
-        intended_actions: what the expert asked for; None where that is what was executed.
-        states_sha256: see `states_digest`.
-    """
+    """What the expert did with one seed; for the fields see `RecordedEpisode`."""
 
     seed: Count
     success_step: Positive | None
@@ -61,11 +51,7 @@ class Attempt:
 
 @dataclass(slots=True)
 class EpisodeLog:
-    """A `StepObserver` that keeps all results of one episode.
-
-    Args:
-        n_images: request the images of this many first observations.
-    """
+    """A `StepObserver` that keeps all results of one episode, and asks for images of the first `n_images`."""
 
     n_images: int = 0
     results: list[StepResult] = field(default_factory=list)
@@ -116,10 +102,8 @@ class NoisyEnv:
     The expert sees where it has got to and corrects it: its answer is what a policy learns to recover
     by. The gripper gets no noise, since no expert corrects its width.
 
-    Args:
-        env: the environment.
-        std: standard deviation of the noise in each dimension of the arm, in units of a delta action; in a
-            mode that is given m and rad, a tenth of it.
+    `std` is the standard deviation in each dimension of the arm, in units of a delta action; in a mode
+    that is given m and rad, a tenth of it.
     """
 
     def __init__(self, env: SimEnv, std: float) -> None:
@@ -213,17 +197,9 @@ def replay_actions(
     heartbeat: Callable[[Stage], None],
     with_pictures: bool,
 ) -> EpisodeLog:
-    """Execute recorded actions.
+    """Execute recorded actions, (n_steps, A); return all results, from reset on.
 
-    Args:
-        env: the environment; to render images it must have been made with cameras.
-        start: the episode; its horizon is the number of actions.
-        actions: (n_steps, A).
-        heartbeat: called with what is about to be done.
-        with_pictures: whether every observation before an action shall have images.
-
-    Returns:
-        All results, from reset on.
+    With images, every observation before an action has them, from an environment that has cameras.
     """
     log = EpisodeLog(n_images=len(actions) if with_pictures else 0)
     settings = RolloutSettings(chunking=ONE_BY_ONE)

@@ -19,7 +19,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
@@ -57,13 +56,8 @@ class RecordingFolder:
     def open(cls, out: Path, description: RunDescription, *, allow_environment_change: bool) -> Self:
         """Start a recording in a folder, or resume the one that is there.
 
-        Args:
-            out: the folder; it is made if it is not there.
-            description: recipe and environment; they must be what they were before.
-            allow_environment_change: resume although commit, versions or machine have changed.
-
         Raises:
-            RunChangedError: recipe or environment are not what they were; the message says in what.
+            RunChangedError: recipe or environment are not what they were, and that is not allowed.
             RunFolderError: another process records there, or the folder is somebody else's.
             StorageFullError: the disk is full.
         """
@@ -109,11 +103,7 @@ class RecordingFolder:
         return device_of(self._run_file)
 
     def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
-        """Record the device; all images of a dataset must come from one device.
-
-        Raises:
-            RunChangedError: it is another one than before, and changes are not allowed.
-        """
+        """Record the device: all images of a dataset come from one, or `RunChangedError` is raised."""
         changes = device_changes(self._run_file, device)
         check_allowed(changes, shown=self.out, allowed=allow_change)
         if dict(device) != self.device:
@@ -124,14 +114,6 @@ class RecordingFolder:
         """Return the folder of the workers' logs."""
         return _made(self.out / STATE_FOLDER / "logs")
 
-    def dataset(self, task: str) -> Path:
-        """Return where the dataset of a task appears."""
-        return self.out / task
-
-    def is_finished(self, task: str) -> bool:
-        """Whether the dataset of a task is there; it appears only when it is complete."""
-        return (self.dataset(task) / RECORDING_FILE).exists()
-
     def shard(self, task: str, index: int) -> Path:
         """Return where a shard appears."""
         path = shard_path(self.out, task, index)
@@ -139,38 +121,22 @@ class RecordingFolder:
         return path
 
     def attempts(self, task: str) -> dict[int, Attempt]:
-        """Return seed -> attempt of all that is known.
-
-        Raises:
-            DatasetError: the file is damaged.
-        """
+        """Return seed -> attempt; errors as `read_attempts`."""
         cut_tail(self._task_folder(task) / ATTEMPTS_FILE)
         return read_attempts(self.out, task)
 
     def append(self, task: str, attempt: Attempt) -> None:
-        """Keep an attempt; it is durable when this returns.
-
-        Raises:
-            StorageFullError: it could not be stored.
-        """
+        """Keep an attempt; it is durable when this returns."""
         if task not in self._attempts:
             self._attempts[task] = LineFile(self._task_folder(task) / ATTEMPTS_FILE, durable=True)
         self._attempts[task].append(json.dumps(dataclasses.asdict(attempt)))
-
-    def remove_shards(self, task: str) -> None:
-        """Remove what is not needed once the dataset is there."""
-        remove_shards(self.out, task)
 
     def _task_folder(self, task: str) -> Path:
         return _made(self.out / STATE_FOLDER / task)
 
 
 def read_attempts(out: Path, task: str) -> dict[int, Attempt]:
-    """Return seed -> attempt of a recording, without touching it.
-
-    Raises:
-        DatasetError: the file is damaged.
-    """
+    """Return seed -> attempt of a recording, without touching it, or raise `DatasetError`."""
     path = out / STATE_FOLDER / task / ATTEMPTS_FILE
     found = [_attempt(line, where=where) for line, where in whole_lines(read_lines(path), path)]
     return {one.seed: one for one in found}

@@ -27,14 +27,7 @@ class SetupKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskPlan:
-    """What is recorded of one task.
-
-    Attributes:
-        group: task, environment and expert, as an evaluation has them.
-        task_version: version of the task's rules.
-        expert_version: version of the expert's recipe.
-        recipe: the recipe of the dataset.
-    """
+    """What is recorded of one task: environment and expert as in an evaluation, and the recipe."""
 
     group: EpisodeGroup
     task_version: int
@@ -59,21 +52,27 @@ class TaskPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AttemptJob:
-    """Let the expert try one seed; the answer is an `Attempt`."""
+class _TaskJob:
+    """A job of one task; see `workers.Job`."""
 
     plan: TaskPlan
-    seed: int
 
     @property
     def setup_key(self) -> SetupKey:
-        """See `workers.Job`."""
-        return SetupKey(self.plan.task, "attempt")
+        """Jobs of one class share an environment."""
+        return SetupKey(self.plan.task, type(self).__name__)
 
     @property
     def n_items(self) -> int:
-        """One seed."""
+        """One seed, or one dataset."""
         return 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttemptJob(_TaskJob):
+    """Let the expert try one seed; the answer is an `Attempt`."""
+
+    seed: int
 
     @property
     def name(self) -> str:
@@ -82,18 +81,12 @@ class AttemptJob:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShardJob:
+class ShardJob(_TaskJob):
     """Render and encode some attempts; the answer is a `ShardWritten`."""
 
-    plan: TaskPlan
     path: Path
     first_index: int
     attempts: tuple[Attempt, ...]
-
-    @property
-    def setup_key(self) -> SetupKey:
-        """See `workers.Job`."""
-        return SetupKey(self.plan.task, "render")
 
     @property
     def n_items(self) -> int:
@@ -107,32 +100,18 @@ class ShardJob:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JoinJob:
-    """Put the shards of a task together; the answer is a `DatasetWritten`.
+class JoinJob(_TaskJob):
+    """Put all shards of a task together, in order; the answer is a `DatasetWritten`.
 
     Attributes:
-        plan: what was recorded.
         path: where the dataset is to appear; its draft is written in the folder of the shards.
-        shards: all of them, in order.
-        failed: seeds at which the expert failed.
-        facts: what is known of the dataset but counts, device and digests.
+        facts: the dataset's, without counts and digests.
     """
 
-    plan: TaskPlan
     path: Path
     shards: tuple[Path, ...]
     failed: tuple[FailedSeed, ...]
     facts: DatasetFacts
-
-    @property
-    def setup_key(self) -> SetupKey:
-        """See `workers.Job`."""
-        return SetupKey(self.plan.task, "join")
-
-    @property
-    def n_items(self) -> int:
-        """One dataset."""
-        return 1
 
     @property
     def name(self) -> str:
@@ -142,13 +121,7 @@ class JoinJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
-    """With what a recording was made.
-
-    Attributes:
-        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts and weights.
-        environment: commit, versions and machine.
-        device: what is known of the device that rendered.
-    """
+    """Digests of recipes and weights, environment and device of a recording; see `DatasetFacts`."""
 
     recipe_files: Mapping[str, str]
     environment: Mapping[str, JsonValue]
@@ -170,13 +143,7 @@ class DatasetWritten:
 
 
 def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], Path]) -> tuple[ShardJob, ...]:
-    """Return the jobs that render the kept attempts.
-
-    Args:
-        plan: what is recorded.
-        kept: the attempts, in their order.
-        place: number of a shard -> where it appears.
-    """
+    """Return the jobs that render the kept attempts; `place` says where the shard of a number appears."""
     size = plan.recipe.episodes_per_shard
     return tuple(
         ShardJob(
@@ -192,15 +159,7 @@ def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], P
 def join_job(
     plan: TaskPlan, path: Path, *, shards: Sequence[ShardJob], failed: Sequence[Attempt], origin: Origin
 ) -> JoinJob:
-    """Return the job that makes the dataset of a task.
-
-    Args:
-        plan: what was recorded.
-        path: where the dataset is to appear.
-        shards: all of them, in order; they are there.
-        failed: the attempts that did not succeed.
-        origin: with what it was recorded.
-    """
+    """Return the job that makes the dataset of a task at `path` from all of its shards."""
     facts = DatasetFacts(
         complete=True,
         name=plan.recipe.name,

@@ -39,15 +39,7 @@ OF_THE_PLAN = ("task_versions", "source")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergedTask:
-    """What the parts have of one task.
-
-    Attributes:
-        plan: what was recorded.
-        selection: what is kept and what failed.
-        attempts: the file of attempts of one part.
-        shards: number of a shard -> its folder.
-        missing: sentences about seeds and shards that are not there.
-    """
+    """What the parts have of one task: selection, a file of attempts, shards by number; what is missing."""
 
     plan: TaskPlan
     selection: Selection
@@ -69,13 +61,7 @@ class _Tried(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergedRecording:
-    """What the parts come to.
-
-    Attributes:
-        run_file: the description of the whole recording, and the sessions of all parts.
-        tasks: what there is of each task.
-        missing: sentences about parts, seeds and shards that are not there.
-    """
+    """The description and the sessions of all parts, what they have of each task, and what is missing."""
 
     run_file: RunFile
     tasks: tuple[MergedTask, ...]
@@ -83,14 +69,10 @@ class MergedRecording:
 
 
 def merge_recordings(folders: Sequence[Path], *, allow_environment_change: bool = False) -> MergedRecording:
-    """Read the parts of a recording; nothing is written.
-
-    Args:
-        folders: what `record --shard` has made.
-        allow_environment_change: merge although versions or machines differ.
+    """Read the parts of a recording, which `record --shard` has made; nothing is written.
 
     Raises:
-        MergeError: a folder is no part, two are the same one, or they are of different recipes or, unless
+        MergeError: a folder is not a part, two are the same one, or they are of different recipes or, unless
             that is allowed, environments; or an expert has acted differently.
         VlaEvalError: the recipe cannot be planned here; a file is damaged.
     """

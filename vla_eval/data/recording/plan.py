@@ -21,13 +21,7 @@ from vla_eval.tasks.spec import TaskSpec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingPlan:
-    """All that a recording needs to know before it starts.
-
-    Attributes:
-        tasks: what is recorded of each task.
-        recipe_files: `policies/oracle` -> sha256; likewise the prompts, and the
-            weights of a learned expert.
-    """
+    """What is recorded of each task, and the digests of recipes, prompts and weights."""
 
     tasks: tuple[TaskPlan, ...]
     recipe_files: dict[str, str]

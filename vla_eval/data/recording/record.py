@@ -18,9 +18,9 @@ from typing import Literal, Protocol, Self
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe
 from vla_eval.config.files import content_of, options_of
 from vla_eval.data.facts import DatasetFacts, read_facts
-from vla_eval.data.manifest import FailedSeed, read_failed, read_manifest
+from vla_eval.data.manifest import RECORDING_FILE, FailedSeed, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
-from vla_eval.data.recording.folder import RecordingFolder
+from vla_eval.data.recording.folder import RecordingFolder, remove_shards
 from vla_eval.data.recording.jobs import (
     AttemptJob,
     DatasetWritten,
@@ -44,6 +44,7 @@ from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
 from vla_eval.workers.job_list import JobList
+from vla_eval.workers.jobs import Answered
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.start import simulator_modules
@@ -51,12 +52,12 @@ from vla_eval.workers.start import simulator_modules
 WORKER_MODULE = "vla_eval.data.recording.worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
 
-Phase = Literal["trying seeds", "converting", "rendering", "joining"]
+Phase = Literal["trying seeds", "converting", "rendering", "joining", "replaying"]
 RecordingPool = Pool[RecordingJob, RecordingAnswer]
 
 
 class RecordingObserver(Protocol):
-    """Watches a recording: progress on a terminal, for example."""
+    """Watches a recording or a replay: progress on a terminal, for example."""
 
     def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
         """Called when a phase of a task begins, with how many episodes are done already."""
@@ -64,22 +65,23 @@ class RecordingObserver(Protocol):
     def on_progress(self, *, n_done: int) -> None:
         """Called when more is done of the phase."""
 
+    def on_mismatch(self, sentence: str) -> None:
+        """Called for each mismatch that a replay finds."""
+
     def on_tick(self) -> bool:
-        """Called several times a second; returns whether the recording shall stop now."""
+        """Called several times a second; returns whether to stop now."""
 
 
 class _Silence:
     """Watches nothing and never stops."""
 
-    def on_phase(self, task: str, phase: Phase, *, n_done: int, n_total: int) -> None:
-        """Do nothing."""
-
-    def on_progress(self, *, n_done: int) -> None:
-        """Do nothing."""
-
     def on_tick(self) -> bool:
-        """Continue."""
         return False
+
+    def _ignore(self, *_: object, **__: object) -> None:
+        """Do nothing."""
+
+    on_phase = on_progress = on_mismatch = _ignore
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,63 +153,28 @@ def record(
     command: str = "",
     allow_environment_change: bool = False,
     observer: RecordingObserver | None = None,
-    backend: Backend = LOCAL,
-    part: Shard | None = None,
-) -> RecordingSummary:
-    """Record all datasets of a recipe that are not there yet.
-
-    Args:
-        recipe: what to record.
-        out: the folder; each task's dataset appears in it.
-        command: what the user typed, for the record.
-        allow_environment_change: resume although package versions or the machine have changed.
-        observer: gets the progress.
-        backend: where the workers run; they write shards and datasets into the folder.
-        part: render only this part of the episodes; `merge_recordings` makes the datasets.
-
-    Raises:
-        VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk. What was
-            recorded stays.
-    """
-    return run_plan(
-        recipe,
-        plan_recording(recipe),
-        out=out,
-        command=command,
-        allow_environment_change=allow_environment_change,
-        observer=observer or _Silence(),
-        backend=backend,
-        part=part,
-    )
-
-
-def run_plan(
-    recipe: DatasetRecipe,
-    plan: RecordingPlan,
-    *,
-    out: Path,
-    observer: RecordingObserver,
-    command: str = "",
-    allow_environment_change: bool = False,
     selections: Mapping[str, Selection] | None = None,
     source: str | None = None,
     backend: Backend = LOCAL,
     part: Shard | None = None,
 ) -> RecordingSummary:
-    """Record what is planned; see `record`.
+    """Record all datasets of a recipe that are not there yet, in OUT/TASK.
 
     Args:
         recipe: what to record.
-        plan: what `plan_recording` makes of it.
         out: the folder.
-        observer: gets the progress.
-        command: what the user typed.
+        command: what the user typed, for the record.
         allow_environment_change: resume although package versions or the machine have changed.
+        observer: gets the progress.
         selections: task -> the attempts to render, where they are known already.
         source: digest of what the selections were read from.
-        backend: see `record`.
-        part: see `record`.
+        backend: where the workers run; they write shards and datasets into the folder.
+        part: render only this part of the episodes; `merge_recordings` makes the datasets.
+
+    Raises:
+        VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk.
     """
+    plan = plan_recording(recipe)
     part = part and part.of_blocks(recipe.episodes_per_shard, recipe.episodes)
     versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
@@ -236,7 +203,7 @@ def run_plan(
                 plan=plan,
                 folder=folder,
                 pool=running,
-                observer=observer,
+                observer=observer or _Silence(),
                 allow_environment_change=allow_environment_change,
             )
             try:
@@ -264,13 +231,13 @@ class _Recorder:
     def record(self, task: TaskPlan, selection: Selection | None) -> RecordedDataset:
         """Return the dataset of a task; made if it is not there yet."""
         begun = time.monotonic()
-        path = self.folder.dataset(task.task)
-        if not self.folder.is_finished(task.task):
+        path = self.folder.out / task.task
+        if not (path / RECORDING_FILE).exists():  # a dataset appears only when it is complete
             selection = selection or self._try_seeds(task)
             shards = self._shard_jobs(task, selection)
             self._render(shards)
             self._join(task, selection, shards)
-        self.folder.remove_shards(task.task)  # also what a killed session has left
+        remove_shards(self.folder.out, task.task)  # also what a killed session has left
         return RecordedDataset.read(path, seconds=time.monotonic() - begun)
 
     def record_part(self, task: TaskPlan, part: Shard) -> RecordedPart:
@@ -320,7 +287,7 @@ class _Recorder:
             environment=self.folder.environment,
             device=self.folder.device,
         )
-        path = self.folder.dataset(task.task)
+        path = self.folder.out / task.task
         job = join_job(task, path, shards=shards, failed=selection.failed, origin=origin)
         for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)
@@ -331,27 +298,19 @@ class _Recorder:
         """Run the jobs, each again if it fails once; yield each with its answer when it is done."""
         n_failed: Counter[str] = Counter()
         for event in self.pool.run(queue):
-            answered = self._look_at(event)
-            if answered is None:
+            if not isinstance(event, Answered):
+                if isinstance(event, DeviceFound):
+                    self.folder.note_device(event.device, allow_change=self.allow_environment_change)
+                elif event is None and self.observer.on_tick():
+                    raise _Stopped
                 continue
-            job, answer = answered
+            job, answer = event.job, event.answer
             if isinstance(answer, Failed):
                 n_failed[job.name] += 1
                 _raise_if_last(answer, n_failed[job.name], job.name)
                 queue.give_back(job)  # type: ignore[arg-type]  # it is the queue's own
             else:
                 yield job, answer
-
-    def _look_at(self, event: object) -> "tuple[RecordingJob, RecordingAnswer | Failed] | None":
-        """Return job and answer, if the event is one; else see to it."""
-        if event is None:
-            if self.observer.on_tick():
-                raise _Stopped
-        elif isinstance(event, DeviceFound):
-            self.folder.note_device(dict(event.device), allow_change=self.allow_environment_change)
-        else:
-            return event.job, event.answer  # type: ignore[attr-defined]  # an Answered
-        return None
 
     def _begin(self, task: TaskPlan, phase: Phase, *, n_done: int) -> None:
         self.observer.on_phase(task.task, phase, n_done=n_done, n_total=task.recipe.episodes)

@@ -15,12 +15,7 @@ from vla_eval.errors import RecordingError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """The outcome of all tries.
-
-    Attributes:
-        kept: the attempts that become episodes, by seed.
-        failed: attempts below the last kept seed that did not succeed.
-    """
+    """The attempts that become episodes, by seed, and those below the last of them that did not succeed."""
 
     kept: tuple[Attempt, ...]
     failed: tuple[Attempt, ...]
@@ -35,13 +30,7 @@ class SeedJob(Protocol):
 
 
 class SeedQueue[J: SeedJob]:
-    """A `JobSource` of seeds to try.
-
-    Args:
-        recipe: how many to keep, from which seed on, and whether failures are kept, too.
-        known: seed -> attempt of earlier sessions.
-        make_job: makes the job of a seed.
-    """
+    """A `JobSource` of seeds to try; `known` are the attempts of earlier sessions."""
 
     def __init__(
         self, recipe: DatasetRecipe, known: Mapping[int, Attempt], make_job: Callable[[int], J]

@@ -18,7 +18,13 @@ from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.checks.rules import MIN_FRAMES
-from vla_eval.data.exact_statistics import Histogram, count_levels, dataset_statistics, empty_histogram
+from vla_eval.data.exact_statistics import (
+    Histogram,
+    count_levels,
+    empty_histogram,
+    image_statistics,
+    vector_statistics,
+)
 from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import join_datasets, video_decoder
 from vla_eval.data.tables import read_columns
@@ -43,15 +49,7 @@ ENCODER_THREADS = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Format:
-    """What shards must have in common to become one dataset.
-
-    Attributes:
-        state: which proprioception `observation.state` is.
-        encoder: how frames become video.
-        max_frames: no episode has more.
-        action_names: the numbers of an action.
-        image_size_px: height and width of images.
-    """
+    """What shards must have in common to become one dataset; no episode has more than `max_frames`."""
 
     state: StateKind
     encoder: EncoderSettings
@@ -61,12 +59,7 @@ class Format:
 
 
 class ShardWriter:
-    """Writes one shard; a context manager that leaves either the whole shard or nothing.
-
-    Args:
-        path: where the shard is to appear.
-        format: see `Format`.
-    """
+    """Writes one shard to `path`; a context manager that leaves either the whole shard or nothing."""
 
     def __init__(self, path: Path, format: Format) -> None:
         """Begin with an empty draft."""
@@ -82,15 +75,7 @@ class ShardWriter:
         return self
 
     def add_episode(self, episode: RecordedEpisode, frames: Iterable[dict[str, Any]]) -> None:
-        """Encode an episode.
-
-        Args:
-            episode: what is known of it.
-            frames: see `features.frame_values`.
-
-        Raises:
-            DatasetError: fewer than two frames.
-        """
+        """Encode an episode of at least two frames, see `features.frame_values`."""
         if episode.n_steps < MIN_FRAMES:
             raise DatasetError(
                 f"{episode.task}, seed {episode.seed}: {episode.n_steps} frames; lerobot needs at least "
@@ -149,15 +134,7 @@ def new_dataset(
 
 
 def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ...]:
-    """Put shards together as one LeRobotDataset with exact statistics.
-
-    Args:
-        shards: finished shards, in order.
-        root: the new dataset; must not exist.
-
-    Returns:
-        The episodes, in order.
-    """
+    """Put finished shards together as one new LeRobotDataset with exact statistics; return its episodes."""
     join_datasets(shards, root)
     histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
     for shard in shards:
@@ -170,10 +147,13 @@ def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ..
 
 def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None:
     """Replace `meta/stats.json` by statistics over all rows and all pixels."""
-    write_stats(dataset_statistics(read_columns(root), histograms), root)
+    columns = read_columns(root)
+    n_frames = len(columns["index"])
+    statistics = {key: vector_statistics(rows.reshape(n_frames, -1)) for key, rows in columns.items()}
+    images = {key: image_statistics(found, n_frames=n_frames) for key, found in histograms.items()}
+    write_stats({**statistics, **images}, root)
 
 
 def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:
     """Return the episodes of a finished shard."""
-    path = shard / SHARD_EPISODES
-    return read_entries(path, RecordedEpisode)
+    return read_entries(shard / SHARD_EPISODES, RecordedEpisode)

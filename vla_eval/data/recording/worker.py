@@ -6,12 +6,10 @@ jobs of one kind. Only whole shards and whole datasets appear on the disk.
 
 import dataclasses
 import errno
-import logging
 import shutil
 from collections.abc import Callable, Sequence
 
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.config.environment import EnvSettings
 from vla_eval.core import FloatArray, Policy, SimEnv
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.manifest import (
@@ -43,7 +41,7 @@ from vla_eval.data.recording.jobs import (
     TaskPlan,
 )
 from vla_eval.data.recording.shard_writer import Format, ShardWriter, join_shards
-from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.data.simulator_runner import SimulatorRunner
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.features import CAMERA_KEYS, frame_values
@@ -51,46 +49,38 @@ from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import storage_full
 from vla_eval.storage.starting import DISK_TROUBLE
 from vla_eval.workers.inside import Heartbeat
-from vla_eval.workers.messages import DeviceFound, Failed, describe_error
-
-logger = logging.getLogger(__name__)
+from vla_eval.workers.messages import DeviceFound
 
 NEARLY_FULL_BYTES = 1 << 24  # an encoder's error does not say that the disk is full; this little left does
 
 
-class RecordingRunner:
-    """Does jobs, keeping the environment between those that need the same."""
+class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
+    """Tries seeds, writes shards, and joins them; keeps the expert, too."""
 
     def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
         """Start with nothing made."""
-        self._heartbeat = heartbeat
-        self._tell = tell
-        self._env: SimEnv | None = None
-        self._env_settings: EnvSettings | None = None
+        super().__init__(heartbeat, tell)
         self._expert: Policy | None = None
 
-    def answer(self, job: RecordingJob) -> RecordingAnswer | Failed:
-        """Do the job; whatever goes wrong becomes a `Failed`."""
-        self._heartbeat.begin_batch()
-        self._heartbeat("setup")
-        try:
-            if isinstance(job, AttemptJob):
-                return self._attempt(job)
-            if isinstance(job, ShardJob):
-                return self._write_shard(job)
-            return join_dataset(job)
-        except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
-            logger.exception("%s, stage %s", job.setup_key, self._heartbeat.stage)
-            known = _explained(exc, job)
-            return Failed(
-                error=describe_error(known, self._heartbeat.stage), refused=isinstance(known, VlaEvalError)
-            )
-
     def close(self) -> None:
-        """Release the simulator."""
-        if self._env is not None:
-            self._env.close()
-        self._env = self._env_settings = self._expert = None
+        """Release simulator and expert."""
+        super().close()
+        self._expert = None
+
+    def _do(self, job: RecordingJob) -> RecordingAnswer:
+        if isinstance(job, AttemptJob):
+            return self._attempt(job)
+        return self._write_shard(job) if isinstance(job, ShardJob) else join_dataset(job)
+
+    def _explained(self, exc: BaseException, job: RecordingJob) -> BaseException:
+        """Return a `StorageFullError` in place of what a full disk has caused."""
+        if isinstance(exc, VlaEvalError) or isinstance(job, AttemptJob):
+            return exc
+        is_known = isinstance(exc, OSError) and exc.errno in DISK_TROUBLE
+        if is_known or shutil.disk_usage(job.path.parent).free < NEARLY_FULL_BYTES:
+            full = exc if isinstance(exc, OSError) else OSError(errno.ENOSPC, str(exc))
+            return storage_full(job.path, full)
+        return exc
 
     def _attempt(self, job: AttemptJob) -> Attempt:
         plan = job.plan
@@ -122,16 +112,6 @@ class RecordingRunner:
                 episode = recorded_episode(plan, one, log, index=index)
                 writer.add_episode(episode, frames_of(plan.recipe, episode, log))
         return ShardWritten(n_episodes=len(job.attempts))
-
-    def _make_env(self, settings: EnvSettings) -> SimEnv:
-        if self._env is None or self._env_settings != settings:
-            self.close()
-            self._env = make_env(settings)
-            self._env_settings = settings
-            device = describe_device(self._env)
-            if device is not None and settings.cameras:
-                self._tell(DeviceFound(device=device))
-        return self._env
 
 
 def join_dataset(job: JoinJob) -> DatasetWritten:
@@ -193,13 +173,3 @@ def stored_actions(recipe: DatasetRecipe, episode: RecordedEpisode) -> FloatArra
     """Return the actions of the field `action`: the executed ones, or those without noise."""
     intended = episode.intended_rows()
     return intended if recipe.stored_action == "intended" and intended is not None else episode.action_rows()
-
-
-def _explained(exc: BaseException, job: RecordingJob) -> BaseException:
-    """Return a `StorageFullError` in place of what a full disk has caused."""
-    if isinstance(exc, VlaEvalError) or isinstance(job, AttemptJob):
-        return exc
-    is_known = isinstance(exc, OSError) and exc.errno in DISK_TROUBLE
-    if is_known or shutil.disk_usage(job.path.parent).free < NEARLY_FULL_BYTES:
-        return storage_full(job.path, exc if isinstance(exc, OSError) else OSError(errno.ENOSPC, str(exc)))
-    return exc

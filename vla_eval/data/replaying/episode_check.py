@@ -49,15 +49,7 @@ def check_rows(episode: RecordedEpisode, rows: Columns, log: EpisodeLog) -> list
 def check_states(
     episode: RecordedEpisode, rows: Columns, log: EpisodeLog, *, expect_equal_bits: bool
 ) -> list[str]:
-    """Compare states and success with the manifest.
-
-    Args:
-        episode: what the manifest says.
-        rows: the table's rows of this episode.
-        log: the episode, done again.
-        expect_equal_bits: whether machine and versions are those of the recording; otherwise states
-            may differ by `STATE_TOLERANCE`.
-    """
+    """Compare states and success with the manifest; unless bits are compared, within `STATE_TOLERANCE`."""
     equal = states_digest(log.results) == episode.states_sha256
     found = []
     if not equal:

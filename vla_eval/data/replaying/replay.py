@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.facts import DatasetFacts, read_facts
 from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, RecordedEpisode, ReplayReport, read_manifest
+from vla_eval.data.recording.record import RecordingObserver
 from vla_eval.data.replay_report import keep_report, manifest_sha256
 from vla_eval.data.replaying.episode_check import STATE_TOLERANCE
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
@@ -48,16 +49,7 @@ class ReplayKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayJob:
-    """One episode to replay.
-
-    Attributes:
-        dataset: the dataset's folder.
-        episode: what the manifest says of it.
-        env: the environment.
-        pixels: whether images are compared, too.
-        same_machine: whether machine and versions are those of the recording.
-        device: the device that rendered the recording's images.
-    """
+    """One episode to replay; `device` is the one that rendered the recording's images."""
 
     dataset: Path
     episode: RecordedEpisode
@@ -84,22 +76,6 @@ class EpisodeReplayed:
     episode_index: int
     mismatches: tuple[str, ...]
     psnr_db: dict[str, float]
-
-
-class ReplayObserver(Protocol):
-    """Watches a replay."""
-
-    def on_phase(self, task: str, phase: Literal["replaying"], *, n_done: int, n_total: int) -> None:
-        """Called when the replay of a dataset begins."""
-
-    def on_progress(self, *, n_done: int) -> None:
-        """Called when more episodes are done."""
-
-    def on_mismatch(self, sentence: str) -> None:
-        """Called for each mismatch."""
-
-    def on_tick(self) -> bool:
-        """Called several times a second; returns whether the replay shall stop now."""
 
 
 def replay_main(connection: Connection, shared: SharedStage, log: Path) -> None:
@@ -130,7 +106,7 @@ def replay(
     dataset: Path,
     *,
     logs: Path,
-    observer: ReplayObserver,
+    observer: RecordingObserver,
     episodes: Sequence[int] | None = None,
     pixels: bool = False,
     workers: int | Literal["auto"] = "auto",
@@ -152,8 +128,8 @@ def replay(
         The report; None if the observer asked to stop.
 
     Raises:
-        DatasetError: the dataset is not complete, or has no such episode; the task has changed since.
-        VlaEvalError: the simulator cannot be started.
+        VlaEvalError: the dataset is not complete, or has no such episode; the task has changed since; the
+            simulator cannot be started.
     """
     facts, manifest = read_facts(dataset), read_manifest(dataset)
     environment = collect_environment()
@@ -238,11 +214,7 @@ def check_task_versions(dataset: Path, episodes: Sequence[RecordedEpisode]) -> N
 
 
 def recipe_of(facts: DatasetFacts) -> DatasetRecipe:
-    """Return the recipe that a dataset was recorded by.
-
-    Raises:
-        DatasetError: what the dataset has is no recipe.
-    """
+    """Return the recipe that a dataset was recorded by; raise `DatasetError` if it cannot be read."""
     try:
         return decode(DatasetRecipe, {"name": facts.name, **facts.recipe}, where=str(RECORDING_FILE))
     except RecipeError as exc:

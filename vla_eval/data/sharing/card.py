@@ -29,10 +29,8 @@ MAX_SEEDS_SHOWN = 40
 def write_card(root: Path, *, license_id: str | None = None) -> str:
     """Write card and contact sheet into a complete dataset, and return the card's text.
 
-    Args:
-        root: the dataset.
-        license_id: licence as the Hub names it; by default that of this project for recordings and for
-            mixtures of them, and none for imports.
+    The licence is named as on the Hub; by default it is that of this project for recordings and for mixtures
+    of them, and none for imports.
 
     Raises:
         DatasetError: the dataset is not complete, or damaged.

@@ -38,13 +38,10 @@ class PulledDataset(NamedTuple):
 
 
 def push_dataset(root: Path, repo_id: str, *, private: bool = False, api: HfApi | None = None) -> str:
-    """Upload a dataset, replacing what the repository held before; return where it is.
+    """Upload a dataset, replacing what the repository USER/NAME held before; return where it is.
 
-    Args:
-        root: a complete dataset; its card is written if there is none.
-        repo_id: `USER/NAME`.
-        private: make the repository a private one; a public one that exists already is refused.
-        api: the Hub's client, by default that of the user's login.
+    A card is written if there is none. With `private`, a public repository that exists already is refused.
+    `api` is the Hub's client, by default that of the user's login.
 
     Raises:
         DatasetError: the dataset is not complete, or the Hub refuses it.
@@ -78,15 +75,10 @@ def push_dataset(root: Path, repo_id: str, *, private: bool = False, api: HfApi 
 def pull_dataset(
     repo_id: str, out: Path, *, revision: str | None = None, api: HfApi | None = None
 ) -> PulledDataset:
-    """Download a dataset and check it; the folder appears when it is complete.
+    """Download a dataset, USER/NAME, and check it; the folder appears when it is complete.
 
-    After an interruption the same call resumes from `OUT.partial`.
-
-    Args:
-        repo_id: `USER/NAME`.
-        out: the folder to make.
-        revision: branch, tag or commit; by default the newest commit.
-        api: the Hub's client, by default that of the user's login.
+    After an interruption the same call resumes from `OUT.partial`. `revision` is a branch, tag or commit, by
+    default the newest commit; `api` as for `push_dataset`.
 
     Raises:
         DatasetError: `out` exists, the Hub does not give it, or it is not a complete dataset.

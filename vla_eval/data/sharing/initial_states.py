@@ -29,7 +29,6 @@ class InitialState:
     """How one episode of a dataset begins.
 
     Attributes:
-        name: its number, or its file.
         seed: of its own environment; None if it is not known.
         kind, state: proprioception of the first frame as `features.proprioception` gives it.
     """
@@ -45,10 +44,8 @@ class InitialStates:
     """How the episodes of a dataset begin.
 
     Attributes:
-        path: the dataset.
         task: task id; None if the dataset names none.
-        simulator: that it was recorded with; ManiSkill for what was not recorded here.
-        episodes: in the dataset's order.
+        simulator: of the recording; ManiSkill for what was not recorded here.
         read_frames: reads the first frame of each episode; decoding takes a while.
     """
 
@@ -60,14 +57,7 @@ class InitialStates:
 
 
 def read_initial_states(path: Path) -> InitialStates:
-    """Read how the episodes of a dataset begin.
-
-    Args:
-        path: a dataset of this project, recorded or converted, or what `dataset convert` reads.
-
-    Raises:
-        DatasetError: there is no dataset that can be read.
-    """
+    """Read how the episodes of any dataset begin that `dataset convert` reads, or raise `DatasetError`."""
     source = find_source(path)
     seeds, task, simulator = _recorded_facts(source)
     states = []

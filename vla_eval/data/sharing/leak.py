@@ -44,7 +44,6 @@ class LeakReport:
     """What a comparison found.
 
     Attributes:
-        task: task id.
         seeds: of the evaluation.
         n_episodes: of the dataset.
         evidence: what was compared: the arm's state, or first frames where that is the same for all seeds.
@@ -68,12 +67,7 @@ class _Start:
 
 
 def check_leak(dataset: InitialStates, *, task: str, seeds: range) -> LeakReport:
-    """Compare how the episodes of a dataset begin with the initial states of evaluation seeds.
-
-    Args:
-        dataset: what `read_initial_states` returned.
-        task: task id whose evaluation is meant.
-        seeds: its seeds.
+    """Compare how the episodes of a dataset begin with the initial states of a task's evaluation seeds.
 
     Raises:
         UnknownNameError: there is no such task.

@@ -50,12 +50,7 @@ class EpisodeWish:
 
 
 def write_dataset_rrds(root: Path, wish: EpisodeWish, folder: Path) -> list[Path]:
-    """Write the wished episodes, one file each, and return their paths.
-
-    Args:
-        root: the dataset's folder.
-        wish: which episodes.
-        folder: gets `episode_000003.rrd`; files of that name are replaced.
+    """Write the wished episodes as `episode_000003.rrd`, replacing files of that name; return their paths.
 
     Raises:
         DatasetError: there is no complete dataset.

@@ -37,13 +37,9 @@ class DatasetSummary:
     """What a card is written from.
 
     Attributes:
-        dataset: what it summarises.
-        lengths: (E,) frames per episode.
         n_success: episodes in which the success rule held at some frame; None if that is not stored.
         instructions: every sentence that occurs.
         fields: field -> `float32 (7)`.
-        action: over all frames.
-        image_size_px: height and width of the images.
     """
 
     dataset: OpenDataset

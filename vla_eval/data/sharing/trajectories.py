@@ -63,12 +63,7 @@ class Trajectory:
         return counts.astype(np.float32)
 
     def returns_to_go(self, kind: RewardKind, *, discount: float = 1.0) -> FloatArray:
-        """Return (T,) float32: the sum of a step's reward and all later ones.
-
-        Args:
-            kind: of the rewards.
-            discount: by which a reward counts less for each step that it is away.
-        """
+        """Return (T,) float32: the sum of a step's reward and all later ones, discounted per step."""
         returns, after = np.zeros(len(self.success_T), dtype=np.float64), 0.0
         rewards = self.rewards(kind)
         for step in reversed(range(len(rewards))):
@@ -91,11 +86,7 @@ class Trajectory:
 class Trajectories(Sequence[Trajectory]):
     """The episodes of a complete dataset, in their order; each is read when it is asked for.
 
-    Images are decoded once, into the user's cache, where training finds them, too.
-
-    Args:
-        root: the folder of a dataset.
-        cache: where decoded frames lie; by default in the user's cache.
+    Images are decoded once, into `cache`, by default the user's, where training finds them, too.
 
     Raises:
         DatasetError: it is not complete, or lacks a field of the layout.
