@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from vla_eval.data.manifest import ReplayReport, read_replay
-from vla_eval.data.replay_report import manifest_sha256, require_passed
+from vla_eval.data.manifest import ReplayReport, manifest_sha256, read_replay, require_passed
 
 
 def passed(dataset: Path) -> ReplayReport | None:

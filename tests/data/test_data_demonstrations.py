@@ -20,6 +20,7 @@ from vla_eval.data.manifest import (
     decode_actions,
     encode_actions,
     from_json,
+    keep_report,
     to_json,
 )
 from vla_eval.data.recording.demonstrations import (
@@ -31,7 +32,6 @@ from vla_eval.data.recording.demonstrations import (
     replay_attempt,
     states_digest,
 )
-from vla_eval.data.replay_report import keep_report
 from vla_eval.data.replaying.episode_check import check_rows, check_states, psnr_db
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import DatasetError, RecordingError
@@ -198,7 +198,7 @@ class TestEpisodeCheck:
 
 class TestReplayReport:
     def report(self, dataset: Path, **fields: Any) -> ReplayReport:
-        from vla_eval.data.replay_report import manifest_sha256
+        from vla_eval.data.manifest import manifest_sha256
 
         default = ReplayReport(
             passed=True,

@@ -1,5 +1,6 @@
 """Recipes, features, statistics and seeds of demonstrations: what needs no process and no episode."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -151,14 +152,14 @@ class TestExactStatistics:
 class TestSeedQueue:
     def tried(self, successes: set[int], order: list[int], **fields: Any) -> tuple[list[int], list[int], int]:
         """Return kept seeds, failed seeds and the number of tries, workers answering in some order."""
-        queue = SeedQueue(recipe(**fields), {}, lambda seed: seed)
+        queue = SeedQueue(plan(**fields), {})
         in_flight: list[int] = []
         n_tries = 0
         for position in order * 50:
             while queue.has_next() and len(in_flight) < len(order):
                 taken = queue.take(None)
                 assert taken is not None
-                in_flight.append(taken)
+                in_flight.append(taken.seed)
                 n_tries += 1
             if not in_flight:
                 break
@@ -179,8 +180,9 @@ class TestSeedQueue:
 
     def test_attempts_of_an_earlier_session_are_not_tried_again(self) -> None:
         known = {seed: fake_attempt(seed, succeeds=True) for seed in (1000, 1002)}  # 1001 was in flight
-        queue = SeedQueue(recipe(episodes=3), known, lambda seed: seed)
-        assert queue.take(None) == 1001
+        queue = SeedQueue(plan(episodes=3), known)
+        taken = queue.take(None)
+        assert taken is not None and taken.seed == 1001
         assert not queue.has_next()
 
     def test_all_seeds_are_kept_where_the_recipe_says_so(self) -> None:
@@ -191,6 +193,11 @@ class TestSeedQueue:
     def test_an_expert_that_fails_too_often_is_an_error(self) -> None:
         with pytest.raises(RecordingError, match="at 1 of the 5 seeds from 1000 to 1004; 3 episodes are"):
             self.tried({1000}, [0], episodes=3, max_failed_seeds=2)
+
+
+def plan(**fields: Any) -> Any:
+    """Return a plan as far as the choice of seeds goes."""
+    return SimpleNamespace(recipe=recipe(**fields))
 
 
 def fake_attempt(seed: int, *, succeeds: bool) -> Attempt:

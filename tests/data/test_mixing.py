@@ -14,9 +14,15 @@ from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.data.dataset_folder import check_complete
 from vla_eval.data.derived.mixing import mix_datasets
 from vla_eval.data.facts import find_facts, read_facts
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, REPLAY_FILE, ReplayReport, write_entry
+from vla_eval.data.manifest import (
+    MIXTURE_FILE,
+    RECORDING_FILE,
+    REPLAY_FILE,
+    ReplayReport,
+    manifest_sha256,
+    write_entry,
+)
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.sharing.card import write_card
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, RecipeError

@@ -6,8 +6,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
-from vla_eval.data.rewards import rewards_of
+from vla_eval.data.frames.decoded_frames import DecodedFramesDataset, rewards_of
 from vla_eval.errors import DatasetError
 
 # Two episodes of 4 and 3 frames; in the first, success holds from its third frame on.

@@ -16,8 +16,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.files import list_recipes, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, write_entry
-from vla_eval.data.replay_report import manifest_sha256
+from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, manifest_sha256, write_entry
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.testing.tiny_models import TINY_POLICY, Family, tiny_paligemma

@@ -55,6 +55,14 @@ class CheckReport:
         return any(one.answer == "refused" for one in self.said)
 
 
+def _refused(sentence: str) -> Said:
+    return Said(answer="refused", sentence=sentence)
+
+
+def _kept(sentence: str) -> Said:
+    return Said(answer="kept", sentence=sentence)
+
+
 def check(path: Path) -> CheckReport:
     """Look at all of a dataset but the pixels.
 
@@ -81,7 +89,7 @@ def check(path: Path) -> CheckReport:
     try:
         report = _of_source(lerobot_source(dataset), kind)
     except DatasetError as exc:
-        said = (*found, Said(answer="refused", sentence=str(exc)), *_breaches(demonstrations))
+        said = (*found, _refused(str(exc)), *_breaches(demonstrations))
         return CheckReport(path=path, kind=kind, demonstrations=demonstrations, said=said, next_step="")
     return dataclasses.replace(report, said=(*found, *report.said))
 
@@ -130,9 +138,9 @@ def has_our_fields(features: Any) -> bool:  # Any: lerobot's plain data
 def _of_source(source: Source, kind: str) -> CheckReport:
     path = source.path
     demonstrations = source.demonstrations(expected_px=IMAGE_SIZE_PX)
-    said = [Said(answer="kept", sentence=f"{remark}.") for remark in source.remarks]
+    said = [_kept(f"{remark}.") for remark in source.remarks]
     if source.left_out:
-        said.append(Said(answer="kept", sentence=f"A conversion leaves out {', '.join(source.left_out)}."))
+        said.append(_kept(f"A conversion leaves out {', '.join(source.left_out)}."))
     return CheckReport(
         path=path,
         kind=kind or f"{len(source.files)} npz files",
@@ -143,11 +151,7 @@ def _of_source(source: Source, kind: str) -> CheckReport:
 
 
 def require_checked(dataset: OpenDataset) -> None:
-    """Apply the rules to what no conversion has applied them to.
-
-    Raises:
-        DatasetError: an import that an older version made, or a mixture, breaks one.
-    """
+    """Apply the rules to a mixture or an import that an older version made, or raise `DatasetError`."""
     if not dataset.facts.is_checked:
         is_mixture = isinstance(dataset.facts, MixtureFacts)
         require_sound(dataclasses.replace(demonstrations_of(dataset.local), is_gripper_named=is_mixture))
@@ -156,7 +160,7 @@ def require_checked(dataset: OpenDataset) -> None:
 def _known_or_found(facts: Facts | None, demonstrations: Demonstrations) -> Iterator[Said]:
     """Yield what a conversion has found, or what is found now; a recording follows the rules."""
     if facts is not None and facts.is_checked:
-        yield from (Said(answer="kept", sentence=sentence) for sentence in facts.kept)
+        yield from (_kept(sentence) for sentence in facts.kept)
     else:
         yield from _breaches(demonstrations)
 
@@ -178,21 +182,16 @@ def check_videos(dataset: LocalDataset) -> Iterator[Said]:
                 stream = container.streams.video[0]
                 size, n_frames, fps = (stream.height, stream.width), stream.frames, stream.average_rate
         except (FFmpegError, LookupError) as exc:
-            yield Said(answer="refused", sentence=f"{path}: cannot be read as a video ({exc!s:.100}).")
+            yield _refused(f"{path}: cannot be read as a video ({exc!s:.100}).")
             continue
         expected = channels_first(meta.features[camera])[1:]
         if size != expected:
             found = f"{size[0]} × {size[1]} px, expected {expected[0]} × {expected[1]}"
-            yield Said(answer="refused", sentence=f"{path}: its frames are {found} (meta/info.json).")
+            yield _refused(f"{path}: its frames are {found} (meta/info.json).")
         if n_frames < needed:
-            yield Said(
-                answer="refused",
-                sentence=f"{path}: has {n_frames} frames, its {len(numbers)} episodes need {needed}.",
-            )
+            yield _refused(f"{path}: has {n_frames} frames, its {len(numbers)} episodes need {needed}.")
         if fps != meta.fps:
-            yield Said(
-                answer="refused", sentence=f"{path}: has {fps} frames per second, expected {meta.fps}."
-            )
+            yield _refused(f"{path}: has {fps} frames per second, expected {meta.fps}.")
 
 
 def _statistics(dataset: LocalDataset, demonstrations: Demonstrations) -> Iterator[Said]:
@@ -213,8 +212,7 @@ def _statistics(dataset: LocalDataset, demonstrations: Demonstrations) -> Iterat
                 differing.append(f"{kind} of {name}")
                 break
     if differing:
-        yield Said(
-            answer="kept",
-            sentence=f"meta/stats.json differs from the rows: {', '.join(differing)}. `dataset adopt` and "
-            "`dataset convert` compute it again.",
+        yield _kept(
+            f"meta/stats.json differs from the rows: {', '.join(differing)}. `dataset adopt` and "
+            "`dataset convert` compute it again."
         )

@@ -9,7 +9,6 @@ from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.manifest import FAILED_FILE, MANIFEST_FILE, RECORDING_FILE, FileDigest
 from vla_eval.errors import DatasetError
 
-BLOCK_BYTES = 1 << 20
 # What a dataset consists of; a card, a replay's report and what the Hub's client leaves are not part of it.
 CONTENT = (
     "data/**/*.parquet",
@@ -63,13 +62,9 @@ def _check_files(root: Path, facts: Facts) -> None:
 
 def digest_file(path: Path) -> FileDigest:
     """Return size and sha256 of a file."""
-    digest = hashlib.sha256()
-    n_bytes = 0
     with path.open("rb") as file:
-        while block := file.read(BLOCK_BYTES):
-            digest.update(block)
-            n_bytes += len(block)
-    return FileDigest(n_bytes=n_bytes, sha256=digest.hexdigest())
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return FileDigest(n_bytes=file.tell(), sha256=digest)
 
 
 def digest_files(dataset: Path) -> dict[str, FileDigest]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath
-from typing import Any  # plain data
+from typing import Any, ClassVar  # Any: plain data
 
 from vla_eval.control_modes import control_mode_of
 from vla_eval.data.folder_contents import check_folder
@@ -54,6 +54,8 @@ class DatasetFacts:
     environment: dict[str, Any]
     device: dict[str, str]
     files: dict[str, FileDigest]
+    is_checked: ClassVar[bool] = True
+    kept: ClassVar[tuple[str, ...]] = ()
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -65,16 +67,6 @@ class DatasetFacts:
         """What the actions are for."""
         env = self.recipe.get("env")
         return control_mode_of(env if isinstance(env, dict) else {})
-
-    @property
-    def is_checked(self) -> bool:
-        """A recording follows the rules."""
-        return True
-
-    @property
-    def kept(self) -> tuple[str, ...]:
-        """Nothing."""
-        return ()
 
     @property
     def kind(self) -> str:
@@ -177,6 +169,8 @@ class MixtureFacts:
     sources: tuple[MixtureSource, ...]
     files: dict[str, FileDigest]
     vla_eval_version: str
+    is_checked: ClassVar[bool] = False  # its sources are; the whole is checked when it is used
+    kept: ClassVar[tuple[str, ...]] = ()
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -222,16 +216,6 @@ class MixtureFacts:
     def was_replayed(self) -> bool:
         """Whether a replay had confirmed every source."""
         return all(one.was_replayed for one in self.sources)
-
-    @property
-    def is_checked(self) -> bool:
-        """Sources are checked one by one; the whole is checked when it is used."""
-        return False
-
-    @property
-    def kept(self) -> tuple[str, ...]:
-        """Nothing."""
-        return ()
 
     @property
     def kind(self) -> str:
@@ -304,11 +288,7 @@ def has_facts(root: Path) -> bool:
 
 
 def find_facts(root: Path) -> Facts | None:
-    """Return what a dataset of this project is; None if it is another one.
-
-    Raises:
-        DatasetError: its record is damaged, of another version, or the dataset was not finished.
-    """
+    """Return what a dataset of this project is, or raise `DatasetError`; None if it is another one."""
     for kind in KINDS:
         if (root / kind.file).exists():
             return _read(root, kind)
@@ -316,11 +296,7 @@ def find_facts(root: Path) -> Facts | None:
 
 
 def read_facts(root: Path) -> DatasetFacts:
-    """Return what a recorded dataset is.
-
-    Raises:
-        DatasetError: there is no `recording.json`, it is damaged, or the dataset is not complete.
-    """
+    """Return what a recorded dataset is; `DatasetError` if it is another one, or was not finished."""
     check_folder(root)
     facts = _read(root, KINDS[0])
     assert isinstance(facts, DatasetFacts)

@@ -14,6 +14,7 @@ and numpy only: it knows nothing of lerobot.
 import base64
 import binascii
 import dataclasses
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from vla_eval.control_modes import action_spec, control_mode_of
-from vla_eval.core import FloatArray
+from vla_eval.core import EpisodeStart, FloatArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file, whole_lines
@@ -91,6 +92,17 @@ class RecordedEpisode:
         if self.intended_actions is None:
             return None
         return decode_actions(self.intended_actions, n_dims=self._n_action_dims)
+
+    def start(self) -> EpisodeStart:
+        """Return the episode, to be done again in slot 0."""
+        return EpisodeStart(
+            slot=0,
+            task=self.task,
+            seed=self.seed,
+            run=0,
+            instruction=self.instruction,
+            horizon_steps=self.n_steps,
+        )
 
     @property
     def _n_action_dims(self) -> int:
@@ -224,3 +236,57 @@ def read_content(path: Path) -> bytes:
             f"{path}: is not there: it is not a dataset that `mikasa-vla record` has finished. Name the "
             f"folder of one task, OUT/TASK."
         ) from exc
+
+
+def keep_report(dataset: Path, report: ReplayReport) -> None:
+    """Write the report, unless one that is there says more.
+
+    A mismatch is always written. A report without any is written if it is about all episodes, and does
+    not hide a mismatch of images that it has not compared.
+    """
+    if report.passed:
+        before = read_replay(dataset)
+        hides = (
+            before is not None
+            and before.manifest_sha256 == report.manifest_sha256
+            and not before.passed
+            and before.pixels
+            and not report.pixels
+        )
+        if hides or report.n_episodes < report.n_total:
+            return
+    write_entry(dataset / REPLAY_FILE, report)
+
+
+def require_passed(dataset: Path, report: ReplayReport | None, manifest: str) -> ReplayReport | None:
+    """Return the report of a dataset's last replay, as `read_replay` returned it.
+
+    Raises:
+        DatasetError: the replay has failed, or was one of another manifest than that of this digest.
+    """
+    if report is None:
+        return None
+    if report.manifest_sha256 != manifest:
+        raise DatasetError(
+            f"{dataset}: {REPLAY_FILE} is about another manifest. Replay the dataset: mikasa-vla replay "
+            f"{dataset}"
+        )
+    if not report.passed:
+        shown = "\n".join(f"  {sentence}" for sentence in report.mismatches[:5])
+        raise DatasetError(
+            f"{dataset}: its replay failed with {len(report.mismatches)} mismatches:\n{shown}\nWhat is "
+            f"learned from it would not fit the environment. Record it again, or rebuild it from its "
+            f"manifest: mikasa-vla replay {dataset} --rebuild OUT"
+        )
+    return report
+
+
+def needs_replay(dataset: Path) -> bool:
+    """Whether no replay of the whole dataset, as it is, has passed."""
+    report = read_replay(dataset)
+    return report is None or not report.passed or report.manifest_sha256 != manifest_sha256(dataset)
+
+
+def manifest_sha256(dataset: Path) -> str:
+    """Return the digest of a dataset's manifest."""
+    return hashlib.sha256((dataset / MANIFEST_FILE).read_bytes()).hexdigest()

@@ -37,8 +37,8 @@ from vla_eval.data.manifest import (
     read_failed,
     read_manifest,
     read_replay,
+    require_passed,
 )
-from vla_eval.data.replay_report import require_passed
 from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, Columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import SUCCESS_KEY
@@ -276,7 +276,7 @@ def reason(exc: BaseException) -> str:
 
 @contextlib.contextmanager
 def local_readers(tables_of: Callable[[Path], Tables]) -> Iterator[None]:
-    """Let lerobot read datasets by our readers, which are given no address, and ask the Hub for nothing.
+    """Let lerobot read by our readers, which know no address, and ask the Hub for nothing.
 
     `tables_of` returns what the files of a folder hold; lerobot gets copies of what it changes.
     """
@@ -347,10 +347,7 @@ def _open(root: Path, options: dict[str, Any]) -> LeRobotDataset:
 
 
 def decoder_for(root: Path) -> str:
-    """Return lerobot's name of the decoder for a dataset's videos.
-
-    lerobot hands their paths to fsspec for torchcodec, and fsspec takes `::` for a chain of addresses.
-    """
+    """Return lerobot's decoder: the path that torchcodec gets is fsspec's, where `::` chains addresses."""
     return "pyav" if "::" in str(root.absolute()) else video_decoder()
 
 

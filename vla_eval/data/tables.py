@@ -43,12 +43,10 @@ Columns = dict[str, NDArray[np.generic]]
 def read_table(
     path: Path, keep: Callable[[str], bool] | None = None, *, with_images: bool = False
 ) -> Any:  # Any: pyarrow.Table
-    """Return a table of a dataset, without what Hugging Face's library noted in it.
+    """Return a table of a dataset, or the columns that `keep` names, without Hugging Face's notes in it.
 
-    Args:
-        path: a parquet file, of a folder that `check_folder` has seen.
-        keep: whether to read the column of a name; None: read all.
-        with_images: whether it may have columns of images as lerobot embeds them.
+    The file is of a folder that `check_folder` has seen; it may have images as lerobot embeds them
+    `with_images`.
 
     Raises:
         DatasetError: it is damaged, does not fit into memory, or has a column of anything but numbers, text

@@ -1,15 +1,18 @@
 """Start or continue what has a `run.json`: the file with one more session, unless something has changed.
 
-Knows nothing of what the folder holds beside it.
+A run may grow: its records are then those of a run that had all episodes from the start. Knows nothing of
+what else the folder holds.
 """
 
+import itertools
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from vla_eval.storage.plan_growth import command_beside, without_growth
+from vla_eval.errors import RunChangedError
 from vla_eval.storage.run_file import (
     DEVICE,
     Change,
@@ -17,13 +20,15 @@ from vla_eval.storage.run_file import (
     RunDescription,
     RunFile,
     Session,
-    environment_changed,
     find_changes,
-    run_changed,
-    server_changed,
+    listed,
 )
 
 logger = logging.getLogger(__name__)
+
+GROWING = ("tasks", "task_versions", "policies", "policy_names", "n_action_steps", "episodes", "runs")
+"""Fields of a configuration of which more is a plan with more episodes."""
+OUT_FLAG = "--out"
 
 
 def continued(
@@ -41,11 +46,10 @@ def continued(
         description: what the run is started with; the device is not compared.
         shown: the folder that messages name.
         allow_environment_change: continue although commit or versions have changed.
-        may_grow: more of what is planned, the rest being the same, is no change.
+        may_grow: more of what is planned, the rest being the same, is not a change.
 
     Raises:
         RunChangedError: configuration, recipes or environment are not what they were.
-        RunFolderError: the file is damaged.
     """
     session = Session(
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -75,7 +79,9 @@ def continued(
 def _check_unchanged(old: RunDescription, new: RunDescription, shown: Path, *, may_grow: bool) -> None:
     """Raise `RunChangedError` if the configuration, a recipe or a policy server is not what it was."""
     if changes := find_changes(_shard(old), _shard(new), prefix="shard"):
-        raise run_changed(changes, shown, remedy="Each shard needs a folder of its own: use another --out.")
+        raise _changed(
+            "configuration", changes, shown, "Each shard needs a folder of its own: use another --out."
+        )
     compared = without_growth(new, old) if may_grow else new
     changes = (
         *find_changes(old.config, compared.config, prefix="config"),
@@ -89,15 +95,24 @@ def _check_unchanged(old: RunDescription, new: RunDescription, shown: Path, *, m
                 "new ones. Anything else goes into a folder beside it, and `report` takes both:\n"
                 f"  {command_beside(new.command, shown)}"
             )
-        raise run_changed(changes, shown, remedy=remedy)
+        raise _changed("configuration", changes, shown, remedy)
     if changes := find_changes(old.servers, compared.servers, prefix="servers"):
-        raise server_changed(changes, shown)
+        remedy = "Start the former policy there again to continue this run, or use another --out."
+        raise _changed("policy at the server", changes, shown, remedy)
+
+
+def _changed(what: str, changes: Sequence[Change], where: Path, remedy: str) -> RunChangedError:
+    return RunChangedError(f"{where}: this run was started with another {what}:\n{listed(changes)}\n{remedy}")
 
 
 def check_allowed(changes: Sequence[Change], *, shown: Path, allowed: bool) -> None:
     """Log the changes, or raise `RunChangedError` if there are any and they are not allowed."""
     if changes and not allowed:
-        raise environment_changed(changes, shown)
+        raise RunChangedError(
+            f"{shown}: this run was started in another environment:\n{listed(changes)}\n"
+            f"Use another --out, or restore the old environment. To continue all the same, add "
+            f"--allow-environment-change: the change is then recorded and the report names it."
+        )
     for change in changes:
         logger.warning("%s: the environment has changed: %s", shown, change)
 
@@ -125,3 +140,51 @@ def _shard(description: RunDescription) -> dict[str, JsonValue]:
     """Return which shard a run is; its groups follow from the configuration, which may grow."""
     shard = description.shard
     return {} if shard is None else {"number": shard.number, "count": shard.count}
+
+
+def without_growth(new: RunDescription, old: RunDescription) -> RunDescription:
+    """Return `new` without what it only adds to `old`: what still differs changes what was run."""
+    config = {
+        name: old.config[name] if name in GROWING and _covers(value, old.config.get(name)) else value
+        for name, value in new.config.items()
+    }
+    return replace(
+        new,
+        config=config,
+        recipes={name: digest for name, digest in new.recipes.items() if name in old.recipes},
+        servers={name: server for name, server in new.servers.items() if name in old.servers},
+    )
+
+
+def _covers(new: JsonValue, old: JsonValue) -> bool:
+    """Whether a plan with the new value has all episodes of one with the old value."""
+    match new, old:
+        case int(), int():
+            return new >= old
+        case Mapping(), Mapping():
+            return all(new.get(key) == value for key, value in old.items())
+        case (str(), _) | (_, str()):
+            return False
+        case Sequence(), Sequence():
+            return all(any(_continues(one, item) for one in new) for item in old)
+    return False
+
+
+def _continues(new: JsonValue, old: JsonValue) -> bool:
+    """Whether an item is the same, or a policy of several checkpoints, `NAME=A,B`, with further ones."""
+    is_longer = isinstance(new, str) and isinstance(old, str) and "=" in old and new.startswith(f"{old},")
+    return new == old or is_longer
+
+
+def command_beside(command: str, out: Path) -> str:
+    """Return the command that the user typed, with a free folder next to `out`."""
+    words = shlex.split(command)
+    beside = (out.with_name(f"{out.name}-{n}") for n in itertools.count(2))
+    free = next(path for path in beside if not path.exists())
+    kept: list[str] = []
+    skips = False
+    for word in words:
+        if not skips and word != OUT_FLAG and not word.startswith(f"{OUT_FLAG}="):
+            kept.append(word)
+        skips = word == OUT_FLAG
+    return shlex.join([*kept, OUT_FLAG, str(free)])

@@ -20,8 +20,7 @@ NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, err
 def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
     """Give a place to write to; it becomes `out` at the end, or is removed after an exception.
 
-    Raises:
-        VlaEvalError: of class `error`: `out` exists.
+    An `out` that exists is an error of this class.
     """
     if out.exists():
         raise error(f"{out}: exists already. Name a new folder with --out, or remove this one.")

@@ -62,11 +62,7 @@ def sync_tree(folder: Path) -> None:
 
 
 def read_lines(path: Path) -> bytes:
-    """Return the bytes of a file of lines, none if it is not there.
-
-    Raises:
-        RunFolderError: what lies there is not a file, or cannot be read.
-    """
+    """Return the bytes of a file of lines, none if it is not there."""
     source = Source(where=str(path), what="a file of JSON lines", remedy="", error=RunFolderError)
     try:
         return read_file(path, source)

@@ -35,12 +35,9 @@ class PlannedConfig:
     """The part of a configuration that says which episodes there are; None is not known.
 
     Attributes:
-        tasks: ids, maybe with their namespace.
-        task_versions: task id -> version of its rules.
-        policies: names, files or folders, or `NAME=A,B,C`.
-        policy_names: what records call the policies.
+        tasks: ids, maybe with their namespace; `task_versions`: id -> version of its rules.
+        policies: names, files or folders, or `NAME=A,B,C`; `policy_names`: what records call them.
         n_action_steps: None also where each policy has its default.
-        episodes, runs, seed_start: how many, and of which seeds.
     """
 
     tasks: tuple[str, ...] | None = None
@@ -73,13 +70,7 @@ def planned_config(config: Mapping[str, Any], source: Source) -> PlannedConfig: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedEpisodes:
-    """The episodes of a run.
-
-    Attributes:
-        config: what the configuration says of them.
-        groups: (task, policy, n_action_steps) of all, where that is known.
-        shard: the part of these episodes that the run has; None: all.
-    """
+    """The episodes of a run: groups (task, policy, n_action_steps), where known, and the shard, if any."""
 
     config: PlannedConfig
     groups: Collection[tuple[str, str, int]] | None = None

@@ -30,12 +30,7 @@ ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 
 
 def collect_environment() -> dict[str, JsonValue]:
-    """Return what results may depend on and no configuration says.
-
-    Returns:
-        `vla_eval` (`version`; `commit` and `changes`, see `checkout_state`), `packages` (name ->
-        version, None if not installed), `python`, `platform`, `cpu`, `mesa`, `nvidia_driver`.
-    """
+    """Return what results may depend on and no configuration says; see also `checkout_state`."""
     return {
         "vla_eval": {"version": vla_eval.__version__, **checkout_state(PACKAGE_FOLDER)},
         "packages": {name: package_version(name) for name in PACKAGES},

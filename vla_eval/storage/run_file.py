@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vla_eval.errors import RunChangedError, RunFolderError
+from vla_eval.errors import RunFolderError
 from vla_eval.plain_text import printable
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.durable import replace_file
@@ -30,21 +30,18 @@ type JsonValue = bool | int | float | str | Sequence[JsonValue] | Mapping[str, J
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDescription:
-    """What makes a run this run.
+    """What makes a run this run: compared on resume, but for options, command and what weights imply.
 
     Attributes:
-        name: the configuration's name.
-        config: the resolved configuration, as far as results depend on it; compared on resume.
-        recipes: recipe as shown -> sha256; compared on resume.
-        environment: commit, versions, device; compared on resume unless a change is allowed.
-        options: workers, timeouts and the like; recorded, never compared.
+        config: the resolved configuration, as far as results depend on it.
+        recipes: recipe as shown -> sha256.
+        environment: commit, versions, device; a change may be allowed.
+        options: workers, timeouts and the like.
         command: what the user typed.
-        normalization: learned policy -> by which statistics it normalises; recorded only, since the digest
-            of the weights in `recipes` covers them.
-        servers: policy behind a socket -> what its server says of itself; compared on resume.
-        shard: which part of the plan it is; None: all of it. Compared on resume.
-        training_seeds: the seeds of the demonstrations that policies were trained on, where known; recorded
-            only, since the digest of the weights covers them.
+        normalization: learned policy -> by which statistics it normalises; not compared.
+        servers: policy behind a socket -> its server's description.
+        shard: which part of the plan it is; None: all of it.
+        training_seeds: seeds of the demonstrations that policies were trained on, where known; not compared.
     """
 
     name: str
@@ -77,8 +74,6 @@ class Session:
 
     Attributes:
         started_at: ISO 8601, UTC.
-        command: what the user typed.
-        options: see `RunDescription`.
         environment_changes: how the environment differed from the one the run was started in.
         plan_changes: by what the run grew: more episodes, runs, policies, tasks or n_action_steps.
         sentences: lines on instructions that a policy's tokenizer cut, or took for that of another task.
@@ -111,12 +106,7 @@ class RunFile:
 
     @classmethod
     def load(cls, folder: Path) -> "RunFile":
-        """Read `run.json`.
-
-        Raises:
-            RunFolderError: it is damaged, or of another version.
-            FileNotFoundError: there is none.
-        """
+        """Read `run.json`; `FileNotFoundError` if there is none, `RunFolderError` if it is damaged."""
         source = _source(folder)
         data = read_json(read_file(folder / RUN_FILE, source), source)
         read_version(data, "format_version", FORMAT_VERSION, source)
@@ -128,11 +118,7 @@ class RunFile:
     def planned(
         self, folder: Path, groups: Collection[tuple[str, str, int]] | None = None
     ) -> PlannedEpisodes:
-        """Return which episodes the run has; `groups` are known from the plan, or from the shard.
-
-        Raises:
-            RunFolderError: a field of the configuration has another type than a configuration's.
-        """
+        """Return which episodes the run has; `groups` are known from the plan, or from the shard."""
         config, shard = planned_config(self.description.config, _source(folder)), self.description.shard
         known = groups if shard is None else shard.groups
         return PlannedEpisodes(config=config, groups=known, shard=shard)
@@ -157,30 +143,6 @@ class RunFile:
         """Return this with a line on an instruction noted in the current session."""
         *earlier, current = self.sessions
         return replace(self, sessions=(*earlier, replace(current, sentences=(*current.sentences, line))))
-
-
-def run_changed(changes: Sequence[Change], where: Path, *, remedy: str) -> RunChangedError:
-    """Build the error for a run that is started again as another one."""
-    return RunChangedError(
-        f"{where}: this run was started with another configuration:\n{listed(changes)}\n{remedy}"
-    )
-
-
-def server_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
-    """Build the error for a run whose policy server holds another policy than before."""
-    return RunChangedError(
-        f"{where}: this run was started with another policy at the server:\n{listed(changes)}\n"
-        f"Start the former policy there again to continue this run, or use another --out."
-    )
-
-
-def environment_changed(changes: Sequence[Change], where: Path) -> RunChangedError:
-    """Build the error for a run that is continued on another machine or with other versions."""
-    return RunChangedError(
-        f"{where}: this run was started in another environment:\n{listed(changes)}\n"
-        f"Use another --out, or restore the old environment. To continue all the same, add "
-        f"--allow-environment-change: the change is then recorded and the report names it."
-    )
 
 
 def find_changes(

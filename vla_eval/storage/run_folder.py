@@ -98,7 +98,7 @@ class RunFolder:
         """Start a run in a new or empty folder, or continue the one that is there.
 
         Args:
-            path: the folder; it is made if it is not there.
+            path: the folder.
             description: what the run is started with; it must be what it was before, or plan more episodes.
             allow_environment_change: continue although commit, versions or device have changed.
             groups: task, policy and n_action_steps of each episode that is planned; None: as far as the
@@ -133,11 +133,7 @@ class RunFolder:
         return frozenset(self._finished)
 
     def append(self, record: EpisodeRecord, timing: EpisodeTiming | None = None) -> None:
-        """Store one episode; it is durable when this returns.
-
-        Args:
-            record: the episode's result.
-            timing: how long it took; not made durable, and lost rather than an error if it cannot be kept.
+        """Store one episode; it is durable when this returns. A timing may be lost without an error.
 
         Raises:
             RunFolderError: the episode has a result already or is not planned, its values contradict each
@@ -188,12 +184,7 @@ class RunFolder:
             logger.warning("%s: %d timings were not kept (%s)", self.path, len(timings), exc)
 
     def note_machine(self, kind: str, facts: Mapping[str, JsonValue]) -> None:
-        """Record that episodes run on a machine of another kind; their timings name it.
-
-        Raises:
-            RunChangedError: its facts differ from the environment's, and changes are not allowed.
-            StorageFullError: it could not be recorded.
-        """
+        """Record that episodes run on a machine of another kind; errors as `note_device`."""
         environment = self._run_file.description.environment
         own = {name: environment.get(name) for name in facts}
         changes = find_changes(own, facts, prefix=f"environment.machine {kind}")
@@ -201,12 +192,7 @@ class RunFolder:
         self._keep(self._run_file.with_changes(changes))
 
     def note_device(self, device: Mapping[str, JsonValue]) -> None:
-        """Record facts about the device, some of which may have been recorded before.
-
-        Raises:
-            RunChangedError: a value differs from the recorded one, and changes are not allowed.
-            StorageFullError: it could not be recorded.
-        """
+        """Record facts about the device; `RunChangedError` if known ones have changed."""
         self._keep(self._with_device(self._run_file, device))
 
     def note_sentence(self, line: str) -> None:

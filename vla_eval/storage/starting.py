@@ -71,12 +71,8 @@ def starting(
 ) -> Iterator[StartedFolder]:
     """Make and lock a folder; if the block ends with an exception, all that was made is removed.
 
-    Args:
-        path: the folder.
-        own: names of the files that a start writes into it.
-        lock_file: name of the file that is locked.
-        purpose: `a run folder`, for messages.
-        make: makes the folder if it is not there, after checks of its own.
+    `own` are the files that a start writes into it, `purpose` is `a run folder`, for messages, and `make`
+    makes the folder if it is not there, after checks of its own.
 
     Raises:
         RunFolderError: the folder cannot be used, or is in use.

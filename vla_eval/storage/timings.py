@@ -19,13 +19,7 @@ from vla_eval.strict.json_text import Source, as_dataclass, read_json
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Latency:
-    """Seconds per inference, over episodes; and per episode.
-
-    Attributes:
-        n_episodes: episodes with a timing.
-        median_seconds, slowest_seconds: of the episodes' mean seconds per inference.
-        episode_seconds: median of the whole episodes.
-    """
+    """Median and maximum of the episodes' mean seconds per inference; median seconds of whole episodes."""
 
     n_episodes: int
     median_seconds: float

@@ -66,10 +66,7 @@ def open_study(
 
 
 def needed_files(study: Study) -> tuple[Needed, ...]:
-    """Return the folders that workers write into and read from, and the recipes that they read.
-
-    Those of the package are compared anyway.
-    """
+    """Return the folders that workers write into and read from, and the user's recipes that they read."""
     from vla_eval.checkpoints.files import file_sha256
 
     found = dict.fromkeys(find_recipe("policies", row.policy) for row in study.table.rows)

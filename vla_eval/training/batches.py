@@ -6,7 +6,7 @@ back to 0, and completes an epoch's last batches with samples from wherever the 
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple  # Any: lerobot, accelerate and datasets are untyped
 
@@ -15,7 +15,12 @@ import torch
 from accelerate.data_loader import BatchSamplerShard
 from accelerate.utils import send_to_device, set_seed
 from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
+from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
+
+from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+
+Batch = dict[str, Any]
 
 
 class Position(NamedTuple):
@@ -93,3 +98,27 @@ def on_device(loader: "DataLoader[Any]", device: torch.device) -> Iterator[Any]:
     """Yield the loader's batches, moved to a device."""
     for batch in loader:
         yield send_to_device(batch, device, non_blocking=loader.pin_memory)
+
+
+def preprocessed(preprocess: Callable[[Batch], Batch], batch: Batch) -> Batch:
+    """Return a batch as the policy reads it; each segment goes through the pipeline as its own sample."""
+    if SEGMENT_PADDING_KEY not in batch:
+        return preprocess(batch)
+    padding = batch[SEGMENT_PADDING_KEY]
+    n_samples, n_segments = padding.shape
+    flat: Batch = {}
+    for key, value in batch.items():
+        if isinstance(value, Tensor):
+            flat[key] = value.flatten(0, 1)
+        else:
+            flat[key] = [entry for entry in value for _ in range(n_segments)]
+    del flat[SEGMENT_PADDING_KEY]
+    done: Batch = {}
+    for key, value in preprocess(flat).items():
+        if isinstance(value, Tensor) and value.ndim and len(value) == n_samples * n_segments:
+            done[key] = value.reshape(n_samples, n_segments, *value.shape[1:])
+        elif isinstance(value, list) and len(value) == n_samples * n_segments:
+            done[key] = value[::n_segments]
+        else:
+            done[key] = value
+    return {**done, SEGMENT_PADDING_KEY: padding.to(done["action"].device)}

@@ -25,17 +25,12 @@ LOSS_SCALE_FILE = "loss_scale.json"
 def write_checkpoint(
     job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any], scaler: Any
 ) -> Path | None:
-    """Write the checkpoint of a step, with what it was trained on; every process has to take part.
+    """Write the checkpoint of a step, counted from 1; every process has to take part, the first one writes.
 
-    Args:
-        job: see there.
-        step: counted from 1.
-        accelerator: accelerate's `Accelerator`.
-        parts: `cfg`, `policy`, `optimizer`, …, see lerobot's `save_checkpoint`.
-        scaler: torch's `GradScaler` of the training; enabled in float16 alone.
+    `parts` are those of lerobot's `save_checkpoint`; the scaler is enabled in float16 alone.
 
     Returns:
-        The folder (`…/000100`); None in all processes but the first, which writes.
+        The folder (`…/000100`); None in the other processes.
     """
     if accelerator.distributed_type == DistributedType.FSDP:  # each process has a share of the weights
         gathered = train_utils.gather_fsdp_state_dicts(parts["policy"], parts["optimizer"])
@@ -66,10 +61,9 @@ def write_checkpoint(
 
 @contextlib.contextmanager
 def _recurrent_weights_apart(policy: nn.Module) -> Iterator[None]:
-    """Let a policy's `state_dict` have each weight of a GRU or LSTM in a storage of its own.
+    """Let a policy's `state_dict` have each weight of a GRU or LSTM in a storage of its own, for safetensors.
 
-    On a GPU torch keeps all of them in one, as cuDNN wants it (`flatten_parameters`). safetensors refuses to
-    save a part of a storage.
+    On a GPU torch keeps all of them in one, as cuDNN wants it (`flatten_parameters`).
     """
 
     def copied(module: nn.Module, state: dict[str, Any], prefix: str, metadata: Any) -> None:
@@ -100,11 +94,7 @@ def load_state(folder: Path, optimizer: Any, scheduler: Any, *, load_optimizer: 
 
 
 def load_loss_scale(folder: Path, scaler: Any) -> None:
-    """Load the scale of the loss: from another one, other steps would be left out because of an overflow.
-
-    Raises:
-        TrainingError: the training is in float16, and the scale is missing or damaged.
-    """
+    """Load the scale of the loss: from another one, other steps would be left out because of an overflow."""
     if not scaler.is_enabled():
         return
     file = folder / STATE_FOLDER / LOSS_SCALE_FILE

@@ -21,11 +21,7 @@ from vla_eval.models.episodes.samples import decisions
 
 
 def training_dataset(root: Path, *, allow_unreplayed: bool) -> OpenDataset:
-    """Return a dataset that is complete and, unless that is waived, was replayed without a mismatch.
-
-    Args:
-        root: the folder of a dataset, or a folder that holds exactly one.
-        allow_unreplayed: return it although no replay has confirmed it.
+    """Return a folder's dataset if it is complete and was replayed without a mismatch, unless that is waived.
 
     Raises:
         DatasetError: it is not, or the folder holds several.

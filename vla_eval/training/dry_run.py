@@ -32,11 +32,7 @@ PUBLISHED_SIZES: Mapping[str, Mapping[str, Any]] = {"octo_base": SIZES["base"]}
 
 
 def assumed_config(recipe: FinetuneRecipe) -> Any:
-    """Return the policy's configuration without base and dataset: published sizes, fields of recordings.
-
-    Raises:
-        RecipeError: a field that the policy does not have, or a value that it refuses.
-    """
+    """Return the policy's configuration without base and dataset: published sizes, fields of recordings."""
     cls = config_class(recipe.type, where="finetune.type")
     known = cls.__dataclass_fields__
     closed = {name: value for name, value in NO_DOWNLOADS.items() if name in known}
@@ -65,12 +61,9 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DryRunOptions:
-    """What is assumed of a device.
+    """What is assumed: the device's memory, None: that of the GPU here; its rate, None: a usual one.
 
-    Attributes:
-        device_bytes: its memory; None: of the GPU that is here, if any.
-        tflops: its rate; None: a usual one.
-        assume: returns the policy's configuration where the base or the dataset is missing.
+    `assume` returns the policy's configuration where the base or the dataset is missing.
     """
 
     device_bytes: float | None = None

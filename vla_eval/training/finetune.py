@@ -58,12 +58,8 @@ def finetune(
 ) -> FinetuneSummary:
     """Fine-tune, or resume a fine-tuning.
 
-    Args:
-        config: what to train on what.
-        command: what the user typed, for the record.
-        say: gets lines for a person.
-        is_stopping: asked between steps, and during evaluations; once it says yes, a checkpoint is written,
-            from which the same call resumes.
+    `is_stopping` is asked between steps, and during evaluations; once it says yes, a checkpoint is written,
+    from which the same call resumes.
 
     Raises:
         VlaEvalError: a mistake; what was saved stays.

@@ -81,11 +81,7 @@ class HeldOut:
         return [folder for folder, step in steps.items() if self.is_due(step) and step not in evaluated]
 
     def evaluate(self, checkpoint: Path) -> None:
-        """Evaluate a checkpoint (`…/000100`) and report its figure; finished episodes are not run again.
-
-        Raises:
-            VlaEvalError: no episode could be run.
-        """
+        """Evaluate a checkpoint (`…/000100`) and report its figure; finished episodes are not run again."""
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
         stops = _UntilStopped(self.is_stopping, functools.partial(self._warn, checkpoint))

@@ -41,16 +41,12 @@ class TrainingJob:
     Attributes:
         name, recipe_sha256: of the policy's recipe.
         recipe: its section `finetune`, with the configuration's values on top.
-        dataset: what is trained on.
         policy: lerobot's configuration of the policy, which it completes when the model is made.
         frames: how many of the dataset's frames begin a chunk.
         base: folder of the weights to start from; None: from scratch.
         below: what those were trained on; None: from scratch, or not known.
-        device: `cpu`, `cuda` …
-        out: the run folder.
         run_seed: of initial weights, order of samples and noise.
         held_out: evaluation of checkpoints during training; None: there is none.
-        held_out_task: on which task.
         resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
         run_id: names the run to services, also when it is resumed; None: it has no folder yet.
     """

@@ -42,14 +42,13 @@ from vla_eval.models.shared.levels import in_numbers
 from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.models.shared.tokens_read import Readings
 from vla_eval.policies.lerobot.device import amp_dtype
-from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device
+from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device, preprocessed
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
 from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.model import local_files_only, make_model, make_processors
 from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, drop_extra_checkpoints
-from vla_eval.training.segments import preprocessed
 from vla_eval.workers.start import child_context
 
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
@@ -161,11 +160,7 @@ class _Training:
         return {**parts, "cfg": self.config, "preprocessor": self.before, "postprocessor": self.after}
 
     def do_step(self, step: int) -> list[SentenceReading]:
-        """Do one gradient step, the `step`-th counted from 1.
-
-        Returns:
-            What was read of sentences that are new.
-        """
+        """Do one gradient step, counted from 1; return what was read of sentences that are new."""
         tracker, started, n_known = self.tracker, time.perf_counter(), len(self.readings.known)
         batch = next(self.batches)
         for key in () if self.job.takes_bytes else self.images:

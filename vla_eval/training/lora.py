@@ -20,12 +20,7 @@ leaves them frozen (https://github.com/huggingface/lerobot/pull/4494)."""
 
 
 def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
-    """Return lerobot's settings of the adapters; None: all weights are trained.
-
-    Args:
-        recipe: see there.
-        policy: lerobot's configuration.
-    """
+    """Return lerobot's settings of the adapters of a policy; None: all weights are trained."""
     lora = recipe.lora
     if lora is None:
         return None
@@ -38,12 +33,7 @@ def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
 
 
 def check_lora_targets(recipe: FinetuneRecipe, cls: Any) -> None:
-    """Raise `RecipeError` where neither the recipe nor the policy says which layers get an adapter.
-
-    Args:
-        recipe: see there.
-        cls: class of the policy's configuration.
-    """
+    """Raise `RecipeError` where neither recipe nor policy class says which layers get an adapter."""
     if recipe.lora is None or recipe.lora.target_modules is not None:
         return
     if hasattr(cls, "lora_defaults"):
@@ -57,16 +47,7 @@ def check_lora_targets(recipe: FinetuneRecipe, cls: Any) -> None:
 
 
 def check_adapters(model: Any, recipe: FinetuneRecipe, policy: Any) -> None:
-    """Check what LoRA trains against the recipe, else against the policy's own choice.
-
-    Args:
-        model: peft's wrapper around the policy; any model if the recipe has no LoRA.
-        recipe: see there.
-        policy: lerobot's configuration.
-
-    Raises:
-        TrainingError: other parameters are trained.
-    """
+    """Raise `TrainingError` if LoRA trains others than the recipe asks for, else the policy's own choice."""
     if recipe.lora is None:
         return
     if getattr(policy, "memory_tokens", 0) and "memory_tokens" not in recipe.lora.full_modules:

@@ -33,12 +33,7 @@ def new_tracker(job: TrainingJob, dataset: Any, accelerator: Any) -> Any:
 
 
 def next_line(tracker: Any, samples_per_step: int) -> dict[str, float]:
-    """Return the means since the last line, and begin new ones; every process has to take part.
-
-    Args:
-        tracker: what `new_tracker` returned.
-        samples_per_step: of all processes.
-    """
+    """Return the means since the last line, and begin new ones; every process has to take part."""
     tracker.reduce_across_ranks()
     tracker.samples_per_s = samples_per_step / (tracker.update_s.avg + tracker.dataloading_s.avg)
     values = tracker.to_dict()

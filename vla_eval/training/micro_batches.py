@@ -28,17 +28,10 @@ def add_gradient(
 ) -> Loss:
     """Add the gradient of a batch's loss to the parameters'.
 
-    In parts, it is that of the whole batch wherever the policy's loss is a mean over samples that count
-    alike (ACT's is one over actions that are no padding, so not quite), but for noise that the policy
-    draws: it is drawn part by part.
-
-    Args:
-        policy: as accelerate has prepared it.
-        batch: tensors and lists with one entry per sample.
-        accelerator: accelerate's `Accelerator`.
-        size: samples of a part, the last one has what is left; None: all at once.
-        autocast: in which precision the forward pass runs; None: as the weights are.
-        scale: applied to the loss before the backward pass.
+    In parts of `size` samples, it is that of the whole batch wherever the policy's loss is a mean over
+    samples that count alike (ACT's is one over actions that are not padding, so not quite), except for noise
+    that the policy draws: it is drawn part by part. `autocast` is the precision of the forward pass, None:
+    the weights'; `scale` is applied to the loss before the backward pass.
 
     Raises:
         TrainingError: a field of the batch cannot be divided.

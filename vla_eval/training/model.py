@@ -42,9 +42,7 @@ class Processors(NamedTuple):
 def make_model(job: TrainingJob, meta: Any) -> Any:
     """Return the policy with its weights on its device, wrapped by peft where LoRA is trained.
 
-    Args:
-        job: see there. Its policy notes where its weights came from.
-        meta: lerobot's description of the dataset.
+    The job's policy notes where its weights came from.
 
     Raises:
         VlaEvalError: the base does not fit, or something would have to be downloaded.
@@ -91,11 +89,7 @@ def _filled(model: Any, job: TrainingJob, weights: Path) -> Any:
 def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
     """Return the processors: those of the weights' folder, with this machine's tokenizer, or new ones.
 
-    Args:
-        job: see there.
-        model: what `make_model` returned.
-        meta: lerobot's description of the dataset, by whose statistics, made usable, is normalised unless
-            training resumes.
+    Unless training resumes, they normalise by the dataset's statistics, made usable.
     """
     stats = usable_statistics(meta.stats, meta.features) if job.resume_from is None else None
     kwargs: dict[str, Any] = {} if stats is None else {"dataset_stats": stats}

@@ -48,13 +48,7 @@ class UsedFrames(NamedTuple):
 
 
 def asked_policy(recipe: FinetuneRecipe, cls: Any, base: Path | None, *, device: str) -> Any:
-    """Return lerobot's configuration that a recipe asks for: the base's, if any, with the recipe's values.
-
-    Args:
-        recipe: see there.
-        cls: class of the configuration.
-        base: folder of the base's weights.
-        device: `cpu`, `cuda` …
+    """Return lerobot's configuration, of this class, that a recipe asks for on top of its base's.
 
     Raises:
         RecipeError: a field that the policy does not have, or a value that it refuses.
@@ -87,8 +81,7 @@ def fit_to_dataset(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) ->
     """Give a configuration the dataset's fields, and what the policy computes from its numbers.
 
     Raises:
-        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the dataset's
-            fields.
+        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the fields.
     """
     with plain_errors(recipe.base_checkpoint or "finetune.policy", recipe.type, "does not fit the dataset"):
         _set_features(config, recipe, dataset)
@@ -115,11 +108,7 @@ def _leave_out_tails(config: Any) -> None:
 
 
 def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
-    """Return lerobot's configuration of how images are changed at random in training.
-
-    Raises:
-        RecipeError: a field or a transform that lerobot does not have.
-    """
+    """Return lerobot's configuration of random changes to images in training, or raise `RecipeError`."""
     if recipe.image_transforms is None:
         return ImageTransformsConfig()
     try:

@@ -25,13 +25,7 @@ from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_metrics,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneSummary:
-    """The result of a call.
-
-    Attributes:
-        out: the run folder.
-        step: of its newest checkpoint; 0: there is none.
-        is_finished: it is the last step, and evaluated if it should be; False: `is_stopping` said yes.
-    """
+    """The step of the newest checkpoint, 0 if there is none, and whether a call has done all."""
 
     out: Path
     step: int
@@ -39,11 +33,7 @@ class FinetuneSummary:
 
     @property
     def checkpoint(self) -> Path:
-        """The checkpoint that an evaluation takes.
-
-        Raises:
-            CheckpointError: there is none: training was stopped before the first.
-        """
+        """The checkpoint that an evaluation takes; `CheckpointError` if there is none yet."""
         return find_checkpoint(self.out)
 
     def __str__(self) -> str:
@@ -52,11 +42,7 @@ class FinetuneSummary:
 
 
 def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
-    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
-
-    Raises:
-        RecipeError: the policy has none, or a field is wrong.
-    """
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top."""
     recipe = load_policy(config.policy)
     if recipe.value.finetune is None:
         raise RecipeError(
@@ -93,11 +79,7 @@ def request_sha256(recipe: FinetuneRecipe, dataset: Path, base_sha256: str | Non
 
 
 def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
-    """Return the run that a configuration asks for if it is finished; None: look closer.
-
-    Raises:
-        VlaEvalError: a mistake in the recipe, or no such dataset or base; the run's record is damaged.
-    """
+    """Return the run that a configuration asks for if it is finished; None: look closer."""
     recipe, out = load_finetune_recipe(config).value, run_folder_of(config)
     step = newest_step(out)
     if step != recipe.steps:

@@ -62,9 +62,6 @@ def open_folder(
 
     Returns:
         The checkpoint to resume from; None to start from the beginning.
-
-    Raises:
-        TrainingError: the folder holds other files, or a run with other settings.
     """
     path.mkdir(parents=True, exist_ok=True)
     names = set(os.listdir(path))
@@ -109,11 +106,7 @@ def _save(path: Path, record: Mapping[str, JsonValue]) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:  # Any: JSON
-    """Return what a run folder's `finetune.json` holds; nothing if there is none.
-
-    Raises:
-        TrainingError: it is damaged.
-    """
+    """Return what a run folder's `finetune.json` holds; nothing if there is none."""
     file = path / RUN_FILE
     if not file.is_file():
         return {}
@@ -170,11 +163,7 @@ def newest_step(path: Path) -> int:
 
 
 def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the lines of metrics of a run folder; none if there is no file.
-
-    Raises:
-        TrainingError: a line is damaged.
-    """
+    """Yield the lines of metrics of a run folder; none if there is no file."""
     file = path / METRICS_FILE
     for line, where in whole_lines(read_lines(file), file):
         source = _source(where, "a line of metrics")

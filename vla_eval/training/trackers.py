@@ -36,14 +36,7 @@ STILL_THERE = "metrics.jsonl has it all."
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """Where metrics go.
-
-    Attributes:
-        name: for messages.
-        log: takes the prefix of their names, the numbers, and the step.
-        save: takes the folder of a checkpoint.
-        close: takes whether the training ended well.
-    """
+    """Where metrics go; `log` takes the prefix of their names, `close` whether the training ended well."""
 
     name: str
     log: Callable[[str, dict[str, float], int], object]
@@ -55,20 +48,12 @@ class Services:
     """The services of one training. A training does not depend on them: what fails is said once."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        """Begin with none.
-
-        Args:
-            say: gets lines for a person.
-        """
+        """Begin with none; `say` gets lines for a person."""
         self._say = say
         self._services: list[Service] = []
 
     def begin(self, name: str, begin: Callable[[], Service]) -> None:
-        """Add a service; without it, if it cannot be reached.
-
-        Raises:
-            VlaEvalError: a mistake that has to be corrected first.
-        """
+        """Add a service; without it, if it cannot be reached."""
         with self._may_fail(name):
             self._services.append(begin())
 
@@ -112,10 +97,6 @@ def services(job: TrainingJob, say: Callable[[str], None]) -> Iterator[Services]
 
     A training that is resumed continues the runs of its name. Steps between the last checkpoint and a kill
     are then there twice; `metrics.jsonl` has each once.
-
-    Args:
-        job: what is trained.
-        say: gets lines for a person.
 
     Raises:
         MissingDependencyError: a package is not installed.
@@ -239,11 +220,7 @@ PACKAGES = {
 
 
 def _require(field: str) -> None:
-    """Import the package that a field of the recipe needs; what it connects to is let through.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """Import the package that a field of the recipe needs; what it connects to is let through."""
     package, missing = PACKAGES[field], None
     if package.begin is not _tensorboard:
         let_connect(f"finetune.{field}", "git")

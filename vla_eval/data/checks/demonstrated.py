@@ -18,10 +18,6 @@ class Demonstrations:
     """The numbers and sentences of all episodes, frame after frame.
 
     Attributes:
-        where: the folder, for messages.
-        fps: frames per second.
-        names: of the episodes: `episode 3`, or a file.
-        lengths: frames of each.
         columns: field -> (N,) or (N, D) numbers.
         dims: field -> the names of its D numbers; a field is absent if they are not known.
         sentences: (N,) the language instruction of each frame, None if there is none; or empty, if what is

@@ -17,6 +17,7 @@ from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import ACTION_KEY, DONE_KEY, FPS, SUCCESS_KEY
 
 Answer = Literal["refused", "kept"]
+Check = Callable[[Demonstrations], Iterator[str]]
 MIN_FRAMES = 2  # lerobot's statistics need two
 UNIT_TOLERANCE = 1e-2  # of the length of a unit quaternion; float16 gives 1e-3
 BOUND_TOLERANCE = 1e-5  # float32 next to 1 has steps of 1e-7
@@ -32,7 +33,7 @@ class Rule:
 
     name: str
     answer: Answer
-    check: Callable[[Demonstrations], Iterator[str]]
+    check: Check
     remedy: str
 
 
@@ -201,77 +202,65 @@ def _repetitions(what: Demonstrations) -> Iterator[str]:
         yield f"Episodes have the same numbers in every frame: {some_of(again)}."
 
 
+def _refused(name: str, check: Check, remedy: str) -> Rule:
+    return Rule(name=name, answer="refused", check=check, remedy=remedy)
+
+
+def _kept(name: str, check: Check, remedy: str) -> Rule:
+    return Rule(name=name, answer="kept", check=check, remedy=remedy)
+
+
 _FETCH = "Correct it where the dataset was made."
-FINITE = Rule(name="finite numbers", answer="refused", check=_finite, remedy=_FETCH)
+FINITE = _refused("finite numbers", _finite, _FETCH)
 """Before anything is computed of them: clipping would hide what is infinite."""
 RULES = (
-    Rule(
-        name=f"{FPS} frames per second",
-        answer="refused",
-        check=_frame_rate,
-        remedy="`mikasa-vla dataset convert … --resample` computes them.",
+    _refused(
+        f"{FPS} frames per second", _frame_rate, "`mikasa-vla dataset convert … --resample` computes them."
     ),
-    Rule(
-        name="square images of one size",
-        answer="refused",
-        check=_image_sizes,
-        remedy="`mikasa-vla dataset convert … --image-size PX` scales square ones, or keeps those of "
+    _refused(
+        "square images of one size",
+        _image_sizes,
+        "`mikasa-vla dataset convert … --image-size PX` scales square ones, or keeps those of "
         "this size (env.image_size); crop others.",
     ),
-    Rule(
-        name=f"at least {MIN_FRAMES} frames per episode",
-        answer="refused",
-        check=_lengths,
-        remedy="Delete such episodes (`lerobot-edit-dataset`).",
+    _refused(
+        f"at least {MIN_FRAMES} frames per episode",
+        _lengths,
+        "Delete such episodes (`lerobot-edit-dataset`).",
     ),
     FINITE,
-    Rule(name="unit quaternions", answer="refused", check=_quaternions, remedy=_FETCH),
-    Rule(
-        name="actions within the bounds of their control mode",
-        answer="refused",
-        check=_bounds,
-        remedy="The environment would clip them: `mikasa-vla dataset convert … --clip-actions` stores what "
+    _refused("unit quaternions", _quaternions, _FETCH),
+    _refused(
+        "actions within the bounds of their control mode",
+        _bounds,
+        "The environment would clip them: `mikasa-vla dataset convert … --clip-actions` stores what "
         "it would execute.",
     ),
-    Rule(
-        name="a gripper from -1 (closed) to 1 (open)",
-        answer="refused",
-        check=_gripper,
-        remedy="Name them: `mikasa-vla dataset convert … --gripper 0 1` if 0 closes, `--gripper 1 0` "
+    _refused(
+        "a gripper from -1 (closed) to 1 (open)",
+        _gripper,
+        "Name them: `mikasa-vla dataset convert … --gripper 0 1` if 0 closes, `--gripper 1 0` "
         "if 1 does, `--gripper -1 1` if they are as expected.",
     ),
-    Rule(name="flags that are 0 or 1", answer="refused", check=_flags, remedy=_FETCH),
-    Rule(
-        name="a sentence in each frame",
-        answer="refused",
-        check=_sentences,
-        remedy="Name the task, whose sentence is then used: --task RememberColor3-v0.",
+    _refused("flags that are 0 or 1", _flags, _FETCH),
+    _refused(
+        "a sentence in each frame",
+        _sentences,
+        "Name the task, whose sentence is then used: --task RememberColor3-v0.",
     ),
-    Rule(
-        name="one sentence per episode",
-        answer="refused",
-        check=_one_sentence,
-        remedy="Policies here get one instruction per episode: split the episodes where it changes.",
+    _refused(
+        "one sentence per episode",
+        _one_sentence,
+        "Policies here get one instruction per episode: split the episodes where it changes.",
     ),
-    Rule(
-        name="sentences without blanks around them",
-        answer="kept",
-        check=_plain_sentences,
-        remedy="A policy is asked with exactly this text only if it is evaluated with it.",
+    _kept(
+        "sentences without blanks around them",
+        _plain_sentences,
+        "A policy is asked with exactly this text only if it is evaluated with it.",
     ),
-    Rule(
-        name="one spelling per sentence",
-        answer="kept",
-        check=_alike_sentences,
-        remedy="A policy sees different instructions.",
-    ),
-    Rule(name="done in the last frame alone", answer="kept", check=_done, remedy=""),
-    Rule(
-        name="different episodes",
-        answer="kept",
-        check=_repetitions,
-        remedy="They count twice in training.",
-    ),
+    _kept("one spelling per sentence", _alike_sentences, "A policy sees different instructions."),
+    _kept("done in the last frame alone", _done, ""),
+    _kept("different episodes", _repetitions, "They count twice in training."),
 )
 
 

@@ -41,11 +41,7 @@ def copy_with_actions(
 ) -> DatasetFacts:
     """Write a dataset with the images and states of another one; it appears whole. Return what it is.
 
-    Args:
-        source: the other dataset; it has the same episodes, with other actions.
-        path: the new folder.
-        episodes: what the manifest will say.
-        recipe: says which actions are stored.
+    `episodes` are those of the source with other actions; the recipe says which of these are stored.
 
     Raises:
         DatasetError: the folder is there already, or the source is damaged.

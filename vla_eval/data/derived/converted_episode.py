@@ -59,16 +59,8 @@ def _aims(env: SimEnv, episode: RecordedEpisode) -> tuple[FloatArray, EpisodeLog
             "simulator 'maniskill'."
         )
     log, noted = EpisodeLog(), _AimLog(env)
-    start = EpisodeStart(
-        slot=0,
-        task=episode.task,
-        seed=episode.seed,
-        run=0,
-        instruction=episode.instruction,
-        horizon_steps=episode.n_steps,
-    )
     settings = RolloutSettings(chunking=ONE_BY_ONE)
-    rollout(env, RecordedActions(episode.action_rows()), [start], settings, observers=[log, noted])
+    rollout(env, RecordedActions(episode.action_rows()), [episode.start()], settings, observers=[log, noted])
     return np.stack(noted.aims), log
 
 
@@ -99,9 +91,7 @@ class AimFollower:
     """A policy that aims, in another control mode, where the arm was to go in a recorded episode.
 
     Beyond the recorded steps it continues to aim at the last place: a mode with narrower bounds needs longer.
-
-    Attributes:
-        intended: the actions that aim where the expert wanted to go before noise was added, step by step.
+    Its `intended` actions aim where the expert wanted to go before noise was added.
     """
 
     def __init__(self, aims: FloatArray, episode: RecordedEpisode, *, old_mode: str, mode: str) -> None:

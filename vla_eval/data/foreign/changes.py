@@ -62,11 +62,7 @@ class Changes:
 
 
 def prepare(source: Source, changes: Changes) -> tuple[Source, tuple[str, ...], tuple[str, ...]]:
-    """Return the source with all that is asked for, checked, and sentences on what was converted and kept.
-
-    Raises:
-        DatasetError: it breaks a rule.
-    """
+    """Return the changed source, and sentences on what was converted and kept, if it follows the rules."""
     require_sound(source.demonstrations(expected_px=changes.expected_px), rules=(FINITE,))
     converted = []
     for step in STEPS:

@@ -43,11 +43,7 @@ MAX_FRAMES = 2048  # lerobot drops frames without an error where its queue is fu
 
 
 class ImportWriter:
-    """Writes episodes of one source, whose numbers have the types of our fields, as a dataset at `draft`.
-
-    Raises:
-        DatasetError: an episode is too long, or the source lacks the proprioception of `state`.
-    """
+    """Writes episodes of one source, whose numbers have the types of our fields, as a dataset at `draft`."""
 
     def __init__(self, draft: Path, source: Source, *, task: TaskSpec | None, state: StateKind) -> None:
         self._draft, self._source, self._state, self._task = draft, source, state, task

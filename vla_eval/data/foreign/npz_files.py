@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,12 +70,8 @@ def npz_source(folder: Path, files: Sequence[Path]) -> Source:
 
 
 def read_npz(path: Path) -> tuple[SourceEpisode, Sequence[str]]:
-    """Read one episode, and the names of the arrays in the file that have no place in it.
-
-    Raises:
-        DatasetError: the file is damaged, holds pickled objects, or is of another layout.
-    """
-    names = _names(path)
+    """Read one episode, and the names of the arrays in the file that have no place in it."""
+    names: list[str] = list(_read(path, lambda stored: stored.files))
     for name in (RGB, ACTION):
         if name not in names:
             raise DatasetError(
@@ -114,10 +110,6 @@ def _dims(field: str) -> tuple[int, ...]:
     return (n_dims,) if n_dims > 1 else ()
 
 
-def _names(path: Path) -> list[str]:
-    return list(_read(path, lambda stored: stored.files))
-
-
 def _arrays(path: Path, names: Sequence[str]) -> Arrays:
     arrays: Arrays = _read(path, lambda stored: {name: stored[name] for name in names})
     return arrays
@@ -131,19 +123,17 @@ def _images(path: Path) -> CameraImages:
 
 def _image_shape(path: Path) -> tuple[int, ...]:
     """Return the shape of the images by their header: they are decoded when they are encoded again."""
-    shape, dtype = _read(path, lambda stored: _header(stored.zip.open(f"{RGB}.npy")))
+    shape, dtype = _read(path, _header)
     if dtype != np.uint8:
         raise DatasetError(f"{path}: rgb is {shape} {dtype}, expected uint8.")
     return tuple(shape)
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:  # Any: of any type
-    with file:
+def _header(stored: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # Any: numpy's file; of any type
+    with stored.zip.open(f"{RGB}.npy") as file:
         version = np.lib.format.read_magic(file)  # type: ignore[no-untyped-call]  # numpy 2.2
-        read = (
-            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        )
-        shape, _, dtype = read(file)  # type: ignore[no-untyped-call]
+        name = f"read_array_header_{'1_0' if version == (1, 0) else '2_0'}"
+        shape, _, dtype = getattr(np.lib.format, name)(file)
     return shape, dtype
 
 

@@ -18,10 +18,9 @@ from vla_eval.data.frames.frame_cache import (
     frames_in_ram,
     frames_on_disk,
 )
-from vla_eval.data.rewards import rewards_of
 from vla_eval.data.tables import as_array, holds_numbers
 from vla_eval.errors import DatasetError, check_names
-from vla_eval.features import REWARD_KEY, RewardKind
+from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
 from vla_eval.models.shared.levels import in_numbers
 from vla_eval.strict.renamed import warn_renamed
 
@@ -186,3 +185,30 @@ def _tensor(column: Any) -> Any:  # Any: pyarrow.ChunkedArray; a tensor, or a li
         return column.to_pylist()
     values = as_array(column)
     return torch.from_numpy(np.array(values, dtype=TENSOR_TYPES[values.dtype.kind]))
+
+
+def rewards_of(
+    columns: Mapping[str, Any], bounds: torch.Tensor, kind: RewardKind, *, root: Path
+) -> torch.Tensor:
+    """Return the reward of each row, (N,) float32.
+
+    Args:
+        columns: field -> (N, …).
+        bounds: (N, 2) first and stop row of each row's episode.
+        kind: `dense`: the table's; `sparse`: 1 where the success rule holds for the first time in the
+            episode, else 0, so that the sum over an episode is whether it succeeded once; `success`: 1
+            wherever it holds.
+        root: the dataset's folder, for messages.
+    """
+    key = REWARD_KEY if kind == "dense" else SUCCESS_KEY
+    if key not in columns:
+        raise DatasetError(
+            f"{root}: has no field '{key}', which `reward: {kind}` is read from. Use a dataset with rewards "
+            "(`mikasa-vla record` stores them), or a policy that reads none."
+        )
+    values: torch.Tensor = columns[key].reshape(-1).float()
+    if kind != "sparse":
+        return values
+    n_so_far = values.cumsum(0)
+    n_before_episode = n_so_far[bounds[:, 0]] - values[bounds[:, 0]]
+    return values * (n_so_far - n_before_episode == 1)

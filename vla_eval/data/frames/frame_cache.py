@@ -115,11 +115,7 @@ def dataset_digest(source: FrameSource) -> str:
 
 
 def channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return (channels, height, width) of a camera, whatever the order of its description.
-
-    Raises:
-        DatasetError: it is not an RGB image, or it is not known which axis is which.
-    """
+    """Return (channels, height, width) of an RGB camera, in whichever order they are described."""
     # lerobot's own datasets call the last one `channel` as well as `channels`.
     names = [{"channel": "channels"}.get(str(name), name) for name in feature.get("names") or ()]
     shape = tuple(feature["shape"])
@@ -138,11 +134,7 @@ def channels_first(feature: Mapping[str, Any]) -> tuple[int, int, int]:
 
 
 def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
-    """Yield the (T, 3, H, W) uint8 frames of each episode in turn.
-
-    Raises:
-        DatasetError: a video cannot be read, or holds no frame at a time where there must be one.
-    """
+    """Yield the (T, 3, H, W) uint8 frames of each episode in turn; `DatasetError` where a video lacks one."""
     dataset = source.dataset
     for episode in source.episodes:
         row = dataset.meta.episodes[episode.index]
@@ -168,11 +160,7 @@ def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
 
 
 def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
-    """Decode all frames into this process's RAM.
-
-    Raises:
-        DatasetError: they do not fit, or a video cannot be read.
-    """
+    """Decode all frames into this process's RAM, or raise `DatasetError`."""
     free = available_ram_bytes()
     if free is not None and source.n_bytes + HEADROOM_BYTES > free:
         raise DatasetError(

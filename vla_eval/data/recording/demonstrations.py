@@ -99,11 +99,9 @@ class RecordedActions:
 class NoisyEnv:
     """A `SimEnv` whose arm is pushed: noise is added to the action before it is executed.
 
-    The expert sees where it has got to and corrects it: its answer is what a policy learns to recover
-    by. The gripper gets no noise, since no expert corrects its width.
-
-    `std` is the standard deviation in each dimension of the arm, in units of a delta action; in a mode
-    that is given m and rad, a tenth of it.
+    The expert sees where it has got to and corrects it: its answer is what a policy learns to recover by. The
+    gripper gets no noise, since no expert corrects its width. The standard deviation of each dimension is in
+    units of a delta action; in a mode that is given m and rad, a tenth of it.
     """
 
     def __init__(self, env: SimEnv, std: float) -> None:
@@ -210,11 +208,7 @@ def replay_actions(
 def replay_attempt(
     env: SimEnv, start: EpisodeStart, attempt: Attempt, *, heartbeat: Callable[[Stage], None]
 ) -> EpisodeLog:
-    """Replay an attempt, with images.
-
-    Raises:
-        RecordingError: the states are not those of the attempt.
-    """
+    """Replay an attempt, with images (`RecordingError` if the states are not those of the attempt)."""
     actions = decode_actions(attempt.actions, n_dims=len(env.spec.action.dims))
     log = replay_actions(env, start, actions, heartbeat=heartbeat, with_pictures=True)
     if states_digest(log.results) != attempt.states_sha256:

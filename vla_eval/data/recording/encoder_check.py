@@ -20,11 +20,7 @@ N_COLOURS = 3
 
 
 def check_encoder(settings: EncoderSettings) -> None:
-    """Encode one frame, unless the encoder belongs to a device.
-
-    Raises:
-        RecipeError: there is no such encoder, or it does not take the format or the quality.
-    """
+    """Encode one frame, unless the encoder is a device's; `RecipeError` if it takes no such settings."""
     name = ALIASES.get(settings.vcodec, settings.vcodec)
     known = (*SOFTWARE, *OF_A_DEVICE)
     if name not in known:

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Self
 
 from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.jobs import Origin
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
 from vla_eval.storage.continuing import (
@@ -31,7 +32,7 @@ from vla_eval.storage.continuing import (
 )
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder, whole_lines
 from vla_eval.storage.folders import other_files
-from vla_eval.storage.run_file import RUN_FILE, JsonValue, RunDescription, RunFile
+from vla_eval.storage.run_file import RUN_FILE, RunDescription, RunFile
 from vla_eval.storage.starting import StartedFolder, starting
 from vla_eval.strict.json_text import Source, as_dataclass, read_json
 
@@ -93,21 +94,17 @@ class RecordingFolder:
         self._started.lock.release()
 
     @property
-    def environment(self) -> Mapping[str, JsonValue]:
-        """The environment that the recording was started in, without the device."""
-        return without_device(self._run_file.description.environment)
-
-    @property
-    def device(self) -> dict[str, str]:
-        """What is known of the device that renders the images."""
-        return device_of(self._run_file)
+    def origin(self) -> Origin:
+        """With what it is made."""
+        return origin_of(self._run_file)
 
     def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
         """Record the device: all images of a dataset come from one, or `RunChangedError` is raised."""
         changes = device_changes(self._run_file, device)
         check_allowed(changes, shown=self.out, allowed=allow_change)
-        if dict(device) != self.device:
-            self._run_file = self._run_file.with_device({**self.device, **device}, changes)
+        known = known_device(self._run_file)
+        if dict(device) != known:
+            self._run_file = self._run_file.with_device({**known, **device}, changes)
             self._run_file.save(self.out / STATE_FOLDER)
 
     def logs(self) -> Path:
@@ -147,9 +144,14 @@ def shard_path(out: Path, task: str, index: int) -> Path:
     return out / STATE_FOLDER / task / SHARDS / f"shard-{index:05d}"
 
 
-def device_of(run_file: RunFile) -> dict[str, str]:
-    """Return what is known of the device that renders the images."""
-    return {name: str(value) for name, value in known_device(run_file).items()}
+def origin_of(run_file: RunFile) -> Origin:
+    """Return with what a recording was made: as it was started, and the device that rendered."""
+    started = run_file.description
+    return Origin(
+        recipe_files=started.recipes,
+        environment=without_device(started.environment),
+        device={name: str(value) for name, value in known_device(run_file).items()},
+    )
 
 
 def remove_shards(out: Path, task: str) -> None:

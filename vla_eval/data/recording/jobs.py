@@ -3,10 +3,9 @@
 Knows nothing of lerobot, simulators or processes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
 from vla_eval.config.files import content_of
@@ -16,13 +15,6 @@ from vla_eval.data.manifest import FailedSeed
 from vla_eval.data.recording.demonstrations import SLOT, Attempt
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.storage.run_file import JsonValue
-
-
-class SetupKey(NamedTuple):
-    """What the jobs share that one environment can do."""
-
-    task: str
-    kind: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,9 +50,9 @@ class _TaskJob:
     plan: TaskPlan
 
     @property
-    def setup_key(self) -> SetupKey:
+    def setup_key(self) -> Hashable:
         """Jobs of one class share an environment."""
-        return SetupKey(self.plan.task, type(self).__name__)
+        return (self.plan.task, type(self))
 
     @property
     def n_items(self) -> int:
@@ -101,11 +93,9 @@ class ShardJob(_TaskJob):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JoinJob(_TaskJob):
-    """Put all shards of a task together, in order; the answer is a `DatasetWritten`.
+    """Put all shards of a task together at `path`; the answer is a `DatasetWritten`.
 
-    Attributes:
-        path: where the dataset is to appear; its draft is written in the folder of the shards.
-        facts: the dataset's, without counts and digests.
+    Its draft is written in the folder of the shards; `facts` are without counts and digests.
     """
 
     path: Path

@@ -12,21 +12,19 @@ from typing import NamedTuple
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.facts import DatasetFacts
-from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import (
     ATTEMPTS_FILE,
     STATE_FOLDER,
-    device_of,
+    origin_of,
     read_attempts,
     remove_shards,
     shard_path,
 )
-from vla_eval.data.recording.jobs import AttemptJob, Origin, TaskPlan, join_job, shard_jobs
+from vla_eval.data.recording.jobs import TaskPlan, join_job, shard_jobs
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.seed_queue import SeedQueue, Selection
 from vla_eval.data.recording.worker import join_dataset
 from vla_eval.errors import MergeError
-from vla_eval.storage.continuing import without_device
 from vla_eval.storage.drafts import link_tree, whole_folder
 from vla_eval.storage.durable import replace_file, storage_full
 from vla_eval.storage.run_file import RunFile, find_changes, listed
@@ -53,10 +51,6 @@ class _Tried(NamedTuple):
 
     folder: Path
     selection: Selection
-
-    def attempts(self) -> list[Attempt]:
-        """Return all that the selection depends on, by seed."""
-        return sorted((*self.selection.kept, *self.selection.failed), key=lambda attempt: attempt.seed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,15 +156,13 @@ def _of_task(task: TaskPlan, part: ShardPart) -> str:
 
 def _selection(task: TaskPlan, part: ShardPart) -> Selection | None:
     """Return what a part has chosen; None if it has not tried all seeds."""
-    queue = SeedQueue(
-        task.recipe, read_attempts(part.path, task.task), lambda seed: AttemptJob(plan=task, seed=seed)
-    )
+    queue = SeedQueue(task, read_attempts(part.path, task.task))
     return None if queue.has_next() else queue.selection()
 
 
 def _refuse_other_attempts(task: TaskPlan, first: _Tried, other: _Tried) -> None:
     """Raise `MergeError` where the expert has acted differently: the machines do not compute the same."""
-    pairs = zip(first.attempts(), other.attempts(), strict=False)
+    pairs = zip(first.selection.attempts(), other.selection.attempts(), strict=False)
     differing = next((one.seed for one, two in pairs if one != two), None)
     if differing is not None:
         raise MergeError(
@@ -181,14 +173,11 @@ def _refuse_other_attempts(task: TaskPlan, first: _Tried, other: _Tried) -> None
 
 
 def _join(task: MergedTask, run_file: RunFile, draft: Path) -> DatasetFacts:
-    origin = Origin(
-        recipe_files=run_file.description.recipes,
-        environment=without_device(run_file.description.environment),
-        device=device_of(run_file),
-    )
     name = task.plan.task
     jobs = shard_jobs(task.plan, task.selection.kept, lambda index: shard_path(draft, name, index))
-    job = join_job(task.plan, draft / name, shards=jobs, failed=task.selection.failed, origin=origin)
+    job = join_job(
+        task.plan, draft / name, shards=jobs, failed=task.selection.failed, origin=origin_of(run_file)
+    )
     facts = join_dataset(job).facts
     remove_shards(draft, name)
     return facts

@@ -22,10 +22,8 @@ from vla_eval.data.manifest import RECORDING_FILE, FailedSeed, read_failed, read
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import RecordingFolder, remove_shards
 from vla_eval.data.recording.jobs import (
-    AttemptJob,
     DatasetWritten,
     JoinJob,
-    Origin,
     RecordingAnswer,
     RecordingJob,
     ShardJob,
@@ -123,10 +121,7 @@ class RecordedPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSummary:
-    """What one call of `record` has come to; fewer datasets than tasks if it was stopped.
-
-    A part of a recording has no datasets yet.
-    """
+    """What one call of `record` has made: of a part no datasets, and fewer than tasks if it was stopped."""
 
     out: Path
     datasets: tuple[RecordedDataset, ...]
@@ -257,11 +252,7 @@ class _Recorder:
         return shard_jobs(task, selection.kept, functools.partial(self.folder.shard, task.task))
 
     def _try_seeds(self, task: TaskPlan) -> Selection:
-        queue = SeedQueue(
-            task.recipe,
-            self.folder.attempts(task.task),
-            lambda seed: AttemptJob(plan=task, seed=seed),
-        )
+        queue = SeedQueue(task, self.folder.attempts(task.task))
         self._begin(task, "trying seeds", n_done=queue.n_kept)
         for _, answer in self._answers(queue):
             assert isinstance(answer, Attempt)
@@ -282,18 +273,13 @@ class _Recorder:
 
     def _join(self, task: TaskPlan, selection: Selection, shards: Sequence[ShardJob]) -> None:
         self._begin(task, "joining", n_done=0)
-        origin = Origin(
-            recipe_files=self.plan.recipe_files,
-            environment=self.folder.environment,
-            device=self.folder.device,
-        )
         path = self.folder.out / task.task
-        job = join_job(task, path, shards=shards, failed=selection.failed, origin=origin)
+        job = join_job(task, path, shards=shards, failed=selection.failed, origin=self.folder.origin)
         for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)
 
     def _answers(
-        self, queue: SeedQueue[AttemptJob] | JobList[ShardJob] | JobList[JoinJob]
+        self, queue: SeedQueue | JobList[ShardJob] | JobList[JoinJob]
     ) -> Iterable[tuple[RecordingJob, RecordingAnswer]]:
         """Run the jobs, each again if it fails once; yield each with its answer when it is done."""
         n_failed: Counter[str] = Counter()

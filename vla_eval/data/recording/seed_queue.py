@@ -4,12 +4,11 @@ Kept are the N lowest seeds at which the expert succeeds. A seed is tried only i
 it are known to succeed or are being tried, so that none is left out and few are tried in vain.
 """
 
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
-from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.recording.demonstrations import Attempt
+from vla_eval.data.recording.jobs import AttemptJob, TaskPlan
 from vla_eval.errors import RecordingError
 
 
@@ -20,24 +19,17 @@ class Selection:
     kept: tuple[Attempt, ...]
     failed: tuple[Attempt, ...]
 
-
-class SeedJob(Protocol):
-    """A job of one seed."""
-
-    @property
-    def seed(self) -> int:
-        """The seed to try."""
+    def attempts(self) -> list[Attempt]:
+        """Return all that the selection depends on, by seed."""
+        return sorted((*self.kept, *self.failed), key=lambda attempt: attempt.seed)
 
 
-class SeedQueue[J: SeedJob]:
+class SeedQueue:
     """A `JobSource` of seeds to try; `known` are the attempts of earlier sessions."""
 
-    def __init__(
-        self, recipe: DatasetRecipe, known: Mapping[int, Attempt], make_job: Callable[[int], J]
-    ) -> None:
-        self._recipe = recipe
+    def __init__(self, plan: TaskPlan, known: Mapping[int, Attempt]) -> None:
+        self._plan, self._recipe = plan, plan.recipe
         self._known = dict(known)
-        self._make_job = make_job
         self._in_flight: set[int] = set()
 
     def has_next(self) -> bool:
@@ -49,20 +41,20 @@ class SeedQueue[J: SeedJob]:
         """How many of the known attempts are kept so far."""
         return min(self._recipe.episodes, sum(self._keeps(one) for one in self._known.values()))
 
-    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> J | None:
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> AttemptJob | None:
         """Return the next job; see `workers.JobSource`."""
         seed = self._next()
         if seed is None:
             return None
         self._in_flight.add(seed)
-        return self._make_job(seed)
+        return AttemptJob(plan=self._plan, seed=seed)
 
     def add(self, attempt: Attempt) -> None:
         """Record a seed's result."""
         self._in_flight.discard(attempt.seed)
         self._known[attempt.seed] = attempt
 
-    def give_back(self, job: J) -> None:
+    def give_back(self, job: AttemptJob) -> None:
         """A seed could not be tried: it is handed out again."""
         self._in_flight.discard(job.seed)
 

@@ -141,17 +141,10 @@ def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: in
         task=plan.task,
         task_version=plan.task_version,
         env_kwargs=dict(plan.group.env.kwargs),
-        seed=one.seed,
         instruction=plan.group.instruction,
         expert=plan.group.key.policy,
         expert_version=plan.expert_version,
-        cue_steps=one.cue_steps,
-        delay_steps=one.delay_steps,
-        n_steps=one.n_steps,
-        success_step=one.success_step,
-        actions=one.actions,
-        intended_actions=one.intended_actions,
-        states_sha256=one.states_sha256,
+        **dataclasses.asdict(one),
         images_sha256=images_digests([result.observation.images for result in log.results[:-1]]),
     )
 

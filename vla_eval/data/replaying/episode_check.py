@@ -74,12 +74,7 @@ def check_pictures(
 ) -> ImageCheck:
     """Compare rendered images with the manifest's digests, and the video with the images.
 
-    Args:
-        episode: what the manifest says.
-        frames: camera -> rendered image, per step.
-        decoded: camera -> frames of the video.
-        expect_equal_bits: whether the images must be bit-equal to the recorded ones.
-        min_psnr_db: how close the video must come to the rendered images.
+    `frames` has the images per step, `decoded` those of the video per camera.
     """
     found = []
     fresh = images_digests(frames)

@@ -7,19 +7,26 @@ the dataset, so that training can refuse one that fails.
 
 import functools
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.facts import DatasetFacts, read_facts
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, RecordedEpisode, ReplayReport, read_manifest
+from vla_eval.data.manifest import (
+    MIXTURE_FILE,
+    RECORDING_FILE,
+    RecordedEpisode,
+    ReplayReport,
+    keep_report,
+    manifest_sha256,
+    read_manifest,
+)
 from vla_eval.data.recording.record import RecordingObserver
-from vla_eval.data.replay_report import keep_report, manifest_sha256
 from vla_eval.data.replaying.episode_check import STATE_TOLERANCE
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
 from vla_eval.features import CAMERA_KEYS
@@ -40,13 +47,6 @@ MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver
 """What of the environment may move the last bits of a state or a pixel."""
 
 
-class ReplayKey(NamedTuple):
-    """What the episodes of one dataset share."""
-
-    dataset: Path
-    pixels: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayJob:
     """One episode to replay; `device` is the one that rendered the recording's images."""
@@ -59,9 +59,9 @@ class ReplayJob:
     device: Mapping[str, str]
 
     @property
-    def setup_key(self) -> ReplayKey:
+    def setup_key(self) -> Hashable:
         """See `workers.Job`."""
-        return ReplayKey(self.dataset, self.pixels)
+        return (self.dataset, self.pixels)
 
     @property
     def n_items(self) -> int:
@@ -112,17 +112,10 @@ def replay(
     workers: int | Literal["auto"] = "auto",
     backend: Backend = LOCAL,
 ) -> ReplayReport | None:
-    """Replay episodes of a dataset; the report of a whole dataset is written into it.
+    """Replay episodes of a dataset, by default all, and compare images, too, if `pixels`.
 
-    Args:
-        dataset: the dataset's folder.
-        logs: folder for what the workers write.
-        observer: gets progress and mismatches.
-        episodes: their numbers; None: all. A report of a part is returned, and not written over one of
-            the whole unless it has found a mismatch.
-        pixels: compare images, too.
-        workers: processes.
-        backend: where they run.
+    The report of a whole dataset is written into it; that of a part only if it has found a mismatch. `logs`
+    is a folder for what the workers write.
 
     Returns:
         The report; None if the observer asked to stop.

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from vla_eval.core import EpisodeStart, ImageArray
+from vla_eval.core import ImageArray
 from vla_eval.data.manifest import RecordedEpisode
 from vla_eval.data.opening import LocalDataset, read_sample
-from vla_eval.data.recording.demonstrations import SLOT, replay_actions
+from vla_eval.data.recording.demonstrations import replay_actions
 from vla_eval.data.replaying.episode_check import MIN_PSNR_DB, check_pictures, check_rows, check_states
 from vla_eval.data.replaying.replay import EpisodeReplayed, ReplayJob
 from vla_eval.data.simulator_runner import SimulatorRunner
@@ -27,16 +27,12 @@ class ReplayRunner(SimulatorRunner[ReplayJob, EpisodeReplayed]):
         episode = job.episode
         env = self._make_env(job.env)
         dataset = self._opened(job)
-        start = EpisodeStart(
-            slot=SLOT,
-            task=episode.task,
-            seed=episode.seed,
-            run=0,
-            instruction=episode.instruction,
-            horizon_steps=episode.n_steps,
-        )
         log = replay_actions(
-            env, start, episode.action_rows(), heartbeat=self._heartbeat, with_pictures=job.pixels
+            env,
+            episode.start(),
+            episode.action_rows(),
+            heartbeat=self._heartbeat,
+            with_pictures=job.pixels,
         )
         self._heartbeat("setup")
         rows = rows_of_episode(dataset.columns, episode.episode_index)

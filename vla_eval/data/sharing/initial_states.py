@@ -88,11 +88,7 @@ def _first_frames(episode: SourceEpisode) -> Frames:
 
 
 def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, Simulator]:
-    """Return seeds, task and simulator as far as `meta/mikasa` knows them.
-
-    Raises:
-        DatasetError: the dataset is one of several tasks, whose seeds are episodes of each.
-    """
+    """Return seeds, task and simulator as far as `meta/mikasa` knows them, or raise `DatasetError`."""
     root, n_episodes = source.path, len(source.episodes)
     facts = find_facts(root)
     if isinstance(facts, MixtureFacts):
