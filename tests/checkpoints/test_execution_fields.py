@@ -17,6 +17,7 @@ from lerobot.configs import PreTrainedConfig
 
 from tests.checkpoints import small_checkpoints
 from tests.checkpoints.small_checkpoints import act_config, context_for, copied
+from tests.evaluation.resolved import make_plan
 from tests.training.lerobot_tiny import lerobots_types
 from vla_eval.checkpoints.execution_fields import EXECUTION_FIELDS, ignored_fields, without_execution
 from vla_eval.checkpoints.files import CONFIG_FILE
@@ -25,7 +26,6 @@ from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED, 
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.specs import EnvSpec

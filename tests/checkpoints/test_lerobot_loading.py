@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.checkpoints import small_checkpoints
 from tests.checkpoints.small_checkpoints import FACTS, TASK, context_for, copied
+from tests.evaluation.resolved import plan_shard
 from vla_eval.checkpoints import loading as lerobot_loading
 from vla_eval.checkpoints.files import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.checkpoints.loading import (
@@ -28,7 +29,6 @@ from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.policies.entries import load_policy_entries
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.evaluation.resolved import evaluate
 from tests.results.stored_runs import stored
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
-from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.power import discordance_of_independent, episodes_to_settle

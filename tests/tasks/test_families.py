@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.evaluation.resolved import make_plan
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.environment import EnvSettings
@@ -12,7 +13,6 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import TaskArgumentError, UnknownNameError
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_cue_blind, make_oracle
 from vla_eval.rollout import RolloutSettings, rollout

@@ -14,6 +14,7 @@ from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.testing.check_policy import check_policy
@@ -47,7 +48,7 @@ def check_recipe(
         slots_per_worker=N_SLOTS,
         simulator="fake",
     )
-    plan = make_plan(config)
+    plan = make_plan(resolve(config))
     for line in (*(f"warning: {one}" for one in plan.warnings), *(f"note: {one}" for one in plan.notes)):
         say(line)
     group = plan.jobs[0].group

@@ -23,6 +23,7 @@ from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
 from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -98,8 +99,8 @@ class HeldOut:
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
         stops = _UntilStopped(self.is_stopping, functools.partial(self._warn, checkpoint))
-        config = self._config(checkpoint)
-        if evaluate(config, out=folder, allow_environment_change=True, observer=stops).was_stopped:
+        resolved = resolve(self._config(checkpoint), out=folder)
+        if evaluate(resolved, allow_environment_change=True, observer=stops).was_stopped:
             return
         records = read_run(folder).records
         results = [bool(record.success_once) for record in records if record.error is None]

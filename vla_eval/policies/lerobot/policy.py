@@ -19,7 +19,7 @@ Three kinds of policies, told apart by their configuration:
 Any of them may be shown earlier frames as further images: see `vla_memory/`.
 
 Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
-they are asked for one action at each control step, with queues of each episode; see `checkpoints.select_step`.
+they are asked for one action at each control step, with queues of each episode (`checkpoints.select_step`).
 """
 
 from collections.abc import Mapping, Sequence
