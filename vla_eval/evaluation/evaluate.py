@@ -161,7 +161,7 @@ def worker_count(resolved: ResolvedEvaluation, plan: Plan, *, n_jobs: int) -> in
 
 
 def describe(resolved: ResolvedEvaluation, plan: Plan, command: str) -> RunDescription:
-    """Return what `run.json` says of the run."""
+    """Return the run's description, for `run.json`."""
     return RunDescription(
         name=resolved.config.name,
         config={
@@ -288,7 +288,7 @@ class _Bookkeeper:
         """Store the results, or the error in their place."""
         batch, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
-            # A group that has worked before is no mistake of the user: a GPU was lost, for example.
+            # A group that has worked before is not a user's mistake: a GPU was lost, for example.
             if answer.refused and batch.setup_key not in self.proven:
                 raise as_exception(answer.error)
             if len(batch.jobs) > 1:

@@ -48,7 +48,7 @@ class Plan:
             policies, and the datasets that these were trained on (another dataset of the same name is
             `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
-        servers: policy behind a socket -> what its server says of itself.
+        servers: policy behind a socket -> its server's metadata.
         sentences: policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was
             trained with, see `Sentences`; None where that is not known.
         training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose

@@ -1,6 +1,6 @@
 """Where jobs run: what the process pool of this machine and a cluster have in common.
 
-Evaluations, audits, probes, recordings and replays take a `Backend` and do not know which. Whoever plans
+Evaluations, audits, probes, recordings and replays take a `Backend` and do not know which. Code that plans
 the jobs is the only one that writes results.
 """
 
@@ -60,7 +60,7 @@ class Service(Protocol):
         Raises:
             EOFError: it has ended, and all that it sent has been returned.
             OSError: the connection is broken.
-            BrokenMessageError: what has come is no message.
+            BrokenMessageError: what has come is not a message.
         """
 
     def has_ended(self) -> bool:

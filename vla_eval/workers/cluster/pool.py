@@ -24,7 +24,7 @@ from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS
 
 TICK_SECONDS = 0.2
-MAX_LOSSES = 3  # of one job: whoever takes it dies, so it is probably the cause
+MAX_LOSSES = 3  # of one job: each worker that takes it dies, so it is probably the cause
 CALL_SECONDS = 1.0  # short jobs are handed out together until a call takes about so long
 MAX_JOBS_PER_CALL = 16
 
