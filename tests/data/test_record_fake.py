@@ -26,12 +26,12 @@ from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.dataset_folder import check_dataset, open_recorded
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
+from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import LOCK_FILE, STATE_FOLDER
 from vla_eval.data.recording.jobs import AttemptJob, ShardJob
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.record import RecordedDataset, record
-from vla_eval.data.recording.record import record as recording_module
 from vla_eval.data.recording.shard_writer import ShardWriter
 from vla_eval.data.recording.worker import RecordingRunner
 from vla_eval.data.replaying import replay as replay_module

@@ -11,7 +11,7 @@ from vla_eval.cli.main import main
 from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.manifest import read_manifest
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.recording.record import record as recording_module
+from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.shard_writer import Format, create_dataset
 from vla_eval.data.replaying import replay as replay_module
 from vla_eval.data.replaying.report import require_passed

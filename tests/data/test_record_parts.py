@@ -10,10 +10,10 @@ from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.manifest import read_manifest
+from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.folder import ATTEMPTS_FILE, STATE_FOLDER, shard_path
 from vla_eval.data.recording.merging import merge_recordings, write_recording
 from vla_eval.data.recording.record import RecordingSummary, record
-from vla_eval.data.recording.record import record as recording_module
 from vla_eval.errors import MergeError, RecipeError
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.decoding import decode

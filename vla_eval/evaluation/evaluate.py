@@ -34,7 +34,7 @@ from vla_eval.workers.backend import Pool
 from vla_eval.workers.jobs import Answered, MachineKind
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.process import WorkerMain
+from vla_eval.workers.process import WorkerMain, WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.evaluation.worker"
@@ -191,8 +191,14 @@ def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
 def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
     """Run the episodes that have no result; return whether the observer stopped it."""
     logs, resolved = bookkeeper.path / "logs", bookkeeper.resolved
-    config, backend = resolved.config, resolved.backend
     logs.mkdir(exist_ok=True)
+    spec = WorkerSpec(
+        main=_worker_main(bookkeeper),
+        answers=(Finished,),
+        timeouts=resolved.config.timeouts,
+        logs=logs,
+        preload=_modules(resolved.config, plan),
+    )
     for phase in phases(plan):
         if not JobQueue(phase.jobs, finished=finished).n_episodes:
             continue
@@ -202,14 +208,8 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
                 if ready is None:
                     return True
                 bookkeeper.queue = JobQueue(ready.jobs, finished={*finished, *bookkeeper.keys})
-                pool: EpisodePool = backend.pool(
-                    _worker_main(bookkeeper),
-                    answers=(Finished,),
-                    size=worker_count(resolved, plan, n_jobs=bookkeeper.queue.n_batches),
-                    timeouts=config.timeouts,
-                    logs=logs,
-                    preload=_modules(config, plan),
-                )
+                size = worker_count(resolved, plan, n_jobs=bookkeeper.queue.n_batches)
+                pool: EpisodePool = resolved.backend.pool(spec, size=size)
                 ending = _run(ready, bookkeeper, pool, is_last_start=n_starts == MAX_SERVER_STARTS)
             if ending == "stopped":
                 return True

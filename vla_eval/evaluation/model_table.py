@@ -106,7 +106,7 @@ class ModelTable:
         steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
         run_seeds: one fine-tuning each; the SEM is over them.
         episodes, seed_start: of each evaluation.
-        controls: scripted policies in addition to the rows of a task, at each of their numbers of action steps.
+        controls: scripted policies next to the rows of a task, at each of their numbers of action steps.
         protocol: the published protocol whose summary figure is printed below the table; None: none.
         simulator: what the evaluations run on.
         env: arguments of all tasks, such as the control mode of the datasets.

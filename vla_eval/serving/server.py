@@ -192,7 +192,7 @@ class PolicyServer:
             self._connections.discard(connection)
 
     def _answer_http(self, socket: ServerConnection, request: Request) -> Response | None:
-        """Answer requests other than WebSockets, refuse browsers and clients without the key; None: a WebSocket."""
+        """Answer anything but a WebSocket, refuse browsers and clients without the key; None: a WebSocket."""
         if request.path == "/healthz":
             return socket.respond(http.HTTPStatus.OK, "OK\n")
         if self._is_stopping:
