@@ -43,11 +43,12 @@ def check_task(
     env = make_env(settings)
     try:
         _check_phases(env)
-        idle = _play(env, task, "hold", n_episodes)
+        n_candidates = task_spec(task).n_candidates(settings.kwargs)
+        idle = _play(env, task, "hold", n_episodes, n_candidates=n_candidates)
         idle_wins = any(record.success_once for record in idle)
         may_idle = task_spec(task).idle_success > 0
         claim(may_idle or not idle_wins, f"{task}: doing nothing never succeeds.")
-        expert = _play(env, task, "oracle", n_episodes)
+        expert = _play(env, task, "oracle", n_episodes, n_candidates=n_candidates)
         rate = sum(bool(record.success_once) for record in expert) / n_episodes
         claim(rate >= MIN_ORACLE_SUCCESS, f"{task}: the oracle succeeds.", f"{rate:.2f} of {n_episodes}")
         right = all(record.first_choice_success is not False for record in expert if record.success_once)
@@ -68,9 +69,8 @@ def _check_phases(env: SimEnv) -> None:
     claim(seen[-1] == "response", f"{env.spec.task}: the response phase begins before the horizon.")
 
 
-def _play(env: SimEnv, task: str, policy: str, n_episodes: int) -> list[EpisodeRecord]:
+def _play(env: SimEnv, task: str, policy: str, n_episodes: int, *, n_candidates: int) -> list[EpisodeRecord]:
     chunking = ChunkingSpec(n_action_steps=1)
-    n_candidates = int(getattr(env, "n_candidates", 0))
     context = PolicyContext(name=policy, env=env.spec, chunking=chunking, n_candidates=n_candidates)
     made = scripted.make_hold(context) if policy == "hold" else scripted.make_oracle(context)
     records = []
