@@ -19,7 +19,7 @@ from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
-from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
+from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.families import check_argument, check_arguments
@@ -252,7 +252,7 @@ class FakeEnv:
             phase=self._phase(episode),
             success=success and not is_lost,
             fail=is_lost,
-            target=_only(episode.targets),
+            target=only_one(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=self._chance(),
             candidate_places=places_from_right(episode.candidates_m[:, :2]),
@@ -317,7 +317,7 @@ class FakeEnv:
             tcp_velocity_m_s=episode.tcp_velocity_m_s.copy(),
             gripper_width_m=episode.gripper_width_m,
             candidate_positions_m=episode.candidates_m.copy(),
-            target=_only(episode.targets),
+            target=only_one(episode.targets),
             right_candidates=episode.targets,
             shown_candidates=episode.targets if self._is_in_view(episode) else (),
             in_order=self._in_order,
@@ -356,10 +356,6 @@ def _check_ranges(arguments: Mapping[str, Any], *, n_items: int, where: str) -> 
     speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
     if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
         raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")
-
-
-def _only(targets: tuple[int, ...]) -> int | None:
-    return targets[0] if len(targets) == 1 else None
 
 
 def make_fake_env(settings: EnvSettings) -> FakeEnv:

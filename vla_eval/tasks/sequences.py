@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.choice import Place
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
-from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.memory_env import Place, nearness
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
 from vla_eval.tasks.spec import chance_of_several, total_cue_steps
 

@@ -12,6 +12,7 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls import scripted
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.task_state import PHASES
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_env import check_env
 from vla_eval.testing.claims import claim
@@ -58,14 +59,13 @@ def check_task(
 
 
 def _check_phases(env: SimEnv) -> None:
-    order = ("cue", "delay", "response")
     result = env.reset({0: 1}, render=False)[0]
     seen = [result.status.phase]
     for _ in range(env.spec.horizon_steps):
         result = env.step({0: env.hold_action(0)}, render=frozenset())[0]
         seen.append(result.status.phase)
-    ranks = [order.index(phase) for phase in seen]
-    claim(ranks == sorted(ranks), f"{env.spec.task}: phases come in the order {', '.join(order)}.")
+    ranks = [PHASES.index(phase) for phase in seen if phase is not None]
+    claim(ranks == sorted(ranks), f"{env.spec.task}: phases come in the order {', '.join(PHASES)}.")
     claim(seen[-1] == "response", f"{env.spec.task}: the response phase begins before the horizon.")
 
 
