@@ -92,7 +92,7 @@ class EpisodeLog:
         """Whether the episode ends here.
 
         Args:
-            steps_after_success: it ends so many steps after the first success; None: it goes on.
+            steps_after_success: it ends so many steps after the first success; None: success does not end it.
         """
         is_won = (
             steps_after_success is not None
