@@ -17,6 +17,7 @@ from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -53,7 +54,7 @@ def check_recipe(
         say(line)
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
-    facts = EnvFacts(shown.spec, shown.n_candidates)
+    facts = EnvFacts(shown.spec, task_spec(task).n_candidates(config.env))
     first = make_policy(group, facts)
     made = [first]  # given to the check first: weights take long to load
     met = check_policy(
@@ -80,9 +81,7 @@ class _Shown:
     def __init__(self, settings: EnvSettings) -> None:
         self._settings = settings
         self._seen: dict[int, list[Observation]] = {}
-        env = FakeEnv(settings)
-        self.spec = env.spec
-        self.n_candidates = env.reset({0: 1}, render=False)[0].status.n_candidates
+        self.spec = FakeEnv(settings).spec
 
     def observe(self, seed: int, step: int) -> Observation:
         """Return the observation after so many control steps."""
