@@ -26,13 +26,6 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
-import vla_eval.models.memory.configuration_memory  # importing it registers
-import vla_eval.models.octo.configuration_octo
-import vla_eval.models.offline_rl.configuration_offline_rl
-import vla_eval.models.openvla.configuration_openvla
-import vla_eval.models.sequence.configuration_sequence
-import vla_eval.models.spatialvla.configuration_spatialvla
-import vla_eval.models.vla_memory.configuration_vla_memory  # noqa: F401  as above
 from vla_eval.checkpoints.adapter_config import read_adapter_config
 from vla_eval.checkpoints.config_check import check_config, check_features
 from vla_eval.checkpoints.execution_fields import without_execution
@@ -48,24 +41,18 @@ from vla_eval.checkpoints.files import (
 )
 from vla_eval.checkpoints.foreign_code import no_foreign_code, only_data
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly, says_what_is_missing
-from vla_eval.checkpoints.policy_types import CANNOT_BE_ASKED
 from vla_eval.checkpoints.processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.checkpoints.saved_processor import refuse_built_in_normalization
 from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
+from vla_eval.models.families import family_of, register_families
 from vla_eval.models.shared.empty_weights import empty_weights
 from vla_eval.models.shared.weight_file import WeightFile
 from vla_eval.models.shared.weights import check_same, put_weights
 
+register_families()
+
 # Fields that make a constructor fetch weights which the checkpoint is about to replace.
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
-
-BUILT_EMPTY = frozenset(
-    {
-        *("pi0", "pi05", "pi0_fast", "smolvla", "mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"),
-        *("mikasa_pi0", "mikasa_pi05", "mikasa_smolvla"),
-    }
-)
-"""Types whose constructors do not compute with their weights: they are built without memory for them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,6 +176,7 @@ def config_class(kind: str, *, where: str) -> Any:
     Raises:
         CheckpointError: there is no such type, or one that this loop cannot ask for chunks.
     """
+    register_families()
     _register_plugins(_search_path())
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
@@ -196,10 +184,11 @@ def config_class(kind: str, *, where: str) -> Any:
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
         )
-    if kind in CANNOT_BE_ASKED:
+    why_not = family_of(kind).why_not
+    if why_not:
         raise CheckpointError(
             f"{where}: a LeRobot policy of type '{kind}' cannot be evaluated in this loop, which asks for "
-            f"whole chunks and hides no frame: {CANNOT_BE_ASKED[kind]}. For it there is "
+            f"whole chunks and hides no frame: {why_not}. For it there is "
             "LeRobot's own loop: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
         )
     return PreTrainedConfig.get_choice_class(kind)
@@ -266,7 +255,7 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
 
 def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:
     """Return a policy that is about to be filled, or only counted: large ones have no memory for weights."""
-    with empty_weights() if config.type in BUILT_EMPTY else contextlib.nullcontext():
+    with empty_weights() if family_of(config.type).is_built_empty else contextlib.nullcontext():
         return make_empty_policy(config, **kwargs)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from vla_eval.checkpoints.conversion.writing import check_free, folder_when_whole
+from vla_eval.checkpoints.conversion import check_free, folder_when_whole
 from vla_eval.checkpoints.files import (
     ADAPTER_CONFIG_FILE,
     ADAPTER_WEIGHTS_FILE,

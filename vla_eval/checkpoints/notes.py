@@ -17,12 +17,15 @@ from vla_eval.checkpoints.files import (
 )
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.models.families import FAMILIES
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 from vla_eval.seeding import SeedRange
 from vla_eval.strict.json_fields import get_mapping, get_text
 
 LEROBOT_ADAPTER = "lerobot"
-LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
+LEROBOT_CHECKPOINTS = frozenset(
+    {LEROBOT_ADAPTER, *(name for family in FAMILIES.values() for name in family.adapters)}
+)
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
 
 NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 
 from torch import Tensor
 
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS
+from vla_eval.models.families import family_of
 
 
 class Step(NamedTuple):
@@ -32,5 +32,5 @@ def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | 
     for name, value in (queues or {}).items():
         setattr(owner, name, copy.deepcopy(value))
     action: Tensor = owner.select_action(batch)
-    kept = {name: getattr(owner, name) for name in ASKED_FOR_STEPS[owner.config.type]}
+    kept = {name: getattr(owner, name) for name in family_of(owner.config.type).queues}
     return Step(action.unsqueeze(1), kept)

@@ -28,6 +28,7 @@ from vla_eval.errors import (
     unknown_name,
 )
 from vla_eval.lock.switch import let_everything
+from vla_eval.models.families import FAMILIES
 from vla_eval.policies.context import PolicyContext
 from vla_eval.seeding import seed_global_generators
 
@@ -47,8 +48,8 @@ POLICIES = {
     "cue_touch": "vla_eval.policies.controls.shortcuts:make_cue_touch",
     "one_frame": "vla_eval.policies.controls.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot.policy:make_lerobot",
-    "openvla": "vla_eval.policies.lerobot.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
+    **{name: target for family in FAMILIES.values() for name, target in family.adapters.items()},
 }
 _SCRIPTED_MODULES = ("vla_eval.policies.controls.scripted:", "vla_eval.policies.controls.shortcuts:")
 SCRIPTED = frozenset(name for name, target in POLICIES.items() if target.startswith(_SCRIPTED_MODULES))

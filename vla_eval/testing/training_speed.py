@@ -14,11 +14,11 @@ from vla_eval.checkpoints.processors import load_processors
 from vla_eval.checkpoints.verify import random_batch
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_KEY
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.stages import EPISODE_STEPS
 from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.cost.estimate import estimate
-from vla_eval.training.cost.network_stages import EPISODE_STEPS
 from vla_eval.training.loop import autocast_dtype
 from vla_eval.training.lora import peft_config
 from vla_eval.training.request import load_finetune_recipe

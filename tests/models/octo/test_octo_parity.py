@@ -22,10 +22,11 @@ from tests.models.octo.octo_golden import (
     values,
     window,
 )
+from tests.models.octo.tiny_octo import our_name
 from vla_eval.errors import CheckpointError
 from vla_eval.models.octo import diffusion_head, transformer
 from vla_eval.models.octo.diffusion_head import Draws, HeadSizes, Targets, cosine_schedule
-from vla_eval.models.octo.flax_names import from_flax, our_name
+from vla_eval.models.octo.flax_names import from_flax
 from vla_eval.models.octo.network import OctoNetwork
 from vla_eval.models.octo.transformer import Outputs, TransformerSizes, Window
 

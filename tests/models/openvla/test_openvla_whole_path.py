@@ -12,14 +12,15 @@ from torch import Tensor
 
 from tests.models.openvla import openvla_golden as golden
 from tests.models.stored_frames import StoredFrames, context, executed
-from vla_eval.checkpoints.conversion.openvla import ConvertOptions, convert_openvla
+from vla_eval.checkpoints.conversion import convert
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.policies.lerobot import inputs as lerobot_inputs
 from vla_eval.policies.lerobot.openvla_paper import make_openvla
 
 # The stored images have the model's size, and the original ran without the crop.
-OPTIONS = ConvertOptions(
+OPTIONS = OpenVLAOptions(
     chunk_size=golden.CHUNK,
     camera_px=golden.SIZES.image_px,
     sizes=golden.SMALL,
@@ -52,7 +53,7 @@ def converted(published: Path, tmp_path: Path, case: str, **changes: Any) -> Pat
         proprio=golden.PROPRIO if "proprio" in case else 0,
         **changes,
     )
-    return convert_openvla(published, tmp_path / "ours", options)
+    return convert("mikasa_openvla", published, tmp_path / "ours", options)
 
 
 def loaded(published: Path, tmp_path: Path, case: str, **changes: Any) -> LoadedPolicy:

@@ -14,6 +14,7 @@ from vla_eval.models.shared.gripper import Gripper, GripperDecoding, GripperEnco
 from vla_eval.models.shared.images import Augmentation
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.ported_config import PortedConfig
+from vla_eval.models.shared.stages import HEAD, LANGUAGE, VISION, Stage, Stages
 
 TYPE = "mikasa_octo"
 BYTES_TOKENIZER = "bytes"
@@ -211,3 +212,15 @@ class MikasaOctoConfig(PortedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
         return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=0.0)
+
+
+PROMPT_TOKENS, FRAME_TOKENS = 16, 337  # docs/octo.md
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    return (
+        Stage(r"language\.", PROMPT_TOKENS, VISION - 1),
+        Stage(r"head\.", config.window, HEAD),
+        Stage(r"transformer\.", PROMPT_TOKENS + FRAME_TOKENS * config.window, LANGUAGE),
+    )

@@ -145,18 +145,6 @@ def from_flax(tree: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return converted
 
 
-def our_name(key: str) -> str:
-    """Return our name of one tensor of the original.
-
-    Raises:
-        CheckpointError: this architecture has no such tensor.
-    """
-    found = _rule(key)
-    if found is None:
-        raise CheckpointError(f"'{key}' is no tensor of the Octo that is built here.")
-    return found.name
-
-
 def is_kernel(name: str) -> bool:
     """Return whether a parameter of our network is a `kernel` of the original: what its optimizer decays.
 

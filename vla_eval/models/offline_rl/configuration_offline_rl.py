@@ -9,7 +9,9 @@ from vla_eval.control_modes import ABSOLUTE_MODES, CONTROL_MODE, JOINT_DELTA_POS
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.features import RewardKind
 from vla_eval.models.offline_rl.algorithms import ALGORITHMS
+from vla_eval.models.sequence.sizes import encoder_stages
 from vla_eval.models.shared.ported_config import PortedConfig
+from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
 
 TYPE = "mikasa_offline_rl"
 REWARDS: tuple[str, ...] = get_args(RewardKind)
@@ -123,3 +125,9 @@ class MikasaOfflineRLConfig(PortedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
         return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the places of a sample that pass through each."""
+    encoder = encoder_stages(image_shape(config)[-1], 1, nature=True)
+    return (*encoder, Stage(r"network\.targets\.", 0, HEAD))

@@ -16,6 +16,16 @@ from vla_eval.models.shared.images import Augmentation
 from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.ported_config import PromptedConfig
+from vla_eval.models.shared.stages import (
+    HEAD,
+    LANGUAGE,
+    PATCHES,
+    PROMPT_TOKENS,
+    VISION,
+    Stage,
+    Stages,
+    n_images,
+)
 
 TYPE = "mikasa_openvla"
 HEADS: tuple[Head, ...] = ("l1", "parallel_tokens", "tokens")
@@ -137,3 +147,18 @@ class MikasaOpenVLAConfig(PromptedConfig):
         return StepDecaySchedulerConfig(
             num_decay_steps=self.scheduler_decay_steps, num_warmup_steps=self.scheduler_warmup_steps
         )
+
+
+DINO_EXTRA = 5  # class token and registers
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    patches, actions = n_images(config) * PATCHES, config.chunk_size * config.action_feature.shape[0]
+    return (
+        Stage(r"lm_head", 0 if config.head == "l1" else actions, HEAD),
+        Stage(r"vision\.dino", patches + n_images(config) * DINO_EXTRA, VISION),
+        Stage(r"vision\.|projector", patches, VISION),
+        Stage(r"\.llm\.", patches + PROMPT_TOKENS + actions, LANGUAGE),
+        Stage(r"action_head", config.chunk_size, HEAD),
+    )

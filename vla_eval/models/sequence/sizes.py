@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any  # values of a recipe
 
 from vla_eval.errors import RecipeError, check_names
+from vla_eval.models.shared.stages import VISION, Stage, Stages
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
 
@@ -210,6 +211,19 @@ def nature_edges(image_px: int) -> tuple[int, ...]:
         edge = (edge - kernel) // stride + 1
         edges.append(edge)
     return tuple(edges)
+
+
+def encoder_stages(image_px: int, n_images: int, *, nature: bool) -> Stages:
+    """Return the places of an image encoder: `nature`, or keypoints, which read cells of 4 x 4 pixels."""
+    encoder = r"network\.(?:encoder|encoders\.\d+)\."
+    if not nature:
+        places = Stage(encoder + r"features\.", n_images * (image_px // 4) ** 2, VISION)
+        return (places, Stage(encoder + "reads", n_images, VISION))
+    edges = enumerate(nature_edges(image_px))  # a layer of rectified units follows each convolution
+    return (
+        *(Stage(encoder + rf"{2 * index}\b", n_images * edge**2, VISION) for index, edge in edges),
+        Stage(encoder + r"7\b", n_images, VISION),
+    )
 
 
 TOKENS = {"step": 1, "return_observation": 2, "return_observation_action": 3}

@@ -17,6 +17,16 @@ from vla_eval.features import ACTION_KEY, CAMERA_KEYS
 from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalizer
 from vla_eval.models.shared.ported_config import PromptedConfig
+from vla_eval.models.shared.stages import (
+    HEAD,
+    LANGUAGE,
+    PATCHES,
+    PROMPT_TOKENS,
+    VISION,
+    Stage,
+    Stages,
+    n_images,
+)
 from vla_eval.models.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,
@@ -27,6 +37,7 @@ from vla_eval.models.spatialvla.lora import LORA_TARGETS, SPATIAL_EMBEDDINGS
 from vla_eval.models.spatialvla.sizes import (
     ATTENTIONS,
     N_ACTION,
+    TOKENS_PER_ACTION,
     Attention,
     NetworkSizes,
 )
@@ -201,3 +212,17 @@ class MikasaSpatialVLAConfig(PromptedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return the configuration of the schedule."""
         return LinearDecaySchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+
+ZOE_PATCHES = 577  # of 384 px in patches of 16, and the class token
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    images, actions = n_images(config), TOKENS_PER_ACTION * config.chunk_size
+    return (
+        Stage(r"lm_head", actions, HEAD),
+        Stage(r"depth\.", images * ZOE_PATCHES, VISION - 1),
+        Stage(r"vision|projector|position", images * PATCHES, VISION),
+        Stage(r"\.llm\.", images * PATCHES + PROMPT_TOKENS + actions, LANGUAGE),
+    )

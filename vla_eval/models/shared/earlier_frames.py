@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from vla_eval.models.shared.frame_choice import FrameChoice, Seen
 from vla_eval.models.shared.levels import in_bytes
-from vla_eval.models.vla_memory.frame_choice import FrameChoice, Seen
 
 SEGMENT_PADDING_KEY = "segment_is_pad"
 """(B, T) of a training batch in segments: which come before the episode's beginning."""

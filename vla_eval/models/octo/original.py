@@ -19,8 +19,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vla_eval.checkpoints.files import read_json
 from vla_eval.errors import CheckpointError, did_you_mean
+from vla_eval.strict.json_fields import read_json
 
 STATISTICS_FILE = "dataset_statistics.json"
 AGGREGATED_FILE = "checkpoint"

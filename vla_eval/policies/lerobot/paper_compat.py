@@ -69,13 +69,13 @@ class PaperCompatPolicy:
         return ActionChunk(actions=np.ascontiguousarray(actions))
 
 
-def make_openvla(
+def make_paper_compat(
     context: PolicyContext,
     *,
     paper_compat: Sequence[str] = (),
     **args: Any,  # Any: those of `make_lerobot`
 ) -> LeRobotPolicy | PaperCompatPolicy:
-    """Make an OpenVLA from a checkpoint of ours; `args` are those of the adapter `lerobot`.
+    """Make a policy from a checkpoint; `args` are those of the adapter `lerobot`.
 
     Args:
         context: what every adapter is given.

@@ -1,52 +1,63 @@
-"""What converting a published checkpoint takes, whichever policy it is. Knows no names of weights.
+"""A published checkpoint of another program, as a family's converter reads it. Knows no names of weights.
 
-No code of the checkpoint is run, and only safetensors are read here. The result is a whole folder or none.
+No code of the checkpoint is run, and only safetensors are read here.
 """
 
-import contextlib
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # JSON, lerobot and transformers
 
+from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from vla_eval.checkpoints.files import TOKENIZER_FOLDER
-from vla_eval.checkpoints.foreign_code import no_foreign_code
-from vla_eval.checkpoints.loading import read_weights
 from vla_eval.errors import CheckpointError, did_you_mean
+from vla_eval.features import ACTION_KEY, ACTION_NAMES, STATE_KEY
 from vla_eval.models.shared.gripper import ENCODINGS, GripperEncoding
+from vla_eval.models.shared.weight_file import WeightFile
 from vla_eval.strict.json_text import shown
 
-TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
-
+CONFIG_FILE = "config.json"
 Statistics = dict[str, dict[str, Any]]
 """Field -> statistic -> one number per dimension."""
 
 
-def check_free(out: Path) -> None:
-    """Refuse a folder that is there.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Original:
+    """What a converter has found.
 
-    Raises:
-        CheckpointError: it is.
+    Attributes:
+        config: of the policy.
+        weights: function from the policy, without values, to its tensors by name.
+        make_processors: makes pre- and postprocessor from the configuration.
+        casts: whether types of numbers may differ from the configuration's.
+        check_tokenizer: is given the tokenizer, whose files are copied, and raises if it is not the model's;
+            None: the configuration names the tokenizer.
     """
-    if out.exists():
-        raise CheckpointError(f"{out} exists already. Name another folder.")
+
+    config: Any
+    weights: Callable[[Any], Mapping[str, Tensor]]
+    make_processors: Callable[[], tuple[Any, Any]]
+    casts: bool = False
+    check_tokenizer: Callable[[Any], None] | None = None
 
 
-@contextlib.contextmanager
-def folder_when_whole(out: Path) -> Iterator[Path]:
-    """Give a folder to write into, which gets its name once everything is in it.
+def with_features(config: Any, cameras: Mapping[str, tuple[int, int]], *, state: int = 0) -> Any:
+    """Give a configuration the fields of our datasets; return it.
 
-    Raises:
-        CheckpointError: `out` exists.
+    Args:
+        config: of the policy.
+        cameras: field -> (height_px, width_px).
+        state: numbers of proprioception; 0: it reads none.
     """
-    check_free(out)
-    partial = out.with_name(f".partial-{out.name}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    yield partial
-    partial.rename(out)
+    fields = {
+        name: PolicyFeature(type=FeatureType.VISUAL, shape=(3, *size)) for name, size in cameras.items()
+    }
+    if state:
+        fields[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(state,))
+    config.input_features = fields
+    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
+    return config
 
 
 def read_safetensors(source: Path) -> dict[str, Tensor]:
@@ -60,7 +71,7 @@ def read_safetensors(source: Path) -> dict[str, Tensor]:
         raise CheckpointError(f"{source}: expected safetensors, found none. Fetch the whole checkpoint.")
     weights: dict[str, Tensor] = {}
     for file in files:
-        weights.update(read_weights(file))
+        weights.update(WeightFile(file))
     return weights
 
 
@@ -137,46 +148,3 @@ def check_mask(source: Path, what: str, statistics: Mapping[str, Any], expected:
     mask = statistics.get("mask")
     if mask is not None and tuple(mask) != expected:
         raise CheckpointError(f"{source}: mask of {what}: expected {expected}, found {tuple(mask)}.")
-
-
-def write_checkpoint(
-    source: Path,
-    out: Path,
-    policy: Any,
-    make_processors: Callable[[], tuple[Any, Any]],
-    *,
-    check_tokenizer: Callable[[Any], None],
-) -> Path:
-    """Write a LeRobot checkpoint with a copy of the source's tokenizer; return its folder.
-
-    Args:
-        source: folder of the published checkpoint.
-        out: a folder that is not there yet.
-        policy: with the weights; its configuration gets the path of the tokenizer.
-        make_processors: makes pre- and postprocessor from that configuration.
-        check_tokenizer: is given the tokenizer, and raises if it is not the model's.
-
-    Raises:
-        CheckpointError: there is no tokenizer, or `out` exists.
-    """
-    with folder_when_whole(out) as partial:
-        policy.config.tokenizer_name = str(_copy_tokenizer(source, partial / TOKENIZER_FOLDER))
-        with no_foreign_code(policy.config.type):
-            processors = make_processors()
-        steps = (step for step in processors[0].steps if hasattr(step, "input_tokenizer"))
-        check_tokenizer(next(steps).input_tokenizer)
-        policy.config.tokenizer_name = str(out / TOKENIZER_FOLDER)
-        policy.save_pretrained(partial)
-        for processor in processors:
-            processor.save_pretrained(partial)
-    return out
-
-
-def _copy_tokenizer(source: Path, folder: Path) -> Path:
-    files = [file for pattern in TOKENIZER_FILES for file in sorted(source.glob(pattern)) if file.is_file()]
-    if not files:
-        raise CheckpointError(f"{source}: expected the tokenizer's files, found none. Fetch them, too.")
-    folder.mkdir(parents=True)
-    for file in files:
-        shutil.copy2(file, folder / file.name)
-    return folder
