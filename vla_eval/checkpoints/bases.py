@@ -25,11 +25,7 @@ def base_of_recipe(recipe: str) -> str | None:
 
 
 def find_base(name: str) -> Base:
-    """Return a base by the name of its folder or of a recipe.
-
-    Raises:
-        UnknownNameError: there is none.
-    """
+    """Return a base by the name of its folder or of a recipe; raise `UnknownNameError` if there is none."""
     known = bases()
     found = name if name in known else base_of_recipe(name)
     check_names("base checkpoint", [found or name], known)

@@ -24,7 +24,7 @@ TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 
 
 def convert(kind: str, source: Path, out: Path, options: Any) -> Path:
-    """Write the LeRobot checkpoint `out`; every parameter of the original is in it, and no other; return it.
+    """Write the LeRobot checkpoint `out` with every parameter of the original and no other; return it.
 
     Args:
         kind: the family's type.
@@ -84,22 +84,14 @@ def _save(original: Original, policy: Any, source: Path, partial: Path, out: Pat
 
 
 def check_free(out: Path) -> None:
-    """Refuse a folder that is there.
-
-    Raises:
-        CheckpointError: it is.
-    """
+    """Raise `CheckpointError` for a folder that is there."""
     if out.exists():
         raise CheckpointError(f"{out} exists already. Name another folder.")
 
 
 @contextlib.contextmanager
 def folder_when_whole(out: Path) -> Iterator[Path]:
-    """Give a folder to write into, which gets its name once everything is in it.
-
-    Raises:
-        CheckpointError: `out` exists.
-    """
+    """Give a folder to write into, which gets its name, not taken so far, once everything is in it."""
     check_free(out)
     partial = out.with_name(f"{out.name}.partial")  # which the lock lets be written, too
     shutil.rmtree(partial, ignore_errors=True)

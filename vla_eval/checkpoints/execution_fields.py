@@ -62,13 +62,7 @@ def ignored_fields(
 ) -> tuple[str, ...]:
     """Return a sentence for each field of a policy's checkpoint that asks for what is not done here.
 
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-        chunking: of the evaluation; None: it is the client's.
-
-    Raises:
-        CheckpointError: there is no checkpoint, or its configuration is damaged.
+    The policy is given by a recipe's adapter and args. Without `chunking`, it is the client's.
     """
     checkpoint = args.get("checkpoint")
     if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):

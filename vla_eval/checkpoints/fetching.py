@@ -42,14 +42,7 @@ class RemoteFile(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemotePart:
-    """What is fetched of one repository.
-
-    Attributes:
-        source: see there.
-        commit: the version.
-        licence: as the repository states it; None if it states none.
-        files: name -> size and digest.
-    """
+    """What is fetched of one repository: the commit, the licence if it states one, and its files by name."""
 
     source: Source
     commit: str
@@ -65,7 +58,7 @@ class RemotePart:
 def fetch_base(
     base: Base, out: Path, *, revision: str | None = None, api: HfApi | None = None, say: Say
 ) -> Path:
-    """Make the folder of a base checkpoint; one that is there is only checked.
+    """Make the folder `out` of a base checkpoint; one that is there is only checked.
 
     Args:
         base: which.
@@ -75,8 +68,7 @@ def fetch_base(
         say: gets lines for a person.
 
     Raises:
-        CheckpointError: the Hub cannot be reached or refuses, the disk is too small, or a file is damaged or
-            not of this model.
+        CheckpointError: the Hub refuses or is not there, the disk is too small, or a file is damaged.
     """
     if out.exists():
         say(f"{out} is there: {_check(base, out)}")

@@ -93,12 +93,9 @@ def no_foreign_code(kind: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def only_data() -> Iterator[None]:
-    """Keep the doors closed within the context; cheap enough for every forward pass.
+    """Keep the doors closed within the context, as `no_foreign_code`; cheap enough for every forward pass.
 
     Some policies open a tokenizer only in the first one.
-
-    Raises:
-        CheckpointError: as `no_foreign_code`.
     """
     replace(_doors())
     with closed():

@@ -84,22 +84,14 @@ class LoadedPolicy:
 
     @contextlib.contextmanager
     def acting(self) -> Iterator[None]:
-        """Let the policy infer within the context, as safely as it was loaded.
-
-        Raises:
-            CheckpointError: from within, whatever its steps and its network make of what does not fit.
-        """
+        """Let the policy infer within the context, as safely and with the same errors as it was loaded."""
         # Some policies open a tokenizer only in their first pass.
         with plain_errors(self.folder, self.config.type, "cannot infer"), only_data():
             yield
 
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
-    """Load policy and processors.
-
-    Args:
-        path: a checkpoint or a run folder, see `find_checkpoint`.
-        options: how.
+    """Load policy and processors of a checkpoint or a run folder.
 
     Raises:
         CheckpointError: anything is missing, damaged, or does not fit.
@@ -159,13 +151,7 @@ def asked_for(cls: Any, kind: str, data: Mapping[str, Any]) -> Any:
 
 
 def with_local_files(data: dict[str, Any], folder: Path, *, tokenizer: str | None) -> dict[str, Any]:
-    """Return a configuration that asks for no download, and for the tokenizers of this checkpoint.
-
-    Args:
-        data: of the checkpoint.
-        folder: of the checkpoint.
-        tokenizer: see `LoadOptions`.
-    """
+    """Return a configuration that asks for no download, and for the tokenizers of its checkpoint."""
     here = {**NO_DOWNLOADS, **own_tokenizers(folder, tokenizer)}
     return {**data, **{name: value for name, value in here.items() if name in data}}
 
@@ -237,16 +223,13 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
-    """Return the policy with exactly the weights of the checkpoint.
+    """Return the policy with exactly the weights of a checkpoint, see `fill_policy`.
 
     Args:
         folder: with `model.safetensors`, or with a LoRA adapter.
         config: what `read_config` returned.
         options: `device`, `dtype` and `base_checkpoint` are used.
         kwargs: further arguments of the policy's constructor.
-
-    Raises:
-        CheckpointError: keys, shapes or types differ; the message lists them.
     """
     return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
         config.device
@@ -262,11 +245,7 @@ def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:
 def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: Sequence[str] = ()) -> Any:
     """Put the weights of a checkpoint into a policy, or an adapter on top of them; return the policy.
 
-    Args:
-        policy: with whatever weights.
-        folder: of the checkpoint.
-        options: how to load.
-        may_be_new: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
+    `may_be_new`: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
 
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
@@ -287,10 +266,6 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
 
 def begin_from(policy: Any, base: Path) -> None:
     """Let a policy change its base's weights, which were just loaded, into what its training begins from.
-
-    Args:
-        policy: with the base's weights; most have nothing to change.
-        base: folder of the base.
 
     Raises:
         CheckpointError: the base is an adapter, whose own base would be changed a second time.

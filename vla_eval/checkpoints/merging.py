@@ -31,9 +31,6 @@ def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, 
         out: a folder that is not there yet.
         base_checkpoint: where the base lies; None: where it was in training.
         device: where to compute.
-
-    Raises:
-        CheckpointError: it is no adapter, or `out` exists.
     """
     folder = find_checkpoint(path)
     if not (folder / ADAPTER_CONFIG_FILE).is_file():

@@ -41,12 +41,7 @@ OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
 
 
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
-    """Return digests of all that a policy's weights consist of, and of what they were trained on.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-        policy: the recipe's name.
+    """Return digests of all that the weights of a recipe's policy consist of, and of their training data.
 
     Returns:
         `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
@@ -54,7 +49,7 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 
     Raises:
         CheckpointError: the weights are not there.
-        RecipeError: an argument that names a folder is no text.
+        RecipeError: an argument that names a folder is not text.
     """
     for name in ("checkpoint", "base_checkpoint"):
         if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
@@ -76,19 +71,12 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 
 
 def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by which statistics a policy normalises what it sees and un-normalises what it does.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
+    """Return by which statistics a policy, of a recipe's adapter and args, normalises and un-normalises.
 
     Returns:
         `of`: the dataset whose statistics they are, by its name, or `the checkpoint` where that is not
         known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
         is used. Empty for a policy without a checkpoint of LeRobot's.
-
-    Raises:
-        CheckpointError: a file that the checkpoint names is missing or damaged.
     """
     checkpoint = args.get("checkpoint")
     if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
@@ -103,32 +91,13 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
 
 
 def training_seeds(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[SeedRange, ...]]:
-    """Return of which seeds a policy was shown demonstrations.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-
-    Returns:
-        Task id -> seeds; empty where they are not known.
-
-    Raises:
-        CheckpointError: what the checkpoint says of its training is damaged.
-    """
+    """Return task -> the seeds of whose demonstrations a policy was trained; empty: they are not known."""
     facts = _facts(adapter, args)
     return {} if facts is None else facts.seeds or {}
 
 
 def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[str, ...]] | None:
-    """Return task id -> the sentences that a policy was trained with; None where they are not known.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-
-    Raises:
-        CheckpointError: what the checkpoint says of its training is damaged.
-    """
+    """Return task -> the sentences that a policy was trained with; None where they are not known."""
     facts = _facts(adapter, args)
     return None if facts is None else facts.sentences
 

@@ -69,14 +69,10 @@ def load_processor(
     to_output: Callable[[Any], Any] | None = None,
     make: type[Any] = DataProcessorPipeline,
 ) -> Any:
-    """Return the pipeline that a file of a checkpoint describes.
+    """Return the pipeline that a file of a checkpoint describes; everything it names lies in its folder.
 
-    Args:
-        path: the file; everything it names lies in its folder.
-        overrides: step's name -> arguments that replace the saved ones. They are ours, and not checked.
-        to_transition: see lerobot's `DataProcessorPipeline`; None: its own.
-        to_output: the same.
-        make: its class.
+    `overrides`: step's name -> arguments that replace the saved ones; they are ours, and not checked. The
+    other arguments are lerobot's of a `DataProcessorPipeline`.
 
     Raises:
         CheckpointError: the file is damaged, or names code, files or settings that it may not.

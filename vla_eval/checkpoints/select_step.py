@@ -26,7 +26,7 @@ def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | 
     Args:
         policy: whose `reset` was just called.
         batch: the newest frame (B, …).
-        queues: those after the previous step; None at the beginning of the episode. They are not changed.
+        queues: those after the previous step, which are not changed; None: the episode begins.
     """
     owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
     for name, value in (queues or {}).items():

@@ -68,13 +68,7 @@ class Verified:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """What a checkpoint's header and its configuration say of each other, in agreement.
-
-    Attributes:
-        kind: lerobot's name of the policy's type.
-        n_tensors: in the file.
-        n_parameters: of the model; shared ones once.
-    """
+    """What a checkpoint's header and its configuration agree about: type, tensors in the file, parameters."""
 
     kind: str
     n_tensors: int

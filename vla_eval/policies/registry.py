@@ -78,11 +78,7 @@ def check_adapter(adapter: str) -> None:
 
 
 def own_modules(adapters: Iterable[str]) -> tuple[str, ...]:
-    """Return the modules of those adapters that come with this package.
-
-    Raises:
-        UnknownNameError: there is no such adapter.
-    """
+    """Return the modules of those adapters that come with this package."""
     modules = (_target(adapter)[0] for adapter in adapters)
     return tuple(dict.fromkeys(name for name in modules if name.startswith("vla_eval.")))
 
@@ -128,14 +124,9 @@ def policy_factory(adapter: str) -> PolicyFactory:
 def make_from_adapter(adapter: str, context: PolicyContext, args: Mapping[str, Any]) -> Policy:
     """Make a policy of an adapter, with global generators seeded by its name.
 
-    Args:
-        adapter: a name from the registry, or `module:attr`.
-        context: what the policy gets to know.
-        args: keyword arguments of the adapter, from a recipe.
-
     Raises:
         UnknownNameError, MissingDependencyError: see `policy_factory`.
-        RecipeError: the adapter does not take these arguments.
+        RecipeError: the adapter does not take these arguments, which come from a recipe.
     """
     factory = policy_factory(adapter)
     seed_global_generators("policy", context.name)

@@ -37,13 +37,8 @@ def stand_in_config(
 ) -> tuple[Any, Path | None]:
     """Return the policy's configuration, and the folder of a tokenizer where its processors need one.
 
-    Nothing is downloaded: see `stand_ins`.
-
-    Args:
-        recipe: see there.
-        folder: where their files are written.
-        dtype: precision, for policies with such a setting; None: the recipe's.
-        tiny: build families that have one in their tiny form.
+    Nothing is downloaded: `stand_ins` writes what it names to a folder. Without `dtype`, the precision is the
+    recipe's; `tiny` builds families that have one in their tiny form.
     """
     family = family_of(recipe.type)
     changes: dict[str, Any] = {
@@ -109,9 +104,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
 def random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
     """Yield a tensor's numbers in order, for `write_weights`: random, of a standard deviation of 0.02.
 
-    Args:
-        described: name -> a tensor of the shape and type; one that has memory is yielded as it is.
-        name: which.
+    `described`: name -> a tensor of the shape and type; one that has memory is yielded as it is.
     """
     tensor = described[name]
     if not tensor.is_meta:  # a buffer, whose values the constructor has computed

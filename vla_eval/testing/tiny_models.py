@@ -91,9 +91,7 @@ def tiny_resnet() -> Iterator[None]:
 def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
     """Train a tokenizer on three sentences, save it, and return its folder.
 
-    Args:
-        folder: where.
-        n_tokens: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
+    `n_tokens`: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
     """
     _tokenizer({}, n_tokens=n_tokens).save_pretrained(str(folder))
     return folder
@@ -102,10 +100,7 @@ def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
 def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_token: int = -60) -> Path:
     """Make an action tokenizer in which each byte is a token, save it, and return its folder.
 
-    Args:
-        folder: where.
-        n_tokens: as for `write_tiny_tokenizer`.
-        min_token: the coefficient whose character is 0.
+    `min_token`: the coefficient whose character is 0.
     """
     from vla_eval.checkpoints.fast_tokens import FastActionTokenizer
 
@@ -118,9 +113,7 @@ def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_
 def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] | None = None) -> Path:
     """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot.
 
-    Args:
-        folder: where.
-        sizes: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
+    `sizes`: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
     """
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
     from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor

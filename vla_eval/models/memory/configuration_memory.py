@@ -58,11 +58,7 @@ class MikasaMemoryConfig(EpisodeConfig):
             )
 
     def fit_to_control_mode(self, mode: str) -> None:
-        """Take the control mode of a dataset.
-
-        Raises:
-            SpecMismatchError: this network does not learn its actions.
-        """
+        """Take the control mode of a dataset; raise `SpecMismatchError` for actions that are not learned."""
         if mode not in LEARNED_MODES:
             raise SpecMismatchError(
                 f"'{TYPE}' learns actions of {', '.join(LEARNED_MODES)}; the dataset's are for {mode}. "

@@ -125,12 +125,9 @@ class GoalLayer(nn.Module):
 
     @torch.no_grad()
     def note_errors(self, missed_m: Tensor, evidence: Tensor, state: Tensor) -> None:
-        """Keep in mind how far off each camera was at N steps, and by which evidence.
+        """Keep in mind how far off each camera was at N steps, and by which evidence, see `Goals`.
 
-        Args:
-            missed_m: (N, cameras, 3) goals of each camera alone, minus what they should have been.
-            evidence: (N, cameras, 3), see `Goals`.
-            state: (N, state).
+        `missed_m` (N, cameras, 3): goals of each camera alone, minus what they should have been.
         """
         squared = missed_m.square().sum(dim=-1) / self._squared_length(state)
         for usual, now in (

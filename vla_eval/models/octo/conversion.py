@@ -35,11 +35,7 @@ def read_original(source: Path, options: OctoOptions) -> Original:
 
 
 def octo_config(fields: dict[str, Any]) -> MikasaOctoConfig:
-    """Return the configuration of an Octo that sees our cameras and gives our actions.
-
-    Raises:
-        CheckpointError: a value is out of its range.
-    """
+    """Return the configuration of an Octo that sees our cameras and gives our actions."""
     height, width, _ = IMAGE_SHAPE
     try:
         config = MikasaOctoConfig(device="cpu", push_to_hub=False, **fields)

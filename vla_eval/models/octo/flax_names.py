@@ -122,14 +122,7 @@ _COMPILED = tuple((re.compile(rule.pattern), rule) for rule in _RULES)
 
 
 def from_flax(tree: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the policy's tensors by our names.
-
-    Args:
-        tree: the original's parameters, flat.
-
-    Raises:
-        CheckpointError: there are tensors that this architecture does not have.
-    """
+    """Return the policy's tensors by our names, of the original's flat tree; raise if one is unknown."""
     converted, unknown = {}, []
     for key, values in tree.items():
         rule = _rule(key)

@@ -33,10 +33,7 @@ EXPORT_HINT = (
 
 
 def read_parameters(folder: Path) -> dict[str, Tensor]:
-    """Return the original's parameter tree, flat.
-
-    Args:
-        folder: the original's folder, a step in it, or one file.
+    """Return the original's parameter tree, flat, from its folder, a step in it, or one file.
 
     Raises:
         CheckpointError: there is none, several, or one in a layout that is not read.
@@ -62,11 +59,7 @@ def read_parameters(folder: Path) -> dict[str, Tensor]:
 
 
 def read_statistics(folder: Path, *, dataset: str | None) -> dict[str, list[float]]:
-    """Return the statistics of actions: name -> one number per dimension.
-
-    Args:
-        folder: the original's folder.
-        dataset: which of several; None: the only one.
+    """Return the statistics of actions of a dataset: name -> one number per dimension.
 
     Raises:
         CheckpointError: there are none, or several and none is named.

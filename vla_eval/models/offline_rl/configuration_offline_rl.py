@@ -88,11 +88,7 @@ class MikasaOfflineRLConfig(PortedConfig):
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
 
     def fit_to_control_mode(self, mode: str) -> None:
-        """Check that the actions lie in [-1, 1], where those of the actor do.
-
-        Raises:
-            RecipeError: they do not.
-        """
+        """Raise `RecipeError` unless the actions lie in [-1, 1], as those of the actor do."""
         if mode in ABSOLUTE_MODES:
             raise RecipeError(
                 f"'{TYPE}' acts in [-1, 1], found a dataset of {mode}, whose actions are m and rad: record "

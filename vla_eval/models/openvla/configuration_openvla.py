@@ -39,12 +39,7 @@ AUGMENTATION = Augmentation(
 @LRSchedulerConfig.register_subclass("mikasa_step_decay")
 @dataclass
 class StepDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
-    """Divides the learning rate by ten once, after so many steps; 0: never.
-
-    Attributes:
-        num_decay_steps: so many.
-        num_warmup_steps: linear, from nothing.
-    """
+    """Divides the learning rate by ten once, after `num_decay_steps` (0: never), after a linear warm-up."""
 
     num_decay_steps: int = 0
     num_warmup_steps: int | None = 0

@@ -57,12 +57,7 @@ class Sequence(NamedTuple):
 
 
 class OpenVLANetwork(nn.Module):
-    """See the module's text.
-
-    Args:
-        sizes: of all parts.
-        options: head, chunk, proprioception.
-    """
+    """See the module's text; also the `LanguageModel` of `shared.greedy`."""
 
     def __init__(self, sizes: NetworkSizes, options: NetworkOptions) -> None:
         super().__init__()
@@ -77,12 +72,7 @@ class OpenVLANetwork(nn.Module):
             self.action_head = L1Head(llm_width=sizes.llm_width, chunk=options.chunk, action=options.action)
 
     def sequence(self, inputs: Inputs, action_ids: Tensor | None = None) -> Sequence:
-        """Return the sequence of each sample.
-
-        Args:
-            inputs: see there.
-            action_ids: (B, K · A) tokens of the actions; None: placeholders.
-        """
+        """Return the sequence of each sample; `action_ids` (B, K · A) are tokens, None: placeholders."""
         ids, is_action, mask = self._text(inputs.prompts, action_ids)
         embeddings = self.llm.model.embed_tokens(ids)
         if action_ids is None:
@@ -103,9 +93,7 @@ class OpenVLANetwork(nn.Module):
     def hidden(self, sequence: Sequence, *, causal: bool = False) -> Tensor:
         """Return Llama's last hidden states (B, N, D).
 
-        Args:
-            sequence: see there.
-            causal: whether a token attends to no later one; False: to all that are no padding.
+        Causal: a token attends to no later one; else to all that are not padding.
         """
         n = sequence.mask.shape[1]
         # Four dimensions: transformers takes such a mask as it is and adds no causal one.

@@ -112,11 +112,7 @@ class MikasaSequenceConfig(EpisodeConfig):
         return self.target_return
 
     def fit_to_rewards(self, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Take the target return from a dataset, where it is not given.
-
-        Args:
-            columns: field -> (N,) of the dataset's frames.
-        """
+        """Take the target return from a dataset's frames, by field (N,), where it is not given."""
         key = REWARD_KEY if self.reward == "dense" else SUCCESS_KEY
         if self.reward is None or self.target_return is not None or key not in columns:
             return

@@ -172,11 +172,7 @@ CORES = {
 
 
 def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
-    """Return the options of a core, with the values that a recipe gives.
-
-    Raises:
-        RecipeError: an option that the core does not have, or a value that it refuses.
-    """
+    """Return the options of a core, with the values that a recipe gives."""
     row, where = CORES[core], f"policy.core_options (core '{core}')"
     known = [field.name for field in fields(row.options) if field.name not in row.fixed]
     check_names("option", given, known, where=where)
@@ -185,11 +181,7 @@ def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderRow:
-    """What has to be known of an image encoder.
-
-    Attributes:
-        shared: one for all cameras, whose images are its channels; else one for each.
-    """
+    """An image encoder: `shared` by all cameras, whose images are its channels, or one for each."""
 
     shared: bool = False
 

@@ -28,12 +28,7 @@ class Prefix(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """What was predicted.
-
-    Attributes:
-        tokens: (B, T) int64.
-        logits: (B, T, V) that they were chosen from.
-    """
+    """Tokens (B, T) int64 that were predicted, and the logits (B, T, V) that they were chosen from."""
 
     tokens: Tensor
     logits: Tensor
@@ -64,11 +59,7 @@ def greedy_tokens(
 ) -> Decoded:
     """Return the likeliest token, the likeliest after that, and so on, `n_tokens` of them.
 
-    Args:
-        model: see there.
-        prefix: see there.
-        n_tokens: how many to predict.
-        never: tokens that are not chosen, however likely; the logits that are returned keep them.
+    `never`: tokens that are not chosen, however likely; the logits that are returned keep them.
     """
     lengths, n = prefix.lengths, prefix.embeddings.shape[1]
     cache = DynamicCache()

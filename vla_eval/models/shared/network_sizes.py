@@ -37,12 +37,7 @@ class VisionSizes:
 
 
 def with_changes[T: VisionSizes](published: type[T], changes: Mapping[str, int]) -> T:
-    """Return the published sizes, which are the defaults, with some of them changed.
-
-    Raises:
-        UnknownNameError: there is no such size.
-        RecipeError: a value is impossible.
-    """
+    """Return the published sizes, which are the defaults, with some of them changed by name."""
     known = [field.name for field in dataclasses.fields(published)]
     check_names("size", changes, known, where="finetune.policy.sizes")
     return published(**changes)

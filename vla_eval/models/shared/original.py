@@ -45,10 +45,7 @@ class Original:
 def with_features(config: Any, cameras: Mapping[str, tuple[int, int]], *, state: int = 0) -> Any:
     """Give a configuration the fields of our datasets; return it.
 
-    Args:
-        config: of the policy.
-        cameras: field -> (height_px, width_px).
-        state: numbers of proprioception; 0: it reads none.
+    `cameras`: field -> (height_px, width_px). `state`: numbers of proprioception; 0: it reads none.
     """
     fields = {
         name: PolicyFeature(type=FeatureType.VISUAL, shape=(3, *size)) for name, size in cameras.items()
@@ -61,11 +58,7 @@ def with_features(config: Any, cameras: Mapping[str, tuple[int, int]], *, state:
 
 
 def read_safetensors(source: Path) -> dict[str, Tensor]:
-    """Return all tensors of a folder's safetensors files.
-
-    Raises:
-        CheckpointError: there are none, or one is damaged.
-    """
+    """Return all tensors of a folder's safetensors files, of which there has to be one."""
     files = sorted(source.glob("*.safetensors"))
     if not files:
         raise CheckpointError(f"{source}: expected safetensors, found none. Fetch the whole checkpoint.")
@@ -76,19 +69,10 @@ def read_safetensors(source: Path) -> dict[str, Tensor]:
 
 
 def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | None) -> Any:
-    """Return the statistics of one dataset of those a model was trained on.
+    """Return the statistics of one of the datasets that a model was trained on, `known` by name.
 
-    Args:
-        source: the checkpoint, for messages.
-        known: dataset -> its statistics.
-        unnorm_key: which; None: the only one there is.
-
-    Returns:
-        What stands under that name; None if there are several and none is chosen: the checkpoint is then a
-        base for fine-tuning, whose statistics are those of the new data.
-
-    Raises:
-        CheckpointError: there are none of that name.
+    None if there are several and none is chosen (`unnorm_key`): the checkpoint is then a base to fine-tune,
+    whose statistics are those of the new data.
     """
     if unnorm_key is None:
         return next(iter(known.values())) if len(known) == 1 else None
@@ -101,16 +85,9 @@ def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | 
 
 
 def stated_gripper(source: Path, stated: str | None) -> GripperEncoding:
-    """Return how a published policy encodes the gripper, which none of its files says.
+    """Return how a published policy encodes the gripper, which has to be stated: none of its files says it.
 
     Statistics cannot say it: from 0 to 1 may be from closed to open, or from open to closed.
-
-    Args:
-        source: the checkpoint, for messages.
-        stated: by whoever converts it.
-
-    Raises:
-        CheckpointError: it is not stated, or there is no such encoding.
     """
     for encoding in ENCODINGS:
         if stated == encoding:
@@ -125,11 +102,7 @@ def stated_gripper(source: Path, stated: str | None) -> GripperEncoding:
 
 
 def read_mask(source: Path, what: str, statistics: Mapping[str, Any], n_dims: int) -> tuple[bool, ...]:
-    """Return which dimensions are normalised; all, where the statistics do not say it.
-
-    Raises:
-        CheckpointError: the mask has another size or holds something else.
-    """
+    """Return which dimensions are normalised; all, where the statistics do not say it."""
     mask = statistics.get("mask", [True] * n_dims)
     is_mask = isinstance(mask, list) and all(isinstance(value, bool) for value in mask)
     if not is_mask or len(mask) != n_dims:
@@ -140,11 +113,7 @@ def read_mask(source: Path, what: str, statistics: Mapping[str, Any], n_dims: in
 
 
 def check_mask(source: Path, what: str, statistics: Mapping[str, Any], expected: tuple[bool, ...]) -> None:
-    """Refuse statistics of other dimensions than those that are normalised.
-
-    Raises:
-        CheckpointError: they have a mask, and it is another one.
-    """
+    """Raise `CheckpointError` for statistics that normalise other dimensions than expected."""
     mask = statistics.get("mask")
     if mask is not None and tuple(mask) != expected:
         raise CheckpointError(f"{source}: mask of {what}: expected {expected}, found {tuple(mask)}.")

@@ -49,11 +49,7 @@ GRIDS = ("refitted", "kept", "uniform")
 @LRSchedulerConfig.register_subclass("mikasa_linear_decay")
 @dataclass
 class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
-    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step.
-
-    Attributes:
-        num_warmup_steps: how long it rises.
-    """
+    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step."""
 
     num_warmup_steps: int | None = 0
 
@@ -156,9 +152,6 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         Args:
             actions: (N, 7) of all frames, as the environment takes them.
             statistics: of the dataset's actions.
-
-        Raises:
-            RecipeError: the base's grid is to be kept, and there is none.
         """
         base, self.base_grid = self.grid, []
         if self.action_grid == "kept":
@@ -179,11 +172,7 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         self.grid, self.base_grid = [list(edges) for edges in chosen.edges], base
 
     def current_grid(self) -> ActionGrid:
-        """Return where the bins lie.
-
-        Raises:
-            RecipeError: it is not set, or it has other bins than the network has tokens.
-        """
+        """Return where the bins lie; raise `RecipeError` if that is not set, or for other tokens."""
         if not self.grid:
             raise RecipeError(
                 f"'{TYPE}': there is no action grid. A fine-tuning sets it (action_grid), and so does "

@@ -77,11 +77,7 @@ def read_statistics(
 
 
 def read_grid(source: Path, processor: Mapping[str, Any]) -> list[list[float]]:
-    """Return the edges of the bins, axis by axis.
-
-    Raises:
-        CheckpointError: some are missing.
-    """
+    """Return the edges of the bins, axis by axis."""
     policy = processor.get("bin_policy") or {}
     try:
         return [[float(edge) for edge in policy[GRID_PARTS[name]][f"{name}_bins"]] for name in AXES]

@@ -40,11 +40,7 @@ N_GRIPPER_BINS = 2
 
 
 def check_described(source: Path, sizes: NetworkSizes) -> None:
-    """Compare all that the files say with what is implemented.
-
-    Args:
-        source: folder of the published checkpoint.
-        sizes: of the network that its weights are to be loaded into.
+    """Compare all that the files of a published checkpoint say with a network of these sizes.
 
     Raises:
         CheckpointError: a file is missing, or says something else or something that is not known here.

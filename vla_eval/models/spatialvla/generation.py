@@ -23,15 +23,9 @@ def token_loss(
     counts: Tensor,
     attention: Attention,
 ) -> Tensor:
-    """Return the mean cross-entropy of the action tokens and of stop.
+    """Return the mean cross-entropy of the tokens of actions (B, K, 7), gripper 0 to 1, and of stop.
 
-    Args:
-        network: see there.
-        grid: where the bins lie.
-        inputs: see there.
-        actions: (B, K, 7) normalised, with the gripper 0 to 1.
-        counts: (B, K) float, 0 for actions that are left out; stop counts as the last action does.
-        attention: what the prefix attends to.
+    `counts` (B, K) is 0 for actions that are left out; stop counts as the last action does.
     """
     ids = to_tokens(actions, grid, network.sizes).flatten(1)
     sequence = network.sequence(inputs, ids)
@@ -48,13 +42,9 @@ def token_loss(
 def generated_tokens(
     network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention
 ) -> Decoded:
-    """Return the tokens (B, 3 · K) of a chunk; stop is never predicted, whatever is likeliest.
+    """Return the tokens (B, 3 · chunk) of a chunk; stop is never predicted, whatever is likeliest.
 
-    Args:
-        network: see there.
-        inputs: see there; prompts of several lengths go together.
-        chunk: K.
-        attention: what the prefix attends to; padding is attended to in no case.
+    Prompts of several lengths go together; padding is attended to in no case.
     """
     if attention == "bidirectional_with_padding":
         attention = "bidirectional"

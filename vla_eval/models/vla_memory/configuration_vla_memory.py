@@ -92,8 +92,7 @@ class VlaMemoryConfig:
     def n_passes(self, window_steps: int) -> tuple[int, int]:
         """Return how many frames of a sample pass through the model: without a gradient, and with one.
 
-        Args:
-            window_steps: of the longest episode, if the configuration does not say it.
+        `window_steps`: of the longest episode, if the configuration does not say it.
         """
         if not self.memory_tokens:
             return 0, 1

@@ -78,12 +78,7 @@ class Counted:
 
 
 def sample_cost(model: Any, config: Any) -> SampleCost | None:
-    """Estimate it; None for a type of policy whose tokens are not known here.
-
-    Args:
-        model: a torch module of lerobot's; its weights need no memory.
-        config: of the policy.
-    """
+    """Estimate it for a torch module without values and its configuration; None: its tokens are not known."""
     family = family_of(config.type)
     if not family.stages:
         return None
