@@ -14,6 +14,7 @@ from vla_eval.checkpoints.files import (
     checkpoint_sha256,
     find_checkpoint,
     read_facts,
+    unreadable,
 )
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
@@ -40,6 +41,14 @@ LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
 OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
 
 
+def checkpoint_folder(adapter: str, args: Mapping[str, Any]) -> Path | None:
+    """Return the folder with the weights of a recipe's policy; None: it has none, or is another package's."""
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return None
+    return find_checkpoint(Path(checkpoint))
+
+
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
     """Return digests of all that the weights of a recipe's policy consist of, and of their training data.
 
@@ -56,10 +65,9 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
             raise RecipeError(
                 f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
             )
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
         return {}
-    folder = find_checkpoint(Path(checkpoint))
     hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
     base = args.get("base_checkpoint")
     if isinstance(base, str):
@@ -78,10 +86,9 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
         known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
         is used. Empty for a policy without a checkpoint of LeRobot's.
     """
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
         return {}
-    folder = find_checkpoint(Path(checkpoint))
     facts = read_facts(folder)
     return {
         "of": "the checkpoint" if facts is None else facts.dataset,
@@ -103,10 +110,8 @@ def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple
 
 
 def _facts(adapter: str, args: Mapping[str, Any]) -> TrainingFacts | None:
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
-        return None
-    return read_facts(find_checkpoint(Path(checkpoint)))
+    folder = checkpoint_folder(adapter, args)
+    return None if folder is None else read_facts(folder)
 
 
 def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:
@@ -156,7 +161,5 @@ def _numbers(file: Path) -> dict[str, list[float]]:
     try:
         tensors = load_file(file)
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
-        ) from exc
+        raise unreadable(file, exc) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}

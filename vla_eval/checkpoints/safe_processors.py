@@ -21,13 +21,14 @@ from lerobot.processor import DataProcessorPipeline, ProcessorStep, ProcessorSte
 from lerobot.processor.converters import batch_to_transition, transition_to_batch
 from safetensors.torch import load
 
+from vla_eval.checkpoints.files import unreadable
 from vla_eval.checkpoints.saved_processor import SavedProcessor, SavedStep, check_paths, read_saved_processor
 from vla_eval.errors import CheckpointError
 from vla_eval.strict.json_fields import FETCH_AGAIN
 
 PROCESSOR_MODULES = re.compile(
     r"lerobot\.processor(\.\w+)?|lerobot\.policies\.\w+\.processor_\w+"
-    r"|vla_eval\.policies\.\w+\.processor_\w+",
+    r"|vla_eval\.models\.\w+\.processor_\w+",
     re.ASCII,
 )
 """Modules of lerobot, and of ours, whose steps a checkpoint may name by their import path."""
@@ -185,9 +186,7 @@ def _state(step: SavedStep) -> dict[str, Any] | None:
     try:
         return dict(load(step.state_file.read_bytes()))
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{step.state_file}: cannot be read as safetensors ({exc}). {FETCH_AGAIN}"
-        ) from exc
+        raise unreadable(step.state_file, exc) from exc
 
 
 def _made(step: SavedStep, cls: type[Any], overrides: Mapping[str, Any]) -> Any:

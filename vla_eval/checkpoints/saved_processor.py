@@ -13,7 +13,13 @@ from typing import Any  # JSON of another program
 
 from safetensors import safe_open
 
-from vla_eval.checkpoints.files import CONFIG_FILE, POSTPROCESSOR_FILE, PREPROCESSOR_FILE, WEIGHTS_FILE
+from vla_eval.checkpoints.files import (
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    WEIGHTS_FILE,
+    unreadable,
+)
 from vla_eval.errors import CheckpointError
 from vla_eval.strict.json_fields import (
     FETCH_AGAIN,
@@ -125,9 +131,7 @@ def refuse_built_in_normalization(folder: Path) -> None:
         with safe_open(file, framework="np") as header:
             names = list(header.keys())
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
-        ) from exc
+        raise unreadable(file, exc) from exc
     built_in = [name for name in names if name.startswith(BUILT_IN) and name.endswith(BUILT_IN_STATISTICS)]
     if built_in:
         raise CheckpointError(

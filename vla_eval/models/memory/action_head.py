@@ -12,13 +12,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.episodes.eef_state import SPACE
-from vla_eval.models.memory.layers import three_layers
+from vla_eval.models.episodes.config import SPACE
 
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
 WAY_HIDDEN = 64
 WAY_SEEN = 4  # numbers that describe the way along one axis
 LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
+
+
+def three_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Return a map from numbers to numbers with two hidden layers."""
+    return nn.Sequential(
+        nn.Linear(inputs, hidden),
+        nn.GELU(),
+        nn.Linear(hidden, hidden),
+        nn.GELU(),
+        nn.Linear(hidden, outputs),
+    )
 
 
 class ActionHead(nn.Module):

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
-from vla_eval.models.memory.layers import three_layers
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
+from vla_eval.models.memory.action_head import three_layers
 from vla_eval.models.memory.sizes import PLACE
 
 MAP_HIDDEN = 64

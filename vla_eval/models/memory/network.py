@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE, STATE
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE, STATE
 from vla_eval.models.episodes.samples import last_of
 from vla_eval.models.episodes.sentence import SentenceEncoder, with_sentence
 from vla_eval.models.memory.action_head import WAY_SCALE_M, ActionHead

@@ -9,13 +9,11 @@ from vla_eval.models.shared.options import gripper_option, option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OctoOptions:
-    """What the files do not say.
+    """What the files do not say; flags explain themselves.
 
     Attributes:
         size: of the published ones, see the bases of the family's row; None: as `fields` say.
-        dataset: whose statistics, where there are several.
-        gripper: how the checkpoint's data encode it, see `shared.gripper`; None is refused: no file says it.
-        tokenizer: folder of T5's tokenizer; None: the one that the configuration names, from the cache.
+        tokenizer: None: the one that the configuration names, from the cache.
         fields: of `MikasaOctoConfig` that differ from those of the size.
     """
 

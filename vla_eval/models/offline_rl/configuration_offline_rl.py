@@ -8,7 +8,6 @@ from lerobot.configs import PreTrainedConfig
 from vla_eval.control_modes import ABSOLUTE_MODES, CONTROL_MODE, JOINT_DELTA_POS
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.features import RewardKind
-from vla_eval.models.offline_rl.algorithms import ALGORITHMS
 from vla_eval.models.sequence.sizes import encoder_stages
 from vla_eval.models.shared.ported_config import PortedConfig
 from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
@@ -16,6 +15,30 @@ from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
 TYPE = "mikasa_offline_rl"
 REWARDS: tuple[str, ...] = get_args(RewardKind)
 UNIT_INTERVAL = ("dropout", "discount", "expectile", "target_rate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlgorithmRow:
+    """What has to be known of an algorithm before its network is made.
+
+    Attributes:
+        reads_rewards: it is more than imitation.
+        draws_actions: the actor is a distribution, whose mean acts.
+        has_value: there is a network of values beside those of action values.
+        has_targets: networks of action values follow slowly, for the right side of Bellman's equation.
+    """
+
+    reads_rewards: bool = True
+    draws_actions: bool = False
+    has_value: bool = False
+    has_targets: bool = True
+
+
+ALGORITHMS = {
+    "cql": AlgorithmRow(draws_actions=True),
+    "cql_published": AlgorithmRow(reads_rewards=False, has_targets=False),
+    "iql": AlgorithmRow(has_value=True),
+}
 
 
 @PreTrainedConfig.register_subclass(TYPE)

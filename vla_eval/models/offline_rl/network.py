@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn import functional
 
-from vla_eval.models.offline_rl.algorithms import ALGORITHMS
-from vla_eval.models.offline_rl.configuration_offline_rl import MikasaOfflineRLConfig
+from vla_eval.models.offline_rl.configuration_offline_rl import ALGORITHMS, MikasaOfflineRLConfig
 from vla_eval.models.offline_rl.losses import squashed_log_density
 from vla_eval.models.sequence.encoders import RGB, Nature
 

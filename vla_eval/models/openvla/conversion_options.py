@@ -10,17 +10,12 @@ from vla_eval.models.shared.options import YES_NO, gripper_option, option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenVLAOptions:
-    """What the files do not say.
+    """What the files do not say; flags explain themselves.
 
     Attributes:
-        head, chunk_size: see `MikasaOpenVLAConfig`.
-        unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
-        pictures: fields of the images, in the order of the training.
+        unnorm_key: None: the only statistics that there are, or none at all.
+        image_augmentation: None: as the folder's name says.
         camera_px: edge of the images as a camera gives them.
-        proprio: numbers of the proprioception; 0: the model has none.
-        allow_pickled: read heads that are pickled tensors.
-        gripper: how the training data encode it, see `shared.gripper`; None is refused: no file says it.
-        image_augmentation: whether it was trained with it; None: as the folder's name says.
         sizes: sizes that differ from the published ones.
         dtype: of the result.
     """

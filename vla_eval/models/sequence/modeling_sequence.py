@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.features import STATE_KEY
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
 from vla_eval.models.episodes.policy import EpisodePolicy
 from vla_eval.models.episodes.returns import returns_to_go, rewards_in
 from vla_eval.models.episodes.samples import (

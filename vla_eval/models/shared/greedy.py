@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 from transformers import DynamicCache
 
 
@@ -74,6 +75,18 @@ def greedy_tokens(
         logits.append(model.logits(hidden))
         tokens.append(_likeliest(logits[-1], never))
     return Decoded(torch.cat(tokens, dim=1), torch.cat(logits, dim=1))
+
+
+def places_from(values: Tensor, first: Tensor, n: int) -> Tensor:
+    """Return (B, n, D): of each row of (B, N, D), n places from `first` (B,) on."""
+    places = first[:, None] + torch.arange(n, device=values.device)
+    return values.take_along_dim(places[..., None], dim=1)
+
+
+def token_cross_entropy(logits: Tensor, wanted: Tensor, weights: Tensor) -> Tensor:
+    """Return the mean of the tokens' losses (B, T) by their weights, of logits (B, T, V)."""
+    losses = functional.cross_entropy(logits.flatten(0, 1), wanted.flatten(), reduction="none")
+    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
 
 
 def _likeliest(logits: Tensor, never: tuple[int, ...]) -> Tensor:

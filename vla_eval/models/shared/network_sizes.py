@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any  # lerobot's configurations
 
 from vla_eval.errors import RecipeError, check_names
 
@@ -34,6 +35,12 @@ class VisionSizes:
     def n_patches(self) -> int:
         """Patches of one image."""
         return (self.image_px // self.patch_px) ** 2
+
+
+def sizes_from[S](sizes: type[S], config: Any, **others: Any) -> S:
+    """Return sizes that a configuration has under the same names, and others."""
+    names = {field.name for field in dataclasses.fields(sizes)} - others.keys()  # type: ignore[arg-type]
+    return sizes(**{name: getattr(config, name) for name in names}, **others)
 
 
 def with_changes[T: VisionSizes](published: type[T], changes: Mapping[str, int]) -> T:

@@ -8,13 +8,11 @@ from vla_eval.models.shared.options import option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpatialVLAOptions:
-    """What the files do not say.
+    """What the files do not say; flags explain themselves.
 
     Attributes:
-        unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
-        pictures: see `MikasaSpatialVLAConfig`.
-        head: whether Gemma's output matrix is that of its input (`tied`) or a tensor of its own; None: as the
-            files say, and an error if they contradict each other.
+        unnorm_key: None: the only statistics that there are, or none at all.
+        head: None: as the files say, and an error if they contradict each other.
         cameras: fields of the images that the policy expects; `pictures` says which of them are read.
         camera_px: edge of the images as a camera gives them.
         sizes: sizes that differ from the published ones.

@@ -6,9 +6,8 @@ are predicted, and only their columns' tokens are taken for it (`action_tokens.f
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from vla_eval.models.shared.greedy import Decoded, Prefix, greedy_tokens
+from vla_eval.models.shared.greedy import Decoded, Prefix, greedy_tokens, places_from, token_cross_entropy
 from vla_eval.models.spatialvla.action_grid import ActionGrid
 from vla_eval.models.spatialvla.action_tokens import from_tokens, to_tokens
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
@@ -29,14 +28,11 @@ def token_loss(
     """
     ids = to_tokens(actions, grid, network.sizes).flatten(1)
     sequence = network.sequence(inputs, ids)
-    hidden = network.hidden(sequence, attention)
     # A token is predicted at the place before it.
-    places = sequence.first_action[:, None] - 1 + torch.arange(ids.shape[1] + 1, device=ids.device)
-    logits = network.logits(hidden.take_along_dim(places[..., None], dim=1))
+    hidden = places_from(network.hidden(sequence, attention), sequence.first_action - 1, ids.shape[1] + 1)
     wanted = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
     weights = torch.cat([counts.repeat_interleave(TOKENS_PER_ACTION, dim=1), counts[:, -1:]], dim=1)
-    losses = functional.cross_entropy(logits.flatten(0, 1), wanted.flatten(), reduction="none")
-    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
+    return token_cross_entropy(network.logits(hidden), wanted, weights)
 
 
 def generated_tokens(
