@@ -5,7 +5,7 @@ from typing import Any  # lerobot is untyped
 
 from torch import Tensor
 
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
 
 Batch = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Make a LeRobot checkpoint of a published OpenVLA, or of what the OFT scripts have saved.
+"""Read a published OpenVLA, or what the OFT scripts have saved, to make a LeRobot checkpoint of it.
 
 No code of the checkpoint is run. Weights are safetensors; the heads of OFT lie beside them as pickled
 tensors (`action_head--50000_checkpoint.pt`), which are read only if that is allowed by name, and then by
@@ -8,36 +8,33 @@ torch's reader that builds nothing but tensors.
 import dataclasses
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any  # JSON and lerobot
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from vla_eval.checkpoints.conversion.writing import (
-    Statistics,
-    check_free,
-    chosen_statistics,
-    read_mask,
-    read_safetensors,
-    stated_gripper,
-    write_checkpoint,
-)
-from vla_eval.checkpoints.files import CONFIG_FILE, read_json
-from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.errors import CheckpointError, RecipeError
-from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY
+from vla_eval.features import ACTION_KEY, STATE_KEY
 from vla_eval.models.openvla.configuration_openvla import AUGMENTATION, MikasaOpenVLAConfig
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.models.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
 from vla_eval.models.openvla.prompt import prompt_text
 from vla_eval.models.openvla.sizes import NetworkSizes
 from vla_eval.models.openvla.weight_names import to_ours
 from vla_eval.models.shared.normalization import Normalization
+from vla_eval.models.shared.original import (
+    CONFIG_FILE,
+    Original,
+    Statistics,
+    chosen_statistics,
+    read_mask,
+    read_safetensors,
+    stated_gripper,
+    with_features,
+)
 from vla_eval.models.shared.processor_steps import check_gripper_mask
-from vla_eval.models.shared.weights import put_weights
-from vla_eval.strict.json_fields import get_mapping, wrong_type
+from vla_eval.strict.json_fields import get_mapping, read_json, wrong_type
 
 STATISTICS_FILE = "dataset_statistics.json"
 BACKBONES = {"vision_backbone_id": "dinosiglip-vit-so-224px", "llm_backbone_id": "llama2-7b-pure"}
@@ -47,73 +44,33 @@ KNOWN_IDS = (1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304, 5839, 29973,
 """What the published tokenizer makes of the prompt of `KNOWN_INSTRUCTION`; from the golden files."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConvertOptions:
-    """What the files do not say of themselves.
-
-    Attributes:
-        head, chunk_size: see `MikasaOpenVLAConfig`.
-        unnorm_key: whose statistics are used; None: the only ones there are, or none at all.
-        pictures: fields of the images, in the order of the training.
-        camera_px: edge of the images as a camera gives them.
-        proprio: numbers of the proprioception; 0: the model has none.
-        allow_pickled: read heads that are pickled tensors.
-        gripper: how the training data encode it, see `steps.gripper`; None is refused: no file says it.
-        image_augmentation: whether it was trained with it; None: as the folder's name says.
-        sizes: sizes that differ from the published ones.
-        dtype: of the result.
-    """
-
-    head: str = "tokens"
-    chunk_size: int = 1
-    unnorm_key: str | None = None
-    pictures: tuple[str, ...] = tuple(CAMERA_KEYS.values())
-    camera_px: int = 128
-    proprio: int = 0
-    allow_pickled: bool = False
-    gripper: str | None = None
-    image_augmentation: bool | None = None
-    sizes: dict[str, int] = field(default_factory=dict)
-    dtype: str = "bfloat16"
-
-
-def convert_openvla(source: Path, out: Path, options: ConvertOptions) -> Path:
-    """Write the LeRobot checkpoint `out`; return it.
-
-    Args:
-        source: folder with `config.json`, safetensors and tokenizer of an OpenVLA.
-        out: a folder that is not there yet.
-        options: see there.
+def read_original(source: Path, options: OpenVLAOptions) -> Original:
+    """Read a folder with `config.json`, safetensors and tokenizer of an OpenVLA.
 
     Raises:
         CheckpointError: something is missing, of another form, or not what the options say.
     """
-    check_free(out)
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
         _check_backbones(source, described)
     config = _config(source, options)
-    policy = make_unfilled_policy(config)
-    weights = read_original(source, options, config.network_sizes())
-    where = str(source)
-    put_weights(policy, {f"network.{name}": value for name, value in weights.items()}, where=where, cast=True)
     statistics = read_statistics(source, described, config, options.unnorm_key)
-    fields = read_normalizations(source, statistics, config) if statistics is not None else None
+    fields = None if statistics is None else read_normalizations(source, statistics, config)
 
-    def check_tokenizer(tokenizer: Any) -> None:
-        if not options.sizes:
-            _check_tokenizer(tokenizer)
+    def weights(_policy: Any) -> dict[str, Tensor]:
+        read = read_weights(source, options, config.network_sizes())
+        return {f"network.{name}": value for name, value in read.items()}
 
-    return write_checkpoint(
-        source,
-        out,
-        policy,
-        lambda: make_mikasa_openvla_pre_post_processors(config, statistics, fields=fields),
-        check_tokenizer=check_tokenizer,
+    return Original(
+        config=config,
+        weights=weights,
+        make_processors=lambda: make_mikasa_openvla_pre_post_processors(config, statistics, fields=fields),
+        casts=True,
+        check_tokenizer=lambda tokenizer: None if options.sizes else _check_tokenizer(tokenizer),
     )
 
 
-def read_original(source: Path, options: ConvertOptions, sizes: NetworkSizes) -> dict[str, Tensor]:
+def read_weights(source: Path, options: OpenVLAOptions, sizes: NetworkSizes) -> dict[str, Tensor]:
     """Return the weights of a published checkpoint under our names.
 
     Raises:
@@ -197,8 +154,7 @@ def settle_augmentation(source: Path, stated: bool | None) -> bool:
     return is_named or bool(stated)
 
 
-def _config(source: Path, options: ConvertOptions) -> MikasaOpenVLAConfig:
-    shape = (3, options.camera_px, options.camera_px)
+def _config(source: Path, options: OpenVLAOptions) -> MikasaOpenVLAConfig:
     make: Any = MikasaOpenVLAConfig  # lerobot, whose fields it has, is untyped
     config: MikasaOpenVLAConfig = make(
         head=options.head,
@@ -212,12 +168,9 @@ def _config(source: Path, options: ConvertOptions) -> MikasaOpenVLAConfig:
         device="cpu",
         push_to_hub=False,
     )
-    inputs = {name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name in options.pictures}
-    if options.proprio:
-        inputs[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(options.proprio,))
-    config.input_features = inputs
-    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
-    return config
+    cameras = dict.fromkeys(options.pictures, (options.camera_px, options.camera_px))
+    made: MikasaOpenVLAConfig = with_features(config, cameras, state=options.proprio)
+    return made
 
 
 def _pickled(source: Path, name: str, *, allowed: bool) -> dict[str, Tensor]:

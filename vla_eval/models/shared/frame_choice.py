@@ -83,12 +83,7 @@ class FrameChoice:
         return RULES[self.rule].looks
 
     def after(self, seen: Seen, image: ImageArray | None) -> Seen:
-        """Return what is kept after one more frame.
-
-        Args:
-            seen: of the frames before.
-            image: (3, H, W) uint8; may be None if the rule does not look at images.
-        """
+        """Return what is kept after one more frame (3, H, W) uint8; None: the rule does not look at it."""
         return RULES[self.rule].after(self, seen, image)
 
     def shown(self, seen: Seen) -> tuple[int | None, ...]:
@@ -114,10 +109,9 @@ class Rule(NamedTuple):
 
 
 def blocks_of(image: ImageArray) -> Blocks:
-    """Return the mean colours of an image's blocks; exact, whatever the array's order in memory.
+    """Return the mean colours of the blocks of an image (3, H, W) of at least 32 pixels each way.
 
-    Args:
-        image: (3, H, W) uint8, at least 32 pixels high and wide.
+    Exact, whatever the array's order in memory.
     """
     return tuple(_means(image.astype(np.int64), n) for n in BLOCKS)
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from vla_eval.models.shared.frame_choice import FrameChoice, Seen
 from vla_eval.models.shared.levels import in_bytes
-from vla_eval.models.vla_memory.frame_choice import FrameChoice, Seen
 
 SEGMENT_PADDING_KEY = "segment_is_pad"
 """(B, T) of a training batch in segments: which come before the episode's beginning."""
@@ -68,10 +68,7 @@ def place_fields(cameras: Iterable[str], n_places: int) -> tuple[str, ...]:
 def in_places(camera: str, images: Sequence[Tensor | None], like: Tensor) -> Iterator[tuple[str, Tensor]]:
     """Yield the fields of a camera's images (3, H, W), in the order of the places, and of their masks.
 
-    Args:
-        camera: field of the newest image.
-        images: None: there is none.
-        like: an image of the same shape and type.
+    `camera` is the field of the newest image, `like` an image of the same shape and type.
     """
     for place, image in enumerate(images, start=1):
         name = place_field(camera, place)

@@ -11,10 +11,9 @@ Gemma 2, SigLIP and its image processor: transformers 4.47.0, with which the ori
 from collections.abc import Mapping
 from pathlib import Path
 
-from vla_eval.checkpoints.conversion.spatialvla_sections import OF_NO_EFFECT, Field, Section
-from vla_eval.checkpoints.files import CONFIG_FILE, read_json
 from vla_eval.errors import CheckpointError
 from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.original import CONFIG_FILE
 from vla_eval.models.shared.siglip import LAYER_NORM_EPS
 from vla_eval.models.spatialvla.action_grid import AXES
 from vla_eval.models.spatialvla.depth import zoe_config
@@ -26,7 +25,9 @@ from vla_eval.models.spatialvla.network import (
     RMS_NORM_EPS,
     ROPE_THETA,
 )
+from vla_eval.models.spatialvla.sections import OF_NO_EFFECT, Field, Section
 from vla_eval.models.spatialvla.sizes import SLIDING_WINDOW, NetworkSizes
+from vla_eval.strict.json_fields import read_json
 
 PROCESSOR_FILE, IMAGES_FILE, GENERATION_FILE = (
     "processor_config.json",
@@ -39,11 +40,7 @@ N_GRIPPER_BINS = 2
 
 
 def check_described(source: Path, sizes: NetworkSizes) -> None:
-    """Compare all that the files say with what is implemented.
-
-    Args:
-        source: folder of the published checkpoint.
-        sizes: of the network that its weights are to be loaded into.
+    """Compare all that the files of a published checkpoint say with a network of these sizes.
 
     Raises:
         CheckpointError: a file is missing, or says something else or something that is not known here.

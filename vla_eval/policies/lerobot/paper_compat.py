@@ -32,13 +32,7 @@ JPEG_QUALITY = 95  # TensorFlow's default, which the original leaves as it is
 
 
 class PaperCompatPolicy:
-    """A policy with some of the switches on; see the module's text.
-
-    Args:
-        policy: what decides.
-        switches: names of `SWITCHES`.
-        n_action_steps: how many actions of a chunk are executed.
-    """
+    """A policy with some of the switches on; see the module's text."""
 
     def __init__(self, policy: LeRobotPolicy, switches: Sequence[str], *, n_action_steps: int) -> None:
         self._policy, self._switches = policy, frozenset(switches)
@@ -69,23 +63,13 @@ class PaperCompatPolicy:
         return ActionChunk(actions=np.ascontiguousarray(actions))
 
 
-def make_openvla(
+def make_paper_compat(
     context: PolicyContext,
     *,
     paper_compat: Sequence[str] = (),
     **args: Any,  # Any: those of `make_lerobot`
 ) -> LeRobotPolicy | PaperCompatPolicy:
-    """Make an OpenVLA from a checkpoint of ours; `args` are those of the adapter `lerobot`.
-
-    Args:
-        context: what every adapter is given.
-        paper_compat: which switches are on.
-        args: of `make_lerobot`.
-
-    Raises:
-        UnknownNameError: there is no such switch.
-        CheckpointError, SpecMismatchError: see `make_lerobot`.
-    """
+    """Make a policy from a checkpoint, with some `SWITCHES`; `args` are those of the adapter `lerobot`."""
     check_names("switch", paper_compat, SWITCHES, where="args.paper_compat")
     policy = make_lerobot(context, **args)
     n_action_steps = context.chunking.n_action_steps
