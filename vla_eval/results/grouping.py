@@ -38,6 +38,16 @@ class RowKey(NamedTuple):
     n_action_steps: int
     variant: str | None
 
+    @property
+    def place(self) -> str:
+        """What is the same for all policies: `RememberColor3-v0 K=4 (env.delay_steps=10)`."""
+        variant = f" ({self.variant})" if self.variant else ""
+        return f"{self.task} K={self.n_action_steps}{variant}"
+
+    def __str__(self) -> str:
+        """Return `oracle on RememberColor3-v0 K=4`."""
+        return f"{self.policy} on {self.place}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
@@ -68,6 +78,11 @@ class RowEpisodes:
 
     key: RowKey
     runs: tuple[Run, ...]
+
+    @property
+    def runs_with_results(self) -> list[Run]:
+        """The runs with an episode that is not an error."""
+        return [run for run in self.runs if run.results]
 
     @property
     def results(self) -> list[EpisodeRecord]:

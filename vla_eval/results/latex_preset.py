@@ -7,7 +7,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from vla_eval.results.comparison import Success
 from vla_eval.results.latex import latex_first, latex_text
+from vla_eval.results.own_statistics import EPISODES, SUCCESS
+from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE
 from vla_eval.results.success_table import Row, Table
 
 CONTROLS = {
@@ -96,16 +99,16 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
     """Return a line of rates, and below it a line of their intervals."""
     rates, intervals = [], []
     for row, best in zip(rows, is_best, strict=True):
-        if row is None or row.success_once is None:
+        success = Success() if row is None else row[SUCCESS]
+        if success.success_once is None:
             rates.append("---")
             intervals.append("")
             continue
-        rate = f"{row.success_once:.2f}"
+        rate = f"{success.success_once:.2f}"
         rates.append(f"\\textbf{{{rate}}}" if best else rate)
-        if row.sem is not None:
-            rates[-1] += f" $\\pm$ {row.sem:.2f}"
-        known = row.ci_low is not None and row.ci_high is not None
-        intervals.append(f"{{\\scriptsize [{row.ci_low:.2f}, {row.ci_high:.2f}]}}" if known else "")
+        if success.sem is not None:
+            rates[-1] += f" $\\pm$ {success.sem:.2f}"
+        intervals.append(f"{{\\scriptsize [{success.ci_low:.2f}, {success.ci_high:.2f}]}}")
     return [
         latex_first(name) + "".join(f" & {rate}" for rate in rates) + r" \\",
         " & ".join(["", *intervals]) + r" \\[2pt]",
@@ -114,19 +117,17 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
 
 def _best(rows: Sequence[Row | None]) -> list[Row]:
     """Return the rows with the highest rate; none if there is nothing to be better than."""
-    known = [row for row in rows if row is not None and row.success_once is not None]
-    if len(known) < 2:
-        return []
-    highest = max(row.success_once or 0.0 for row in known)
-    return [row for row in known if row.success_once == highest]
+    known = [(row, rate) for row in rows if row and (rate := row[SUCCESS].success_once) is not None]
+    highest = max((rate for _, rate in known), default=0.0)
+    return [row for row, rate in known if rate == highest] if len(known) > 1 else []
 
 
 def _by_luck(task: str, cells: dict[tuple[_Label, str], Row]) -> str | None:
     """Return chance by arithmetic, if that is what the rows of the task are compared with."""
     rates = {
-        row.chance
+        chance.rate
         for (_, other), row in cells.items()
-        if other == task and row.chance is not None and row.chance_source in ("1/N", "catalogue")
+        if other == task and (chance := row[CHANCE]) is not None and chance.source in BY_ARITHMETIC
     }
     return f"{rates.pop():.2f}" if len(rates) == 1 else None
 
@@ -158,15 +159,15 @@ def _title(task: str) -> list[str]:
 
 
 def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
-    rate = len("0.00 ± 0.00") if any(row.sem is not None for row in rows) else len("0.00")
+    rate = len("0.00 ± 0.00") if any(row[SUCCESS].sem is not None for row in rows) else len("0.00")
     title = max(len(line) for task in tasks for line in _title(task))
     return max(max(rate, title) * SMALL_PT, len("[0.00, 0.00]") * SCRIPT_PT) + COLUMN_SPACE_PT
 
 
 def _caption(table: Table, variants: Mapping[str, str]) -> str:
-    rows = [row for row in table.rows if row.success_once is not None]
+    rows = [row for row in table.rows if row[SUCCESS].success_once is not None]
     parts = ["Success once with its 95\\,\\% interval"]
-    counts = sorted({row.n_episodes for row in rows})
+    counts = sorted({row[EPISODES].n_episodes for row in rows})
     if counts:
         spread = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         parts.append(f", {spread} episodes per cell")
@@ -174,7 +175,7 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     if len(sizes) == 1:
         parts.append(f", $K = {sizes.pop()}$")
     sentences = ["".join(parts) + "."]
-    if any(row.sem is not None for row in rows):
+    if any(row[SUCCESS].sem is not None for row in rows):
         sentences.append("$\\pm$: standard error over the runs.")
     learned = {_label(row) for row in rows if row.policy not in CONTROLS}
     if len(learned) > 1:
@@ -186,7 +187,7 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     if variants:
         said = "; ".join(f"({letter}) {latex_text(text)}" for text, letter in variants.items())
         sentences.append(f"Settings: {said}.")
-    n_errors = sum(row.n_errors for row in table.rows)
+    n_errors = sum(row[EPISODES].n_errors for row in table.rows)
     if n_errors:
         sentences.append(f"Episodes that ended in an error are in no rate: {n_errors}.")
     return " ".join(sentences)

@@ -5,17 +5,17 @@ Reads and returns; changes nothing. `docs/chunk_sizes.md` explains each column.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from vla_eval.errors import ReportError, unknown_name
-from vla_eval.results.comparison import Chance, Measured, ceiling_of, chance_of, count_pairs, measure
+from vla_eval.results.comparison import Chance, Success, ceiling_of, chance_of, count_pairs, success_of
 from vla_eval.results.cue import CueFrames, cue_frames
 from vla_eval.results.estimates import PairCounts, PairedTest, holm, mcnemar_exact
+from vla_eval.results.formats import By
 from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
 from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
 from vla_eval.storage.run_folder import StoredRun
 
-By = Literal["n_action_steps", "policy"]
 DEFAULT_DIFFERENCE = 0.1
 
 
@@ -26,7 +26,7 @@ class SweepRow:
     Attributes:
         key: task, policy, n_action_steps, variant.
         n_episodes: with a result.
-        measured: rates and interval.
+        success: its rate and interval.
         chance, ceiling: without memory, and with the answer, at the same n_action_steps.
         cue: frames of the cue that the policy got.
         reference: the row with which it is compared; None for the reference itself.
@@ -38,7 +38,7 @@ class SweepRow:
 
     key: RowKey
     n_episodes: int
-    measured: Measured
+    success: Success
     chance: Chance | None
     ceiling: float | None
     cue: CueFrames | None
@@ -98,21 +98,21 @@ def compare_runs(
             f"the same seeds, for example --n-action-steps 1 4 8, or name other runs."
         )
     corrected = dict(zip(tests, holm([test.p_value for test in tests.values()]), strict=True))
-    measured = {key: measure(group) for key, group in groups.items()}
+    successes = {key: success_of(group) for key, group in groups.items()}
     arguments = _env_arguments(runs)
     level = LEVEL / len(tests)
     rows = [
         SweepRow(
             key=key,
             n_episodes=len(group.results),
-            measured=measured[key],
-            chance=chance_of(key, groups, measured),
-            ceiling=ceiling_of(key, measured),
+            success=successes[key],
+            chance=chance_of(key, groups, successes),
+            ceiling=ceiling_of(key, successes),
             cue=cue_frames(group, arguments.get((key.task, key.variant), {})),
             reference=references[key] if key in tests else None,
             test=tests.get(key),
             corrected_p=corrected.get(key),
-            n_to_settle=_n_to_settle(key, references[key], pairs.get(key), measured, difference, level)
+            n_to_settle=_n_to_settle(key, references[key], pairs.get(key), successes, difference, level)
             if key in tests
             else None,
         )
@@ -144,7 +144,7 @@ def _n_to_settle(
     key: RowKey,
     other: RowKey,
     counts: PairCounts | None,
-    measured: Mapping[RowKey, Measured],
+    successes: Mapping[RowKey, Success],
     difference: float,
     level: float,
 ) -> int | None:
@@ -154,7 +154,7 @@ def _n_to_settle(
     n_different = counts.only_first + counts.only_second
     if n_different:
         return episodes_to_settle(difference, n_different / counts.n_pairs, level=level)
-    first, second = measured[key].success_once, measured[other].success_once
+    first, second = successes[key].success_once, successes[other].success_once
     if first is None or second is None:
         return None
     return episodes_to_settle(difference, discordance_of_independent(first, second), level=level)
