@@ -1,10 +1,9 @@
 """Measure one row, and compare it: with baselines on the same episodes, with chance, with the ceiling."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import (
     Interval,
     PairCounts,
@@ -49,7 +48,7 @@ class Success(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """A row against its baseline, on the same episodes; `corrected_p` is Holm's, over the whole table."""
+    """A row against another one, on the same episodes; `corrected_p` is Holm's, over the whole table."""
 
     baseline: RowKey
     pairs: PairCounts
@@ -91,15 +90,15 @@ def success_of(group: RowEpisodes) -> Success:
     zero width, as if there were no uncertainty; then the episodes of one run give the interval.
     """
     runs = group.runs_with_results
-    estimate = estimate_runs([_n_success(run.results.values()) / len(run.results) for run in runs])
+    estimate = estimate_runs([run.rate for run in runs])
     if estimate is None:
         return Success()
-    smallest = min((run.results.values() for run in runs), key=len)
-    one_run = wilson_interval(_n_success(smallest), len(smallest))
+    smallest = min(runs, key=lambda run: len(run.results))
+    one_run = wilson_interval(smallest.n_success, len(smallest.results))
     interval = estimate.interval if estimate.sem else one_run
     assert interval is not None  # there is a result
     return Success(
-        n_success_once=_n_success(group.results),
+        n_success_once=sum(run.n_success for run in runs),
         success_once=estimate.mean,
         ci_low=interval.low,
         ci_high=interval.high,
@@ -107,6 +106,21 @@ def success_of(group: RowEpisodes) -> Success:
         n_runs=len(runs),
         sem=estimate.sem,
     )
+
+
+def compare[K](pairs: Mapping[K, tuple[RowEpisodes, RowEpisodes]]) -> dict[K, Comparison]:
+    """Compare rows with other rows on the same run and seed; the p values are corrected together.
+
+    Returns:
+        The comparisons of those that share episodes.
+    """
+    counts = {place: count_pairs(*pair) for place, pair in pairs.items()}
+    tests = {place: test for place, found in counts.items() if (test := mcnemar_exact(found)) is not None}
+    corrected = holm([test.p_value for test in tests.values()])
+    return {
+        place: Comparison(baseline=pairs[place][1].key, pairs=counts[place], test=test, corrected_p=p)
+        for (place, test), p in zip(tests.items(), corrected, strict=True)
+    }
 
 
 def compare_with_baselines(
@@ -121,24 +135,35 @@ def compare_with_baselines(
         baselines: names of the policies to compare with.
 
     Returns:
-        Row -> its comparison with each baseline, None where they share no episodes; p values are corrected
-        for all comparisons with all baselines.
+        Row -> its comparison with each baseline, None where they share no episodes.
     """
-    found: dict[tuple[str, RowKey], tuple[RowKey, PairCounts, PairedTest]] = {}
-    for rank, baseline in enumerate(baselines):
-        for key, group in groups.items():
-            other = None if key.policy in baselines[rank + 1 :] else _baseline_of(key, groups, baseline)
-            if other is None:
-                continue
-            pairs = count_pairs(group, other)
-            if (test := mcnemar_exact(pairs)) is not None:
-                found[baseline, key] = (other.key, pairs, test)
-    corrected = dict(zip(found, holm([test.p_value for _, _, test in found.values()]), strict=True))
-    compared = {
-        place: Comparison(baseline=other, pairs=pairs, test=test, corrected_p=corrected[place])
-        for place, (other, pairs, test) in found.items()
+    found = compare(
+        {
+            (baseline, key): (group, other)
+            for rank, baseline in enumerate(baselines)
+            for key, group in groups.items()
+            if key.policy not in baselines[rank + 1 :]
+            and (other := _baseline_of(key, groups, baseline)) is not None
+        }
+    )
+    return {key: tuple(found.get((baseline, key)) for baseline in baselines) for key in groups}
+
+
+def gather_evidence(
+    groups: Mapping[RowKey, RowEpisodes], compared: Mapping[RowKey, tuple[Comparison | None, ...]]
+) -> dict[RowKey, Evidence]:
+    """Return what the statistics of each row are estimated from."""
+    successes = {key: success_of(group) for key, group in groups.items()}
+    return {
+        key: Evidence(
+            episodes=group,
+            success=successes[key],
+            chance=chance_of(key, groups, successes),
+            ceiling=successes.get(key._replace(policy=CEILING_POLICY), Success()).success_once,
+            comparisons=compared[key],
+        )
+        for key, group in groups.items()
     }
-    return {key: tuple(compared.get((baseline, key)) for baseline in baselines) for key in groups}
 
 
 def chance_of(
@@ -172,11 +197,6 @@ def chance_of(
     return Chance(rate=spec.chance_success, source="catalogue")
 
 
-def ceiling_of(key: RowKey, successes: Mapping[RowKey, Success]) -> float | None:
-    """Return the success of the oracle on the same task, variant and `n_action_steps`."""
-    return successes.get(key._replace(policy=CEILING_POLICY), Success()).success_once
-
-
 def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: str) -> RowEpisodes | None:
     """Return the baseline's row to compare with: at the same `n_action_steps`, or at the only other one."""
     if key.policy == baseline:
@@ -195,10 +215,10 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: st
 def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
     """Count the outcomes of two rows on the same run and seed."""
     counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
-    others = {(run.index, run.copy): run.results for run in other.runs}
+    others = {run.key: run.results for run in other.runs}
     seen: set[tuple[int, str, str]] = set()
     for run in group.runs:
-        partner = others.get((run.index, run.copy), {})
+        partner = others.get(run.key, {})
         for seed, record in run.results.items():
             if seed not in partner:
                 continue
@@ -208,13 +228,5 @@ def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
                 if (seed, first, second) in seen:
                     continue
                 seen.add((seed, first, second))
-            counts[_once(record), _once(partner[seed])] += 1
+            counts[record.outcome == "success", partner[seed].outcome == "success"] += 1
     return PairCounts(*counts.values())
-
-
-def _once(record: EpisodeRecord) -> bool:
-    return record.outcome == "success"
-
-
-def _n_success(results: Iterable[EpisodeRecord]) -> int:
-    return sum(_once(record) for record in results)

@@ -5,9 +5,9 @@ Knows nothing of episodes.
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from vla_eval.results.comparison import Success
+from vla_eval.results.grouping import RowKey
 from vla_eval.results.latex import latex_first, latex_text
 from vla_eval.results.own_statistics import EPISODES, SUCCESS
 from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE
@@ -32,24 +32,16 @@ LONGEST_LINE = 10  # letters in a line of a column's title
 CHANCE_NAME = "chance, 1/N"
 
 
-class _Label(NamedTuple):
-    """What a row of the paper's table is of."""
-
-    policy: str
-    n_action_steps: int
-    variant: str | None
-
-
 def paper_preset(table: Table) -> str:
     """Return a `table` environment that fits into one line width; it needs booktabs.
 
     Tasks that do not fit side by side continue in a second block below the first.
     """
     tasks = list(dict.fromkeys(row.task for row in table.rows))
-    labels = dict.fromkeys(_label(row) for row in table.rows)
+    labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
     variants = {text: chr(ord("a") + i) for i, text in enumerate(_variants(table))}
     names = {label: _name(label, list(labels), variants) for label in labels}
-    cells = {(_label(row), row.task): row for row in table.rows}
+    cells = {(row.key.of_all_tasks, row.task): row for row in table.rows}
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
@@ -69,7 +61,7 @@ def paper_preset(table: Table) -> str:
 
 
 def _tabular(
-    tasks: Sequence[str], names: dict[_Label, str], cells: dict[tuple[_Label, str], Row]
+    tasks: Sequence[str], names: dict[RowKey, str], cells: dict[tuple[RowKey, str], Row]
 ) -> list[str]:
     lines = [f"\\begin{{tabular}}{{@{{}}l{'c' * len(tasks)}@{{}}}}", "\\toprule"]
     titles = [_title(task) for task in tasks]
@@ -122,7 +114,7 @@ def _best(rows: Sequence[Row | None]) -> list[Row]:
     return [row for row, rate in known if rate == highest] if len(known) > 1 else []
 
 
-def _by_luck(task: str, cells: dict[tuple[_Label, str], Row]) -> str | None:
+def _by_luck(task: str, cells: dict[tuple[RowKey, str], Row]) -> str | None:
     """Return chance by arithmetic, if that is what the rows of the task are compared with."""
     rates = {
         chance.rate
@@ -132,11 +124,7 @@ def _by_luck(task: str, cells: dict[tuple[_Label, str], Row]) -> str | None:
     return f"{rates.pop():.2f}" if len(rates) == 1 else None
 
 
-def _label(row: Row) -> _Label:
-    return _Label(row.policy, row.n_action_steps, row.variant)
-
-
-def _name(label: _Label, labels: Sequence[_Label], variants: Mapping[str, str]) -> str:
+def _name(label: RowKey, labels: Sequence[RowKey], variants: Mapping[str, str]) -> str:
     """Return the policy, its K if there are several, and the letter of its variant."""
     several = len({other.n_action_steps for other in labels}) > 1
     name = f"{label.policy}, K = {label.n_action_steps}" if several else label.policy
@@ -177,7 +165,7 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     sentences = ["".join(parts) + "."]
     if any(row[SUCCESS].sem is not None for row in rows):
         sentences.append("$\\pm$: standard error over the runs.")
-    learned = {_label(row) for row in rows if row.policy not in CONTROLS}
+    learned = {row.key.of_all_tasks for row in rows if row.policy not in CONTROLS}
     if len(learned) > 1:
         sentences.append("The best policy of each task is in bold.")
     controls = dict.fromkeys(row.policy for row in rows if row.policy in CONTROLS)

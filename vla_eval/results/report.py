@@ -13,9 +13,8 @@ from vla_eval.results.comparison import (
     CHANCE_POLICY,
     RANDOM_POLICY,
     Evidence,
-    ceiling_of,
-    chance_of,
     compare_with_baselines,
+    gather_evidence,
     success_of,
 )
 from vla_eval.results.formats import FORMATS, Format
@@ -59,22 +58,12 @@ def build_table(
     )
     groups = grouping.groups
     compared = compare_with_baselines(groups, baselines)
-    successes = {key: success_of(group) for key, group in groups.items()}
-    evidence = {
-        key: Evidence(
-            episodes=group,
-            success=successes[key],
-            chance=chance_of(key, groups, successes),
-            ceiling=ceiling_of(key, successes),
-            comparisons=compared[key],
-        )
-        for key, group in groups.items()
-    }
-    rows = tuple(map(make_row, evidence.values()))
+    evidence = gather_evidence(groups, compared).values()
+    rows = tuple(map(make_row, evidence))
     summaries = protocol_summaries(runs, grouping, names=protocols)
     return Table(
         rows=rows,
-        run_rows=tuple(row for of in evidence.values() if of.success.n_runs > 1 for row in _run_rows(of)),
+        run_rows=tuple(row for of in evidence if of.success.n_runs > 1 for row in _run_rows(of)),
         notes=(
             *audit_notes(runs),
             *row_notes(rows),

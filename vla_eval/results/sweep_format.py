@@ -1,9 +1,10 @@
 """Write a comparison as text: Markdown, CSV, JSON, LaTeX or an HTML table."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from vla_eval.results.comparison import Comparison
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
@@ -83,21 +84,21 @@ def _json(sweep: Sweep, notes: Sequence[str]) -> str:
 
 
 def _values(row: SweepRow, sweep: Sweep) -> dict[str, object]:
-    test = row.test
+    success, one = row.evidence.success, row.comparison
     return {
         **row.key._asdict(),
-        "n_episodes": row.n_episodes,
-        "success_once": row.success.success_once,
-        "ci_low": row.success.ci_low,
-        "ci_high": row.success.ci_high,
-        "chance": row.chance.rate if row.chance else None,
-        "ceiling": row.ceiling,
+        "n_episodes": len(row.evidence.episodes.results),
+        "success_once": success.success_once,
+        "ci_low": success.ci_low,
+        "ci_high": success.ci_high,
+        "chance": row.evidence.chance.rate if row.evidence.chance else None,
+        "ceiling": row.evidence.ceiling,
         "cue_frames": list(row.cue) if row.cue else None,
-        "reference": getattr(row.reference, sweep.by) if row.reference else None,
-        "paired_difference": test.difference if test else None,
-        "n_pairs": test.n_pairs if test else None,
-        "paired_p_raw": test.p_value if test else None,
-        "paired_p": row.corrected_p,
+        "reference": getattr(one.baseline, sweep.by) if one else None,
+        "paired_difference": one.test.difference if one else None,
+        "n_pairs": one.test.n_pairs if one else None,
+        "paired_p_raw": one.test.p_value if one else None,
+        "paired_p": one.corrected_p if one else None,
         "episodes_to_settle": row.n_to_settle,
     }
 
@@ -115,21 +116,24 @@ def _notes(sweep: Sweep) -> list[str]:
 
 
 def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
+    def compared(cell: Callable[[Comparison], str]) -> Callable[[SweepRow], str]:
+        return lambda row: UNDEFINED if row.comparison is None else cell(row.comparison)
+
     return [
         Column("task", lambda row: row.key.task, is_number=False, folds=True),
         Column("policy", lambda row: row.key.policy, is_number=False, folds=True),
         Column("K", lambda row: str(row.key.n_action_steps), folds=True),
         Column("variant", lambda row: row.key.variant or "", is_number=False, folds=True, rank=1),
-        Column("episodes", lambda row: str(row.n_episodes), folds=True, rank=5),
-        Column("success", lambda row: rate(row.success.success_once)),
+        Column("episodes", lambda row: str(len(row.evidence.episodes.results)), folds=True, rank=5),
+        Column("success", lambda row: rate(row.evidence.success.success_once)),
         Column("95 % interval", _interval, is_number=False, rank=2),
-        Column("chance", lambda row: rate(row.chance.rate if row.chance else None), folds=True, rank=8),
-        Column("ceiling", lambda row: rate(row.ceiling), folds=True, rank=9),
+        Column("chance", _chance, folds=True, rank=8),
+        Column("ceiling", lambda row: rate(row.evidence.ceiling), folds=True, rank=9),
         Column("cue frames", lambda row: str(row.cue or UNDEFINED), is_number=False, rank=6),
-        Column("reference", lambda row: _reference(row, sweep.by), is_number=False, rank=4),
-        Column("difference", lambda row: f"{row.test.difference:+.2f}" if row.test else UNDEFINED),
-        Column("p", lambda row: _p(row.test.p_value if row.test else None), rank=7),
-        Column("p (Holm)", lambda row: _p(row.corrected_p)),
+        Column("reference", compared(lambda one: str(getattr(one.baseline, sweep.by))), False, rank=4),
+        Column("difference", compared(lambda one: f"{one.test.difference:+.2f}")),
+        Column("p", compared(lambda one: f"{one.test.p_value:.3g}"), rank=7),
+        Column("p (Holm)", compared(lambda one: f"{one.corrected_p:.3g}")),
         Column(
             "episodes to settle",
             lambda row: UNDEFINED if row.n_to_settle is None else str(row.n_to_settle),
@@ -139,13 +143,9 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
 
 
 def _interval(row: SweepRow) -> str:
-    low, high = row.success.ci_low, row.success.ci_high
+    low, high = row.evidence.success.ci_low, row.evidence.success.ci_high
     return UNDEFINED if low is None or high is None else f"{low:.2f}-{high:.2f}"
 
 
-def _reference(row: SweepRow, by: str) -> str:
-    return str(getattr(row.reference, by)) if row.reference else UNDEFINED
-
-
-def _p(value: float | None) -> str:
-    return UNDEFINED if value is None else f"{value:.3g}"
+def _chance(row: SweepRow) -> str:
+    return rate(row.evidence.chance.rate if row.evidence.chance else None)
