@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from vla_eval.results.printed_table import write_tables
 from vla_eval.results.published.literature import Published, load_published
 from vla_eval.results.published.table import published_side_tables
-from vla_eval.results.table_formats import markdown_side_table
 
 PAGE = Path(__file__).parents[1] / "docs" / "leaderboard.md"
 HEAD = """\
@@ -45,7 +45,7 @@ def page() -> str:
     parts = [HEAD.format(checked=published.checked).rstrip()]
     for name in published.boards:
         parts.append(f"## `{name}`")
-        parts += [markdown_side_table(side) for side in published_side_tables(name)]
+        parts.append(write_tables(published_side_tables(name), "markdown"))
     parts.append(_sources(published))
     return "\n\n".join(parts) + "\n"
 
