@@ -59,8 +59,8 @@ def row(name: str, changed: str, change: Change, sizes: Callable[[FinetuneRecipe
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
     policy = {**recipe.policy, **change.get("policy", {})}
     recipe = dataclasses.replace(recipe, **{**change, "policy": policy})
-    check_lora_targets(recipe)
     config = sizes(recipe)
+    check_lora_targets(recipe, type(config))
     found = estimate(unfilled_model(config, recipe), config, recipe, device="cuda")
     fits = [str(found.largest_batch(n * 1e9) or "—") for n in DEVICES_GB]
     days = (found.step_seconds or 0) * found.steps / SECONDS_PER_DAY

@@ -64,12 +64,12 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="session")
 def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vla_eval.data.dataset_folder import digest_files
+    from vla_eval.data.facts import DatasetFacts
     from vla_eval.data.manifest import (
         FAILED_FILE,
         MANIFEST_FILE,
         MIKASA_FOLDER,
         RECORDING_FILE,
-        DatasetFacts,
         FailedSeed,
         RecordedEpisode,
         encode_actions,

@@ -8,14 +8,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from vla_eval.data.dataset_folder import digest_files
-from vla_eval.data.manifest import (
-    MANIFEST_FILE,
-    RECORDING_FILE,
-    read_facts,
-    read_manifest,
-    write_entry,
-    write_lines,
-)
+from vla_eval.data.facts import read_facts
+from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_manifest, write_entry, write_lines
 from vla_eval.features import SUCCESS_KEY
 
 

@@ -14,7 +14,8 @@ from datasets.features.features import _FEATURE_TYPES
 from fsspec.registry import known_implementations
 
 from vla_eval.data.dataset_folder import digest_files
-from vla_eval.data.manifest import RECORDING_FILE, read_facts, write_entry
+from vla_eval.data.facts import read_facts
+from vla_eval.data.manifest import RECORDING_FILE, write_entry
 
 PIXEL = (  # a PNG of one pixel
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNk+A8AAQUBAScY42YAAAAASUVORK5CYII="

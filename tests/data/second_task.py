@@ -7,12 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.facts import read_facts
 from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
     MIKASA_FOLDER,
     RECORDING_FILE,
-    read_facts,
     read_manifest,
     write_entry,
     write_lines,

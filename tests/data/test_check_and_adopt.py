@@ -16,7 +16,7 @@ from tests.data.foreign_datasets import write_good
 from vla_eval.cli.main import main
 from vla_eval.data.adopt import adopt
 from vla_eval.data.check import check
-from vla_eval.data.imported import IMPORT_FILE
+from vla_eval.data.manifest import IMPORT_FILE
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
 from vla_eval.tasks.catalog import task_spec
@@ -76,7 +76,7 @@ def test_what_lerobots_tool_leaves_can_be_adopted_and_trained_on(
     assert (facts.source_layout, facts.task, facts.control_mode) == ("adopted", TASK.id, "pd_ee_delta_pose")
     assert {episode.source_seed for episode in facts.episodes} == {None}
     found = training_dataset(root, allow_unreplayed=True)
-    assert (found.seeds, found.was_replayed, found.state) == (None, False, "eef")
+    assert (found.seeds, found.was_replayed, found.facts.state) == (None, False, "eef")
     report = check(root)
     assert report.kind == "an adopted dataset, complete" and not report.is_refused
     with pytest.raises(DatasetError, match="the dataset has its records"):
@@ -88,7 +88,7 @@ def test_files_that_are_changed_after_an_adoption_are_found(ours: Path, tmp_path
     adopt(root, task=None)
     video = next(root.glob("videos/*/*/*.mp4"))
     video.write_bytes(video.read_bytes()[:-1] + b"x")
-    with pytest.raises(DatasetError, match=r"\.mp4: not what was converted"):
+    with pytest.raises(DatasetError, match=r"\.mp4: its content is not what was converted"):
         check(root)
 
 

@@ -15,10 +15,11 @@ from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, JOINT_DELTA_POS, JOINT_POS
 from vla_eval.core import Observation, ObservationWindow
-from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.derived.changed_actions import copy_with_actions
 from vla_eval.data.derived.converted_episode import AimFollower, convert_episode
-from vla_eval.data.manifest import RecordedEpisode, decode_actions, encode_actions, read_facts, read_manifest
+from vla_eval.data.facts import read_facts
+from vla_eval.data.manifest import RecordedEpisode, decode_actions, encode_actions, read_manifest
+from vla_eval.data.opening import open_dataset
 from vla_eval.data.recording.demonstrations import NoisyEnv, attempt
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.tables import read_columns
@@ -115,7 +116,7 @@ def test_the_copy_has_the_new_actions_with_their_statistics_and_everything_else_
     del before["action"]
     assert after.keys() == before.keys()
     assert all(np.array_equal(after[name], before[name]) for name in before)
-    dataset = open_recorded(path)  # checks every file's digest
+    dataset = open_dataset(path).lerobot()  # checks every file's digest
     assert dataset.meta.features["action"]["names"] == list(CONTROL_MODES[JOINT_POS].dims)
     assert dataset[3]["action"].shape == (8,)
     stats = json.loads((path / "meta/stats.json").read_text())
@@ -125,7 +126,7 @@ def test_the_copy_has_the_new_actions_with_their_statistics_and_everything_else_
     np.testing.assert_allclose(own, rows[1].max(axis=0))
     assert read_facts(path).control_mode == JOINT_POS
     assert read_facts(recorded).control_mode == EE_DELTA_POSE
-    assert training_dataset(path, allow_unreplayed=True).control_mode == JOINT_POS
+    assert training_dataset(path, allow_unreplayed=True).facts.control_mode == JOINT_POS
     with pytest.raises(DatasetError, match="is there already"):
         copy_with_actions(recorded, path, episodes, recipe(JOINT_POS))
 

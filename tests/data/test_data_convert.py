@@ -9,11 +9,11 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.cli.main import main
+from vla_eval.data.facts import find_facts
 from vla_eval.data.foreign.changes import Changes
 from vla_eval.data.foreign.convert import convert_to_lerobot, convert_to_npz, find_source
 from vla_eval.data.foreign.import_writer import eef_of_proprio
 from vla_eval.data.foreign.npz_files import npz_files, read_npz
-from vla_eval.data.imported import read_import
 from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError
@@ -129,7 +129,7 @@ def test_what_the_papers_layout_lacks_comes_from_the_named_task(tmp_path: Path) 
     assert facts.absent == ()
     assert [episode.success for episode in facts.episodes] == [True, True]
     assert [episode.source_seed for episode in facts.episodes] == [None, None]
-    assert read_import(tmp_path / "ours") == facts
+    assert find_facts(tmp_path / "ours") == facts
 
 
 def test_without_instruction_and_task_nothing_is_written(tmp_path: Path) -> None:
@@ -259,7 +259,8 @@ def test_a_dataset_of_the_90_tasks_can_be_trained_on(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="--allow-unreplayed"):
         training_dataset(tmp_path / "ours", allow_unreplayed=False)
     found = training_dataset(tmp_path / "ours", allow_unreplayed=True)
-    assert (found.task, found.control_mode, found.state) == (task, "pd_ee_delta_pose", "eef")
+    facts = found.facts
+    assert (facts.task, facts.control_mode, facts.state) == (task, "pd_ee_delta_pose", "eef")
     assert {BASE, WRIST} <= set(found.meta.features)
     assert load(tmp_path / "ours")[1]["task"] == "touch the cube"
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from tests.data.recorded_episodes import entry_of
+from tests.data.replays import passed
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart
+from vla_eval.data.facts import read_facts
 from vla_eval.data.manifest import (
     MIKASA_FOLDER,
     RECORDING_FILE,
@@ -18,7 +20,6 @@ from vla_eval.data.manifest import (
     decode_actions,
     encode_actions,
     from_json,
-    read_facts,
     to_json,
 )
 from vla_eval.data.recording.demonstrations import (
@@ -30,8 +31,8 @@ from vla_eval.data.recording.demonstrations import (
     replay_attempt,
     states_digest,
 )
+from vla_eval.data.replay_report import keep_report
 from vla_eval.data.replaying.episode_check import check_rows, check_states, psnr_db
-from vla_eval.data.replaying.report import keep_report, require_passed
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import DatasetError, RecordingError
 from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, SUCCESS_KEY, proprioception
@@ -83,7 +84,9 @@ class TestManifest:
 
     def test_a_folder_without_the_mark_of_completeness_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / MIKASA_FOLDER).mkdir(parents=True)
-        with pytest.raises(DatasetError, match=f"{RECORDING_FILE}.*no dataset that `mikasa-vla record` has"):
+        with pytest.raises(
+            DatasetError, match=f"{RECORDING_FILE}.*not a dataset that `mikasa-vla record` has"
+        ):
             read_facts(tmp_path)
 
 
@@ -195,7 +198,7 @@ class TestEpisodeCheck:
 
 class TestReplayReport:
     def report(self, dataset: Path, **fields: Any) -> ReplayReport:
-        from vla_eval.data.replaying.report import manifest_sha256
+        from vla_eval.data.replay_report import manifest_sha256
 
         default = ReplayReport(
             passed=True,
@@ -216,27 +219,27 @@ class TestReplayReport:
         return tmp_path
 
     def test_a_dataset_that_was_never_replayed_has_no_report(self, dataset: Path) -> None:
-        assert require_passed(dataset) is None
+        assert passed(dataset) is None
 
     def test_a_failed_replay_is_refused_with_its_mismatches(self, dataset: Path) -> None:
         keep_report(dataset, self.report(dataset, passed=False, mismatches=("episode 1: gone",)))
         with pytest.raises(DatasetError, match=r"failed with 1 mismatches:\n  episode 1: gone"):
-            require_passed(dataset)
+            passed(dataset)
 
     def test_a_part_that_passes_does_not_stand_for_the_whole(self, dataset: Path) -> None:
         keep_report(dataset, self.report(dataset, n_episodes=1))
-        assert require_passed(dataset) is None
+        assert passed(dataset) is None
 
     def test_a_mismatch_of_pictures_is_not_hidden_by_a_replay_that_looks_at_none(self, dataset: Path) -> None:
         keep_report(dataset, self.report(dataset, passed=False, pixels=True, mismatches=("pale",)))
         keep_report(dataset, self.report(dataset))
         with pytest.raises(DatasetError, match="pale"):
-            require_passed(dataset)
+            passed(dataset)
         keep_report(dataset, self.report(dataset, pixels=True))
-        assert require_passed(dataset) is not None
+        assert passed(dataset) is not None
 
     def test_a_report_about_another_manifest_is_refused(self, dataset: Path) -> None:
         keep_report(dataset, self.report(dataset))
         (dataset / MIKASA_FOLDER / "manifest.jsonl").write_text("{}\n{}\n")
         with pytest.raises(DatasetError, match="is about another manifest"):
-            require_passed(dataset)
+            passed(dataset)

@@ -12,7 +12,7 @@ import pytest
 from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundError
 
 from vla_eval.cli.main import main
-from vla_eval.data.completeness import check_complete
+from vla_eval.data.dataset_folder import check_complete
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.data.sharing import hub
 from vla_eval.data.sharing.hub import pull_dataset, push_dataset

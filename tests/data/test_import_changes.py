@@ -8,9 +8,9 @@ import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.data.checks.rules import RULES
+from vla_eval.data.facts import find_facts
 from vla_eval.data.foreign.changes import Changes, prepare
 from vla_eval.data.foreign.convert import convert_to_lerobot, find_source
-from vla_eval.data.imported import read_import
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import DatasetError, RecipeError
 from vla_eval.tasks.catalog import task_spec
@@ -153,7 +153,7 @@ def test_what_was_converted_and_kept_is_said_and_stays_with_the_dataset(
     assert main([*arguments, "--task", TASK.id, "--gripper", "0", "1", "--clip-actions"]) == 0
 
     said = capsys.readouterr().out
-    facts = read_import(tmp_path / "ours")
+    facts = find_facts(tmp_path / "ours")
     assert facts is not None and facts.is_checked and facts.left_out == ("torque",)
     assert [one.split(":")[0] for one in facts.converted] == ["gripper", "actions"]
     assert "'pick the red cube' is not the one with which RememberColor3-v0 is evaluated" in facts.kept[0]

@@ -11,19 +11,12 @@ import torch
 from tests.data.second_task import SENTENCE, TASK, write_second_task
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
-from vla_eval.data.completeness import check_complete
+from vla_eval.data.dataset_folder import check_complete
 from vla_eval.data.derived.mixing import mix_datasets
-from vla_eval.data.manifest import (
-    MIXTURE_FILE,
-    RECORDING_FILE,
-    REPLAY_FILE,
-    ReplayReport,
-    read_facts,
-    write_entry,
-)
-from vla_eval.data.mixture import read_mixture
+from vla_eval.data.facts import find_facts, read_facts
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, REPLAY_FILE, ReplayReport, write_entry
 from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.replaying.report import manifest_sha256
+from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.sharing.card import write_card
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError, RecipeError
@@ -96,8 +89,8 @@ def test_statistics_of_images_are_weighted_by_frames_and_have_no_quantiles(
 
 def test_it_is_complete_and_says_of_what_it_was_mixed(recorded: Path, second: Path, mixed: Path) -> None:
     facts = check_complete(mixed)
-    assert facts == read_mixture(mixed)
-    mixture = read_mixture(mixed)
+    assert facts == find_facts(mixed)
+    mixture = find_facts(mixed)
     assert mixture is not None
     assert [one.task for one in mixture.sources] == ["RememberColor3-v0", TASK]
     assert [one.seeds for one in mixture.sources] == [(1000, 1001, 1003, 1004), (2000, 2001)]
@@ -109,8 +102,8 @@ def test_it_is_complete_and_says_of_what_it_was_mixed(recorded: Path, second: Pa
 
 def test_a_changed_file_is_found(mixed: Path) -> None:
     path = next(mixed.glob("data/*/*.parquet"))
-    path.write_bytes(path.read_bytes() + b" ")
-    with pytest.raises(DatasetError, match="not what was mixed"):
+    path.write_bytes(b" " + path.read_bytes()[1:])
+    with pytest.raises(DatasetError, match="its content is not what was mixed"):
         check_complete(mixed)
 
 
@@ -126,7 +119,7 @@ def test_a_mixture_was_replayed_only_if_all_of_it_was(recorded: Path, second: Pa
 
 def test_a_training_knows_all_its_tasks(mixed: Path) -> None:
     dataset = training_dataset(mixed, allow_unreplayed=True)
-    assert (dataset.task, dataset.tasks) == ("", ("RememberColor3-v0", TASK))
+    assert (dataset.facts.task, dataset.facts.tasks) == (None, ("RememberColor3-v0", TASK))
     assert dataset.seeds == {
         "RememberColor3-v0": (SeedRange(first=1000, last=1001), SeedRange(first=1003, last=1004)),
         TASK: (SeedRange(first=2000, last=2001),),
@@ -198,7 +191,7 @@ def test_the_command_says_what_it_made(
 
 
 def test_sources_with_the_same_scenes_are_named(mixed: Path) -> None:
-    facts = read_mixture(mixed)
+    facts = find_facts(mixed)
     assert facts is not None
     assert facts.shared_scenes == ()  # the same seeds, of two tasks
     first = dataclasses.replace(facts.sources[0], seeds=(1, 2, 3, 7))

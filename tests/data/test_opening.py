@@ -7,6 +7,7 @@ from lerobot.datasets import dataset_metadata
 from lerobot.datasets.io_utils import load_episodes
 from lerobot.datasets.utils import EPISODES_DIR
 
+from vla_eval.data.lerobot_tables import Tables
 from vla_eval.data.opening import local_readers, open_local_dataset
 from vla_eval.errors import DatasetError
 
@@ -18,7 +19,7 @@ def test_rows_of_episodes_are_those_that_lerobot_keeps(recorded: Path) -> None:
 
 
 def test_lerobot_is_left_as_it_was_even_after_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=EPISODES_DIR), local_readers():
+    with pytest.raises(DatasetError, match=EPISODES_DIR), local_readers(Tables):
         assert dataset_metadata.load_episodes is not load_episodes
         dataset_metadata.load_episodes(tmp_path)
     assert dataset_metadata.load_episodes is load_episodes

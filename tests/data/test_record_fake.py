@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,14 @@ import torch
 from torch.utils.data import DataLoader
 
 from tests.data.hostile_datasets import Bait, addresses, hostile_columns
+from tests.data.replays import passed
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.data.dataset_folder import check_dataset, open_recorded
+from vla_eval.data.dataset_folder import check_dataset
+from vla_eval.data.facts import read_facts
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
-from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_facts, read_manifest
+from vla_eval.data.manifest import MANIFEST_FILE, RECORDING_FILE, read_manifest
+from vla_eval.data.opening import open_dataset
 from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import LOCK_FILE, STATE_FOLDER
@@ -35,7 +37,6 @@ from vla_eval.data.recording.record import RecordedDataset, record
 from vla_eval.data.recording.shard_writer import ShardWriter
 from vla_eval.data.recording.worker import RecordingRunner
 from vla_eval.data.replaying import replay as replay_module
-from vla_eval.data.replaying.report import require_passed
 from vla_eval.data.sharing.initial_states import read_initial_states
 from vla_eval.data.sharing.leak import check_leak
 from vla_eval.data.tables import read_columns
@@ -98,7 +99,7 @@ class TestDataset:
 
     def test_lerobot_reads_what_the_manifest_says(self, recorded: RecordedDataset) -> None:
         episodes = read_manifest(recorded.path)
-        dataset = open_recorded(recorded.path, delta_timestamps={"action": [0.0, 0.05]})
+        dataset = open_dataset(recorded.path).lerobot(delta_timestamps={"action": [0.0, 0.05]})
 
         assert [episode.seed for episode in episodes] == list(range(1000, 1000 + N_EPISODES))
         assert dataset.num_episodes == N_EPISODES
@@ -145,7 +146,7 @@ class TestDataset:
         report = check_leak(read_initial_states(recorded.path), task=TASK, seeds=range(998, 1002))
         found = [(one.episode, one.dataset_seed, one.evaluation_seed) for one in report.shared]
         assert found == [("episode 0", 1000, 1000), ("episode 1", 1001, 1001)]
-        dataset: Any = SimpleNamespace(root=recorded.path)
+        dataset = open_dataset(recorded.path)
         assert held_out.shared_seeds_warning(dataset) is None
         monkeypatch.setattr(held_out, "EVALUATION_SEEDS", range(1004, 1050))
         assert "2 seeds that tables are made from (1004 … 1005)" in str(
@@ -174,23 +175,23 @@ class TestDamage:
         content[len(content) // 2] ^= 1
         video.write_bytes(content)
         with pytest.raises(DatasetError, match="its content is not what was recorded"):
-            open_recorded(copy)
+            open_dataset(copy).lerobot()
 
     def test_a_file_cut_short_is_found_without_reading_it(self, copy: Path) -> None:
         video = next(copy.rglob("*.mp4"))
         os.truncate(video, 1000)
         with pytest.raises(DatasetError, match=r"expected \d+ bytes, found 1000"):
-            check_dataset(copy, read_bytes=False)
+            check_dataset(copy)
 
     def test_a_missing_file_is_an_error_and_no_download(self, copy: Path) -> None:
         next(copy.rglob("data/**/*.parquet")).unlink()
         with pytest.raises(DatasetError, match=r"data/.*parquet is missing.*--rebuild OUT"):
-            open_recorded(copy)
+            open_dataset(copy).lerobot()
 
     def test_an_unfinished_dataset_cannot_be_opened(self, copy: Path) -> None:
         (copy / RECORDING_FILE).unlink()
-        with pytest.raises(DatasetError, match="no dataset that `mikasa-vla record` has finished"):
-            open_recorded(copy)
+        with pytest.raises(DatasetError, match="not a complete dataset of this project"):
+            open_dataset(copy).lerobot()
 
 
 class TestKill:
@@ -233,7 +234,7 @@ class TestKill:
         assert main(["replay", str(out / TASK), "--workers", "1"]) == 0
         assert training_dataset(out / TASK, allow_unreplayed=False).sha256
         window = {"action": [0.0, 0.05]}
-        source = open_recorded(out / TASK, delta_timestamps=window)
+        source = open_dataset(out / TASK).lerobot(delta_timestamps=window)
         served = DecodedFramesDataset(source, cache=tmp_path / "cache")
         batch = next(iter(DataLoader(served, batch_size=4)))
         assert batch["action"].shape == (4, 2, 7)
@@ -249,7 +250,7 @@ class TestReplay:
         assert self.replay(str(copy), "--pixels") == 0
         output = capsys.readouterr().out
         assert f"{N_EPISODES} of {N_EPISODES} episodes replayed: as recorded; states bit-equal" in output
-        report = require_passed(copy)
+        report = passed(copy)
         assert report is not None
         assert report.pixels
         assert set(report.lowest_psnr_db) == {"base_camera", "hand_camera"}
@@ -289,7 +290,7 @@ class TestReplay:
         assert any(f"{copy}: episode 1 (seed 2003): first success at step" in line for line in output)
         assert not any("episode 2" in line for line in output)
         with pytest.raises(DatasetError, match="its replay failed with"):
-            require_passed(copy)
+            passed(copy)
 
     def test_an_episode_that_is_not_there(self, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.replay(str(copy), "--episodes", "6") == 1

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.data.replays import passed
 from vla_eval.cli.main import main
-from vla_eval.data.dataset_folder import open_recorded
 from vla_eval.data.manifest import read_manifest
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.opening import open_dataset, open_local_dataset
 from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.shard_writer import Format, create_dataset
 from vla_eval.data.replaying import replay as replay_module
-from vla_eval.data.replaying.report import require_passed
 from vla_eval.features import ACTION_NAMES, CAMERA_KEYS, STATE_NAMES, EncoderSettings, dataset_features
 from vla_eval.tasks.interface import ACTION, CAMERAS, states
 from vla_eval.tasks.remember import COLORS
@@ -45,7 +44,7 @@ def test_recorded_episodes_replay_to_the_bit(tmp_path: Path, capsys: pytest.Capt
     assert f"3 episodes, {3 * HORIZON} frames" in out
     assert "3 of 3 episodes replayed: as recorded" in out  # the check that training asks for
     dataset = tmp_path / "out" / TASK
-    assert require_passed(dataset) is not None
+    assert passed(dataset) is not None
     for episode in read_manifest(dataset):
         assert episode.n_steps == HORIZON
         assert (episode.cue_steps, episode.delay_steps) == (5, 5)
@@ -53,12 +52,12 @@ def test_recorded_episodes_replay_to_the_bit(tmp_path: Path, capsys: pytest.Capt
         actions = episode.action_rows()
         assert np.array_equal(actions[:10, :6], np.zeros((10, 6)))
         assert actions[10, 2] < 0
-    first = open_recorded(dataset)[0]
+    first = open_dataset(dataset).lerobot()[0]
     assert first["observation.state"][2].item() == pytest.approx(0.318, abs=0.05)  # the arm's rest height
 
     assert main(["replay", str(dataset), "--pixels", "--workers", "1"]) == 0
 
-    report = require_passed(dataset)
+    report = passed(dataset)
     assert report is not None
     assert report.states_compared == "bit-equal"
     assert min(report.lowest_psnr_db.values()) > 36  # yuv420p would be below 34

@@ -13,16 +13,23 @@ from hypothesis import strategies as st
 
 from tests.fuzz.json_cases import BYTES, VALUES, accepted_or_refused, as_bytes, near
 from vla_eval.data.dataset_folder import check_dataset
-from vla_eval.data.imported import IMPORT_FILE, ImportedEpisode, ImportFacts, read_import
-from vla_eval.data.info_file import INFO_FILE, check_info
+from vla_eval.data.facts import (
+    DatasetFacts,
+    ImportedEpisode,
+    ImportFacts,
+    MixtureFacts,
+    MixtureSource,
+    find_facts,
+)
+from vla_eval.data.info_file import INFO_FILE, read_info
 from vla_eval.data.manifest import (
     FAILED_FILE,
+    IMPORT_FILE,
     MANIFEST_FILE,
     MIKASA_FOLDER,
     MIXTURE_FILE,
     RECORDING_FILE,
     REPLAY_FILE,
-    DatasetFacts,
     FailedSeed,
     FileDigest,
     RecordedEpisode,
@@ -33,7 +40,6 @@ from vla_eval.data.manifest import (
     read_replay,
     to_json,
 )
-from vla_eval.data.mixture import MixtureFacts, MixtureSource, read_mixture
 from vla_eval.data.recording.shard_writer import SHARD_EPISODES, shard_episodes
 
 EMPTY = FileDigest(n_bytes=0, sha256="e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
@@ -139,9 +145,9 @@ READERS: dict[Path, Callable[[Path], object]] = {
     FAILED_FILE: read_failed,
     RECORDING_FILE: check_dataset,
     REPLAY_FILE: read_replay,
-    IMPORT_FILE: read_import,
-    MIXTURE_FILE: read_mixture,
-    INFO_FILE: check_info,
+    IMPORT_FILE: find_facts,
+    MIXTURE_FILE: find_facts,
+    INFO_FILE: read_info,
 }
 FILES = st.dictionaries(
     st.sampled_from(("meta/info.json", "../x", "/etc/passwd", "a/../../x", "", ".", "a" * 300, "\0", "a\nb")),
@@ -171,7 +177,7 @@ def root(tmp_path: Path) -> Path:
         (REPLAY_FILE, REPORT),
         (IMPORT_FILE, IMPORT),
         (MIXTURE_FILE, MIXTURE),
-        (INFO_FILE, None),
+        (INFO_FILE, INFO),
     ],
     ids=str,
 )

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.models.sample_frames import at, between, frames
+from tests.training.fitted_policies import policy_config
 from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.files import list_recipes, load_recipe
 from vla_eval.config.finetuning import FinetuneRecipe
@@ -16,7 +17,6 @@ from vla_eval.models.episodes.sentence import WORD, SentenceEncoder, word_rows
 from vla_eval.models.memory.modeling_memory import MikasaMemoryPolicy
 from vla_eval.models.sequence.modeling_sequence import MikasaSequencePolicy
 from vla_eval.training.dataset import training_dataset
-from vla_eval.training.policy_config import policy_config
 
 TINY: dict[str, dict[str, Any]] = {
     "mikasa_memory": {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16},

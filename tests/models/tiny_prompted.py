@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from tests.training.fitted_policies import policy_config
 from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
@@ -17,7 +18,6 @@ from vla_eval.models.spatialvla import prompt as spatialvla_prompt
 from vla_eval.models.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.models.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
 from vla_eval.training.dataset import training_dataset
-from vla_eval.training.policy_config import policy_config
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
 BOTH = [BASE, WRIST]

@@ -16,7 +16,8 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart, FloatArray, ImageArray, StepResult
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.facts import ImportFacts
+from vla_eval.data.opening import LocalDataset, OpenDataset
 from vla_eval.data.recording.shard_writer import new_dataset
 from vla_eval.envs.fake import M_PER_STEP, FakeEnv
 from vla_eval.features import CAMERA_KEYS, EncoderSettings, dataset_features, frame_values
@@ -24,7 +25,6 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training import job as job_module
-from vla_eval.training.dataset import TrainingDataset
 from vla_eval.training.finetune import finetune
 
 TASK, INSTRUCTION = "RememberColor3-v0", "touch it"
@@ -67,7 +67,7 @@ def make_env() -> SeenCueEnv:
     )
 
 
-def write_demonstrations(root: Path, *, n_episodes: int) -> TrainingDataset:
+def write_demonstrations(root: Path, *, n_episodes: int) -> OpenDataset:
     """Write demonstrations of an expert that waits and then goes to the right side."""
     max_frames = ARGUMENTS["horizon_steps"]
     dataset = new_dataset(root, dataset_features("eef"), encoder=EncoderSettings(), max_frames=max_frames)
@@ -76,18 +76,24 @@ def write_demonstrations(root: Path, *, n_episodes: int) -> TrainingDataset:
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()
-    return TrainingDataset(
-        root=root,
-        name=root.name,
-        sha256="0" * 64,
+    facts = ImportFacts(
+        complete=True,
+        source_layout="adopted",
         task=TASK,
-        tasks=(TASK,),
+        instruction_source="source",
         state="eef",
         control_mode="pd_ee_delta_pose",
-        was_replayed=False,
-        seeds=None,
-        meta=open_local_dataset(root).meta,
+        executable_by_pd_ee_delta_pose=True,
+        absent=(),
+        left_out=(),
+        n_frames=1,
+        episodes=(),
+        source_files={},
+        files={},
+        vla_eval_version="0",
     )
+    local = LocalDataset(root)
+    return OpenDataset(root=root, facts=facts, manifest=(), failed_seeds=(), replay=None, local=local)
 
 
 def _frames(seed: int) -> Iterator[dict[str, Any]]:
@@ -112,7 +118,7 @@ def _expert(env: SeenCueEnv, result: StepResult) -> FloatArray:
 
 
 def trained(
-    dataset: TrainingDataset, recipe: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **section: Any
+    dataset: OpenDataset, recipe: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **section: Any
 ) -> Path:
     """Train with this `finetune` section, and return the run's folder."""
     monkeypatch.setattr(job_module, "training_dataset", lambda *_, **__: dataset)

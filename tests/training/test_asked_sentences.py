@@ -21,8 +21,8 @@ from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig, HeldOutConfig
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.derived.mixing import mix_datasets
+from vla_eval.data.facts import read_facts as read_manifest_facts
 from vla_eval.data.manifest import RECORDING_FILE, write_entry
-from vla_eval.data.manifest import read_facts as read_manifest_facts
 from vla_eval.errors import SpecMismatchError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.serving.host import HostOptions, host_policy

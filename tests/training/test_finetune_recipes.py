@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.training import tiny_trainings
+from tests.training.fitted_policies import policy_config
 from tests.training.tiny_trainings import act, context, pi0
 from vla_eval.checkpoints.loading import make_empty_policy
 from vla_eval.cli.main import main
@@ -16,14 +17,14 @@ from vla_eval.config.files import list_recipes, load_recipe
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, write_entry
-from vla_eval.data.replaying.report import manifest_sha256
+from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma
 from vla_eval.training.cost.description import describe_model
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
-from vla_eval.training.policy_config import masks_padding, policy_config, used_frames
+from vla_eval.training.policy_config import masks_padding, used_frames
 from vla_eval.training.request import load_finetune_recipe
 
 pytestmark = pytest.mark.usefixtures("small_act")

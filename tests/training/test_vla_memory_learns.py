@@ -8,8 +8,8 @@ import pytest
 from tests.models.vla_memory.tiny_vlas import fields_of, tiny
 from tests.training import tiny_trainings
 from tests.training.remembered_toy import choices, trained, write_demonstrations
+from vla_eval.data.opening import OpenDataset
 from vla_eval.testing.tiny_models import write_tiny_tokenizer
-from vla_eval.training.dataset import TrainingDataset
 
 offline_with_a_cache_of_its_own = tiny_trainings.offline_with_a_cache_of_its_own
 STEPS, N_EPISODES = 500, 24
@@ -20,14 +20,14 @@ TOKENS = {"memory_tokens": 4, "token_stride": 4, "token_segments": 6}
 
 
 @pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> TrainingDataset:
+def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> OpenDataset:
     return write_demonstrations(tmp_path_factory.mktemp("toy") / "seen_cue", n_episodes=12)
 
 
 def choices_of(
     family: str,
     memory: dict[str, Any],
-    demonstrations: TrainingDataset,
+    demonstrations: OpenDataset,
     folder: Path,
     patched: pytest.MonkeyPatch,
 ) -> list[bool | None]:
@@ -65,7 +65,7 @@ def choices_of(
 def test_with_memory_it_learns_a_delayed_cue(
     family: str,
     memory: dict[str, Any],
-    demonstrations: TrainingDataset,
+    demonstrations: OpenDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -76,7 +76,7 @@ def test_with_memory_it_learns_a_delayed_cue(
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["pi0", "smolvla"])
 def test_without_memory_it_moves_and_guesses(
-    family: str, demonstrations: TrainingDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    family: str, demonstrations: OpenDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = choices_of(family, NONE, demonstrations, tmp_path, monkeypatch)
     # Two sides: of 24 episodes, guessing is right in 19 or more once in 300 times.

@@ -11,8 +11,8 @@ from vla_eval.cli.shared.arguments import add_workers, seeds_argument
 from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
+    from vla_eval.data.facts import ImportFacts
     from vla_eval.data.foreign.changes import Changes
-    from vla_eval.data.imported import ImportFacts
 
 MAX_SENTENCES = 5  # that `check` shows
 

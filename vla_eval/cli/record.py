@@ -126,7 +126,7 @@ def _replay_new(
 ) -> int:
     """Replay the datasets that no replay has passed yet; return the exit code."""
     from vla_eval.cli.terminal.recording_progress import RecordingProgress
-    from vla_eval.data.replaying.report import needs_replay
+    from vla_eval.data.replay_report import needs_replay
 
     paths = [one.path for one in summary.datasets if not args.no_replay and needs_replay(one.path)]
     if not paths:

@@ -14,14 +14,14 @@ from vla_eval.control_modes import EE_DELTA_POSE
 from vla_eval.data.check import check_videos, demonstrations_of, has_our_fields
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import require_sound
-from vla_eval.data.completeness import RECORDS
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.derived.mixing import write_statistics
+from vla_eval.data.facts import KINDS, ImportedEpisode, ImportFacts
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.changes import other_sentences
 from vla_eval.data.foreign.lerobot_files import names_of
-from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.manifest import IMPORT_FILE, write_entry
+from vla_eval.data.opening import LocalDataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import STATE_KEY, STATE_NAMES, SUCCESS_KEY, dataset_features
 from vla_eval.tasks.spec import TaskSpec
@@ -38,20 +38,20 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
         DatasetError: it has such records already, has other fields than ours, or breaks a rule.
     """
     check_folder(root)
-    for file in RECORDS:
-        if (root / file).exists():
+    for kind in KINDS:
+        if (root / kind.file).exists():
             raise DatasetError(
-                f"{root}: {file} is there: the dataset has its records, and `mikasa-vla dataset check` says "
-                "whether they fit. If another tool has changed its files, remove meta/mikasa and adopt it."
+                f"{root}: {kind.file} is there: the dataset has its records, and `mikasa-vla dataset check` "
+                "says whether they fit. If another tool has changed files, remove meta/mikasa and adopt it."
             )
-    dataset = open_local_dataset(root)
+    dataset = LocalDataset(root)
     meta = dataset.meta
     if not has_our_fields(meta.features):
         raise DatasetError(
             f"{root}: its fields are not those of this project (docs/datasets.md). Import it: mikasa-vla "
             f"dataset convert {root} --to lerobot --out DIR"
         )
-    wrong = [said.sentence for said in check_videos(root, meta) if said.answer == "refused"]
+    wrong = [said.sentence for said in check_videos(dataset) if said.answer == "refused"]
     if wrong:
         raise DatasetError(f"{root}: {' '.join(wrong)}")
     demonstrations = demonstrations_of(dataset)
@@ -64,7 +64,7 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
         )
     write_statistics(root, [meta])
     facts = _facts(root, demonstrations, meta, task, kept)
-    write_import(root, facts)
+    write_entry(root / IMPORT_FILE, facts)
     return facts
 
 

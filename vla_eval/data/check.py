@@ -1,4 +1,4 @@
-"""What `mikasa-vla dataset check` says of a dataset, whoever made it. Decodes no image."""
+"""`mikasa-vla dataset check`: a report on a dataset, whichever program made it. Decodes no image."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -13,22 +13,19 @@ from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.data.checks.agreement import episodes_by_video
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import Answer, find_breaches, require_sound
-from vla_eval.data.completeness import RECORDS, check_complete
+from vla_eval.data.dataset_folder import check_complete
+from vla_eval.data.facts import Facts, MixtureFacts, has_facts
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.convert import find_source
-from vla_eval.data.foreign.lerobot_files import OF_LEROBOT, names_of
+from vla_eval.data.foreign.episodes import Source
+from vla_eval.data.foreign.lerobot_files import OF_LEROBOT, lerobot_source, names_of
 from vla_eval.data.frames.frame_cache import channels_first
-from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
-from vla_eval.data.manifest import DatasetFacts
-from vla_eval.data.mixture import MixtureFacts
-from vla_eval.data.opening import open_local_dataset
-from vla_eval.data.tables import read_columns
+from vla_eval.data.opening import LocalDataset, OpenDataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, IMAGE_SIZE_PX, PROPRIO_KEYS, STATE_KEY, STATE_NAMES
 from vla_eval.viz.mp4 import open_mp4
 
-Facts = DatasetFacts | ImportFacts | MixtureFacts
 STATISTICS = ("min", "max", "mean", "std")
 """Of `meta/stats.json`; not its quantiles, since lerobot averages those of episodes."""
 STATISTICS_TOLERANCE = 1e-3  # relative; lerobot computes in float32
@@ -44,7 +41,7 @@ class Said:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """What there is to say of a dataset.
+    """What was found in a dataset.
 
     Attributes:
         path: its folder.
@@ -74,33 +71,32 @@ def check(path: Path) -> CheckReport:
     """
     check_folder(path)
     if not (path / INFO_FILE).is_file():
-        return _of_source(path, "")
-    facts = _own_facts(path)
-    dataset = open_local_dataset(path)
+        return _of_source(find_source(path), "")
+    facts = check_complete(path) if has_facts(path) else None
+    dataset = LocalDataset(path)
     demonstrations = demonstrations_of(dataset)
-    found = (*check_videos(path, dataset.meta), *_statistics(dataset, demonstrations))
+    found = (*check_videos(dataset), *_statistics(dataset, demonstrations))
     if facts is not None or has_our_fields(dataset.meta.features):
         kind = "a LeRobotDataset with the fields of this project, without its records"
         return CheckReport(
             path=path,
-            kind=kind if facts is None else _kind(facts),
+            kind=kind if facts is None else facts.kind,
             demonstrations=demonstrations,
             said=(*found, *_known_or_found(facts, demonstrations)),
             next_step=f"mikasa-vla dataset adopt {path}" if facts is None else "",
         )
     kind = "a LeRobotDataset"
     try:
-        report = _of_source(path, kind)
+        report = _of_source(lerobot_source(dataset), kind)
     except DatasetError as exc:
         said = (*found, Said(answer="refused", sentence=str(exc)), *_breaches(demonstrations))
         return CheckReport(path=path, kind=kind, demonstrations=demonstrations, said=said, next_step="")
     return dataclasses.replace(report, said=(*found, *report.said))
 
 
-def demonstrations_of(dataset: Any) -> Demonstrations:  # Any: LeRobotDataset
+def demonstrations_of(dataset: LocalDataset) -> Demonstrations:
     """Return what is checked of a dataset by the names in its own `meta/info.json`."""
-    meta = dataset.meta
-    all_columns = read_columns(dataset.root)
+    meta, all_columns = dataset.meta, dataset.columns
     columns = {
         name: rows
         for name, rows in all_columns.items()
@@ -108,10 +104,9 @@ def demonstrations_of(dataset: Any) -> Demonstrations:  # Any: LeRobotDataset
     }
     names = {name: names_of(meta.features[name]) for name in columns}
     sentences = meta.tasks.index
-    ends = zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True)
-    lengths = tuple(int(stop - first) for first, stop in ends)
+    lengths = tuple(dataset.lengths)
     return Demonstrations(
-        where=Path(dataset.root),
+        where=dataset.root,
         fps=meta.fps,
         names=tuple(f"episode {number}" for number in range(len(lengths))),
         lengths=lengths,
@@ -140,8 +135,8 @@ def has_our_fields(features: Any) -> bool:  # Any: lerobot's plain data
     )
 
 
-def _of_source(path: Path, kind: str) -> CheckReport:
-    source = find_source(path)
+def _of_source(source: Source, kind: str) -> CheckReport:
+    path = source.path
     demonstrations = source.demonstrations(expected_px=IMAGE_SIZE_PX)
     said = [Said(answer="kept", sentence=f"{remark}.") for remark in source.remarks]
     if source.left_out:
@@ -155,46 +150,22 @@ def _of_source(path: Path, kind: str) -> CheckReport:
     )
 
 
-def require_checked(dataset: Any, facts: Facts) -> None:  # Any: LeRobotDataset
+def require_checked(dataset: OpenDataset) -> None:
     """Apply the rules to what no conversion has applied them to.
 
     Raises:
         DatasetError: an import that an older version made, or a mixture, breaks one.
     """
-    is_known = isinstance(facts, DatasetFacts) or (isinstance(facts, ImportFacts) and facts.is_checked)
-    if not is_known:
-        require_sound(
-            dataclasses.replace(demonstrations_of(dataset), is_gripper_named=isinstance(facts, MixtureFacts))
-        )
-
-
-def _own_facts(root: Path) -> Facts | None:
-    """Return the records of a dataset of this project; None for others.
-
-    Raises:
-        DatasetError: it is not complete, or its files are not what they were.
-    """
-    is_ours = any((root / file).exists() for file in RECORDS)
-    return check_complete(root) if is_ours else None
-
-
-def _kind(facts: Facts) -> str:
-    match facts:
-        case DatasetFacts():
-            return f"a recording of {facts.task}, complete"
-        case ImportFacts(source_layout="adopted"):
-            return "an adopted dataset, complete"
-        case ImportFacts():
-            return f"an import from {facts.source_layout}, complete"
-        case MixtureFacts():
-            return f"a mixture of {len(facts.sources)} datasets, complete"
+    if not dataset.facts.is_checked:
+        is_mixture = isinstance(dataset.facts, MixtureFacts)
+        require_sound(dataclasses.replace(demonstrations_of(dataset.local), is_gripper_named=is_mixture))
 
 
 def _known_or_found(facts: Facts | None, demonstrations: Demonstrations) -> Iterator[Said]:
     """Yield what a conversion has found, or what is found now; a recording follows the rules."""
-    if isinstance(facts, ImportFacts) and facts.is_checked:
+    if facts is not None and facts.is_checked:
         yield from (Said(answer="kept", sentence=sentence) for sentence in facts.kept)
-    elif not isinstance(facts, DatasetFacts):
+    else:
         yield from _breaches(demonstrations)
 
 
@@ -203,13 +174,13 @@ def _breaches(demonstrations: Demonstrations) -> Iterator[Said]:
         yield Said(answer=one.rule.answer, sentence=str(one))
 
 
-def check_videos(root: Path, meta: Any) -> Iterator[Said]:
-    """Compare the headers of videos with what `meta/` says of them."""
-    ends = list(zip(meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"], strict=True))
+def check_videos(dataset: LocalDataset) -> Iterator[Said]:
+    """Compare the headers of videos with their description in `meta/`."""
+    root, meta, lengths = dataset.root, dataset.meta, dataset.lengths
     for path, (camera, numbers) in episodes_by_video(meta).items():
         if camera in meta.depth_keys:
             continue
-        needed = sum(ends[number][1] - ends[number][0] for number in numbers)
+        needed = sum(lengths[number] for number in numbers)
         try:
             with open_mp4(root / path, DatasetError) as container:
                 stream = container.streams.video[0]
@@ -232,7 +203,7 @@ def check_videos(root: Path, meta: Any) -> Iterator[Said]:
             )
 
 
-def _statistics(dataset: Any, demonstrations: Demonstrations) -> Iterator[Said]:
+def _statistics(dataset: LocalDataset, demonstrations: Demonstrations) -> Iterator[Said]:
     """Compare `meta/stats.json` with the rows; a conversion and an adoption compute it from them."""
     stored = dataset.meta.stats or {}
     differing = []

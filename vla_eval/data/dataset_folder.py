@@ -1,23 +1,12 @@
-"""Check that a dataset is complete and undamaged, and open it without going to the network."""
+"""Whether a dataset is complete and undamaged: a finished recording, import or mixture, with its digests."""
 
-import contextlib
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any  # lerobot is untyped
 
-import huggingface_hub
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-from vla_eval.data.manifest import (
-    FAILED_FILE,
-    MANIFEST_FILE,
-    RECORDING_FILE,
-    DatasetFacts,
-    FileDigest,
-    read_facts,
-)
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.facts import KINDS, DatasetFacts, Facts, find_facts, kind_of, read_facts
+from vla_eval.data.folder_contents import check_folder
+from vla_eval.data.manifest import FAILED_FILE, MANIFEST_FILE, RECORDING_FILE, FileDigest
 from vla_eval.errors import DatasetError
 
 BLOCK_BYTES = 1 << 20
@@ -31,61 +20,45 @@ CONTENT = (
 )
 
 
-def open_recorded(path: Path, **options: Any) -> LeRobotDataset:
-    """Open a finished dataset, offline: what training reads.
-
-    Args:
-        path: the dataset's folder, OUT/TASK.
-        options: what `LeRobotDataset` takes, such as `delta_timestamps` and `episodes`.
+def check_complete(root: Path) -> Facts:
+    """Return what a dataset is, after comparing all of its files with their digests.
 
     Raises:
-        DatasetError: it is not complete, or a file is missing or not what was recorded.
+        DatasetError: it is not finished, or files are missing or not what they were.
     """
-    check_dataset(path)
-    with _offline():
-        return open_local_dataset(path, **options)
-
-
-@contextlib.contextmanager
-def _offline() -> Iterator[None]:
-    """Let a request to the Hub be an error: lerobot fetches what it misses without asking."""
-    before = huggingface_hub.constants.HF_HUB_OFFLINE
-    huggingface_hub.constants.HF_HUB_OFFLINE = True
-    try:
-        yield
-    finally:
-        huggingface_hub.constants.HF_HUB_OFFLINE = before
-
-
-def check_dataset(path: Path, *, read_bytes: bool = True) -> DatasetFacts:
-    """Raise `DatasetError` unless the dataset is complete and its files are what was recorded.
-
-    Args:
-        path: the dataset's folder.
-        read_bytes: compare digests, too, and not just sizes.
-
-    Returns:
-        What the dataset is.
-    """
-    facts = read_facts(path)
-    for name, expected in facts.files.items():
-        file = path / name
-        if not file.is_file():
-            raise DatasetError(f"{path}: the file {name} is missing. {_REPAIR}")
-        n_bytes = file.stat().st_size
-        if n_bytes != expected.n_bytes:
-            raise DatasetError(
-                f"{file}: expected {expected.n_bytes} bytes, found {n_bytes}: the file is damaged. {_REPAIR}"
-            )
-        if read_bytes and digest_file(file).sha256 != expected.sha256:
-            raise DatasetError(f"{file}: its content is not what was recorded. {_REPAIR}")
+    check_folder(root)
+    facts = find_facts(root)
+    if facts is None:
+        *others, last = (str(kind.file) for kind in KINDS)
+        raise DatasetError(
+            f"{root}: not a complete dataset of this project: none of {', '.join(others)} and {last}, which "
+            f"are written last, is there. Run the command that makes it again: a recording resumes."
+        )
+    _check_files(root, facts)
     return facts
 
 
-_REPAIR = (
-    "Fetch or record the dataset again, or make it from its manifest: "
-    "`mikasa-vla replay DATASET --rebuild OUT`."
-)
+def check_dataset(root: Path) -> DatasetFacts:
+    """Do the same with a recorded dataset."""
+    facts = read_facts(root)
+    _check_files(root, facts)
+    return facts
+
+
+def _check_files(root: Path, facts: Facts) -> None:
+    kind = kind_of(facts)
+    for name, expected in facts.files.items():
+        file = root / name
+        if not file.is_file():
+            raise DatasetError(f"{root}: the file {name} is missing. {kind.repair}")
+        n_bytes = file.stat().st_size
+        if n_bytes != expected.n_bytes:
+            raise DatasetError(
+                f"{file}: expected {expected.n_bytes} bytes, found {n_bytes}: the file is damaged. "
+                f"{kind.repair}"
+            )
+        if digest_file(file).sha256 != expected.sha256:
+            raise DatasetError(f"{file}: its content is not what was {kind.made}. {kind.repair}")
 
 
 def digest_file(path: Path) -> FileDigest:

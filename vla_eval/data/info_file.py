@@ -70,12 +70,8 @@ class _Feature:
     names: Any = field(default=None)  # Any: a list, or a mapping of lists
 
 
-def check_info(root: Path) -> None:
-    """Raise `DatasetError` unless `meta/info.json` holds what lerobot may be given.
-
-    Args:
-        root: the dataset's folder.
-    """
+def read_info(root: Path) -> dict[str, Any]:  # Any: JSON
+    """Return `meta/info.json` if it holds what lerobot may be given, else raise `DatasetError`."""
     path = root / INFO_FILE
     source = Source(where=str(path), what="a LeRobotDataset's info", remedy=REMEDY, error=DatasetError)
     try:
@@ -104,6 +100,7 @@ def check_info(root: Path) -> None:
                 f"{name} {shown(template)}",
                 f"expected a path inside of the dataset with no places but {places}",
             )
+    return data
 
 
 def _check_version(version: str, source: Source) -> None:

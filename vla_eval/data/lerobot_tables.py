@@ -1,9 +1,10 @@
-"""The tables of a dataset in the form in which lerobot keeps them: what its own loaders would return.
+"""The files of a dataset in the form in which lerobot keeps them: what its own loaders would return.
 
-Each function replaces one of `lerobot.datasets.io_utils`, which reads by Hugging Face's `datasets` (see
+Each function below replaces one of `lerobot.datasets.io_utils`, which reads by Hugging Face's `datasets` (see
 `tables.py`), caches what it read by the file's name and time, and takes brackets in a path for a pattern.
 """
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any  # pyarrow and datasets are untyped
@@ -16,14 +17,18 @@ from datasets import Dataset, DatasetInfo, Features, Image  # type: ignore[attr-
 from datasets.table import table_cast
 from numpy.typing import NDArray
 
+from vla_eval.data.info_file import read_info
 from vla_eval.data.tables import (
     EPISODE_TABLES,
-    FRAME_TABLES,
     LANGUAGE_COLUMNS,
     REMEDY,
+    Columns,
+    TableFile,
     check_columns,
     check_values,
+    columns_of,
     is_image,
+    read_frame_tables,
     read_table,
     refused,
     table_paths,
@@ -43,19 +48,61 @@ SENTENCE_COLUMNS = ("task", "__index_level_0__")  # what pandas calls an index w
 IMAGE_BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  # PNG, JPEG, TIFF of depth
 
 
-def read_frames(folder: Path, features: Features, episodes: Sequence[int] | None = None) -> Dataset:
+class Tables:
+    """What lerobot reads of a dataset, each file read once: when it is first asked for.
+
+    Args:
+        root: the dataset's folder.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @functools.cached_property
+    def info(self) -> dict[str, Any]:  # Any: JSON
+        """What `meta/info.json` holds; see `read_info`."""
+        return read_info(self.root)
+
+    @functools.cached_property
+    def episodes(self) -> Dataset:
+        """See `read_episodes`."""
+        return read_episodes(self.root)
+
+    @functools.cached_property
+    def tasks(self) -> pd.DataFrame:
+        """See `read_tasks`."""
+        return read_tasks(self.root)
+
+    @functools.cached_property
+    def statistics(self) -> dict[str, dict[str, NDArray[np.generic]]] | None:
+        """See `read_statistics`."""
+        return read_statistics(self.root)
+
+    @functools.cached_property
+    def frames(self) -> list[TableFile]:
+        """See `read_frame_tables`."""
+        return read_frame_tables(self.root)
+
+    @functools.cached_property
+    def columns(self) -> Columns:
+        """See `columns_of`."""
+        return columns_of(self.frames)
+
+
+def frames_for_lerobot(
+    files: Sequence[TableFile], features: Features, episodes: Sequence[int] | None = None
+) -> Dataset:
     """Return the rows of frames, as lerobot's `load_nested_dataset` does.
 
     Args:
-        folder: `data` of the dataset.
+        files: of the dataset.
         features: the columns and their types, of `meta/info.json`.
         episodes: these; None: all.
 
     Raises:
-        DatasetError: see `read_table`; or a table has other columns or types.
+        DatasetError: a table has other columns or types.
     """
-    tables = [_frames(path, features, episodes) for path in table_paths(folder.parent, FRAME_TABLES)]
-    return _as_dataset(pa.concat_tables(tables), features)
+    return _as_dataset(pa.concat_tables([_frames(file, features, episodes) for file in files]), features)
 
 
 def read_episodes(root: Path) -> Dataset:
@@ -121,8 +168,8 @@ def read_statistics(root: Path) -> dict[str, dict[str, NDArray[np.generic]]] | N
     }
 
 
-def _frames(path: Path, features: Features, episodes: Sequence[int] | None) -> Any:  # Any: pyarrow.Table
-    table = read_table(path, with_images=True)
+def _frames(file: TableFile, features: Features, episodes: Sequence[int] | None) -> Any:  # Any: pyarrow.Table
+    path, table = file
     check_columns(path, table, list(features))
     undeclared = [name for name in table.column_names if name not in features]
     if undeclared:

@@ -2,10 +2,10 @@
 
     manifest.jsonl  one `RecordedEpisode` per episode: enough to make the episode again
     failed.jsonl    one `FailedSeed` per seed at which the expert did not succeed
-    recording.json  `DatasetFacts`: recipe, environment, counts, digest of every file; written last
+    recording.json  recipe, environment, counts, digest of every file; written last (see `facts`)
     replay.json     `ReplayReport`: what a replay of the stored actions found
 
-An imported dataset has `import.json` instead (`imported`), one that was mixed of several has `mixture.json`.
+An imported dataset has `import.json` instead, one that was mixed of several has `mixture.json`.
 
 A folder of its own, because lerobot drops keys of `info.json` that it does not know. Standard library
 and numpy only: it knows nothing of lerobot.
@@ -15,9 +15,9 @@ import base64
 import binascii
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import FloatArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
-from vla_eval.storage.durable import replace_file
+from vla_eval.storage.durable import replace_file, whole_lines
 from vla_eval.strict.json_text import (
     Count,
     Positive,
@@ -35,7 +35,6 @@ from vla_eval.strict.json_text import (
     read_file,
     read_json,
     read_version,
-    shown,
 )
 
 FORMAT_VERSION = 1
@@ -46,10 +45,10 @@ MANIFEST_FILE = MIKASA_FOLDER / "manifest.jsonl"
 FAILED_FILE = MIKASA_FOLDER / "failed.jsonl"
 RECORDING_FILE = MIKASA_FOLDER / "recording.json"
 REPLAY_FILE = MIKASA_FOLDER / "replay.json"
+IMPORT_FILE = MIKASA_FOLDER / "import.json"
 MIXTURE_FILE = MIKASA_FOLDER / "mixture.json"
 
 FETCH_AGAIN = "The file was changed by another program; fetch or record the dataset again."
-MAX_NAME = 255  # bytes; what file systems take
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,47 +118,6 @@ class FileDigest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetFacts:
-    """What the dataset is, and how it came about; its presence with `complete` marks it as finished.
-
-    Attributes:
-        complete: written as true, after everything else.
-        name: the recipe's name.
-        task, task_version, instruction: the one task of the dataset.
-        state: which proprioception `observation.state` is.
-        n_episodes, n_frames, n_failed_seeds: counts.
-        recipe: the resolved recipe; `recipe_sha256` is the digest of the part that content depends on.
-        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts, and the weights of a
-            learned expert.
-        environment: commit, versions and machine, see `provenance.collect_environment`.
-        device: what the environment says of the device it rendered on.
-        files: path below the dataset -> digest; lerobot's files and the manifest.
-    """
-
-    complete: bool
-    name: str
-    task: str
-    task_version: Positive
-    instruction: str
-    state: str
-    n_episodes: Count
-    n_frames: Count
-    n_failed_seeds: Count
-    recipe: dict[str, Any]  # Any: plain data
-    recipe_sha256: str
-    recipe_files: dict[str, str]
-    environment: dict[str, Any]  # Any: plain data
-    device: dict[str, str]
-    files: dict[str, FileDigest]
-
-    @property
-    def control_mode(self) -> str:
-        """What the actions mean."""
-        env = self.recipe.get("env")
-        return control_mode_of(env if isinstance(env, dict) else {})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayReport:
     """What a replay found; `finetune` asks for `passed`.
 
@@ -186,9 +144,6 @@ class ReplayReport:
     environment: dict[str, Any] = field(default_factory=dict)  # Any: plain data
 
 
-type Entry = RecordedEpisode | FailedSeed | DatasetFacts | ReplayReport
-
-
 def encode_actions(actions: FloatArray) -> str:
     """Return (n, A) float32 as text: base64 of the little-endian bytes, row by row; exact."""
     return base64.b64encode(np.ascontiguousarray(actions, dtype="<f4").tobytes()).decode("ascii")
@@ -209,13 +164,13 @@ def decode_actions(text: str, *, n_dims: int) -> FloatArray:
     return rows.astype(np.float32)
 
 
-def to_json(entry: Entry, *, indent: int | None = None) -> str:
-    """Return an entry as JSON with the format's version."""
+def to_json(entry: Any, *, indent: int | None = None) -> str:  # Any: dataclasses have no common type
+    """Return a dataclass as JSON with the format's version."""
     data = {"format_version": FORMAT_VERSION, **dataclasses.asdict(entry)}
     return json.dumps(data, ensure_ascii=False, allow_nan=False, indent=indent)
 
 
-def from_json[E: Entry](cls: type[E], text: str | bytes, *, where: str) -> E:
+def from_json[E](cls: type[E], text: str | bytes, *, where: str) -> E:
     """Return the entry that `to_json` wrote.
 
     Raises:
@@ -232,8 +187,9 @@ def write_lines(path: Path, entries: Sequence[RecordedEpisode | FailedSeed]) -> 
     replace_file(path, "".join(f"{to_json(entry)}\n" for entry in entries))
 
 
-def write_entry(path: Path, entry: DatasetFacts | ReplayReport) -> None:
-    """Write one entry, whole or not at all."""
+def write_entry(path: Path, entry: Any) -> None:  # Any: dataclasses have no common type
+    """Write a file with one entry, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     replace_file(path, f"{to_json(entry, indent=2)}\n")
 
 
@@ -258,21 +214,6 @@ def read_failed(dataset: Path) -> tuple[FailedSeed, ...]:
     return read_entries(dataset / FAILED_FILE, FailedSeed)
 
 
-def read_facts(dataset: Path) -> DatasetFacts:
-    """Return what the dataset is.
-
-    Raises:
-        DatasetError: there is no `recording.json`, it is damaged, or the dataset is not complete.
-    """
-    check_folder(dataset)
-    path = dataset / RECORDING_FILE
-    facts = from_json(DatasetFacts, _content(path), where=str(path))
-    check_file_names(facts.files, where=path)
-    if not facts.complete:
-        raise DatasetError(f"{dataset}: is not complete. Run the command that records it again: it resumes.")
-    return facts
-
-
 def read_replay(dataset: Path) -> ReplayReport | None:
     """Return what the last replay found; None if there was none.
 
@@ -280,23 +221,7 @@ def read_replay(dataset: Path) -> ReplayReport | None:
         DatasetError: the file is damaged.
     """
     path = dataset / REPLAY_FILE
-    return from_json(ReplayReport, _content(path), where=str(path)) if path.exists() else None
-
-
-def check_file_names(files: Mapping[str, FileDigest], *, where: Path) -> None:
-    """Raise `DatasetError` unless every name is a path inside of the dataset.
-
-    Args:
-        files: path below the dataset -> digest.
-        where: the file that names them, for the message.
-    """
-    for name in files:
-        parts = PurePosixPath(name).parts
-        is_inside = bool(parts) and not name.startswith("/") and ".." not in parts
-        if not is_inside or not name.isprintable() or max(len(part.encode()) for part in parts) > MAX_NAME:
-            raise DatasetError(
-                f"{where}: expected names of files inside of the dataset, found {shown(name)}. {FETCH_AGAIN}"
-            )
+    return from_json(ReplayReport, read_content(path), where=str(path)) if path.exists() else None
 
 
 def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
@@ -305,13 +230,18 @@ def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> t
     Raises:
         DatasetError: there is no such file, or a line is damaged.
     """
-    lines = _content(path).split(b"\n")
-    if lines[-1]:
+    data = read_content(path)
+    if data and not data.endswith(b"\n"):
         raise DatasetError(f"{path}: expected a line end at its end; the last line is torn. {FETCH_AGAIN}")
-    return tuple(from_json(cls, line, where=f"{path}:{i}") for i, line in enumerate(lines[:-1], start=1))
+    return tuple(from_json(cls, line, where=where) for line, where in whole_lines(data, path))
 
 
-def _content(path: Path) -> bytes:
+def read_content(path: Path) -> bytes:
+    """Return what a file of `meta/mikasa/` holds.
+
+    Raises:
+        DatasetError: it is not there, with what the dataset may be instead.
+    """
     remedy = "Name the folder of one task, OUT/TASK, that `mikasa-vla record` has finished."
     try:
         return read_file(path, Source(where=str(path), what="a file", remedy=remedy, error=DatasetError))
@@ -322,6 +252,6 @@ def _content(path: Path) -> bytes:
                 f"one of those."
             ) from exc
         raise DatasetError(
-            f"{path}: is not there: this is no dataset that `mikasa-vla record` has finished. Name the "
+            f"{path}: is not there: it is not a dataset that `mikasa-vla record` has finished. Name the "
             f"folder of one task, OUT/TASK."
         ) from exc

@@ -8,7 +8,7 @@ gets tables that were read here (`lerobot_tables.py`). Knows nothing of lerobot.
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any  # pyarrow is untyped
+from typing import Any, NamedTuple  # pyarrow is untyped
 
 import numpy as np
 import pyarrow as pa
@@ -71,36 +71,56 @@ def read_table(
     return table.replace_schema_metadata(noted)
 
 
-def read_columns(root: Path, only: Sequence[str] | None = None) -> Columns:
-    """Return numbers of a dataset: field -> (N,) or (N, D), in the order of frames.
+class TableFile(NamedTuple):
+    """A file of a table, and what it holds."""
 
-    Args:
-        root: folder of the dataset.
-        only: these fields; None: all.
+    path: Path
+    table: Any  # pyarrow.Table
+
+
+def read_frame_tables(root: Path) -> list[TableFile]:
+    """Return the tables of frames in the order of their rows; errors as `read_table` and `table_paths`."""
+    return [TableFile(path, read_table(path, with_images=True)) for path in table_paths(root, FRAME_TABLES)]
+
+
+def read_columns(root: Path) -> Columns:
+    """Return the numbers of a dataset; see `columns_of`."""
+    check_folder(root)
+    return columns_of(read_frame_tables(root))
+
+
+def columns_of(files: Sequence[TableFile]) -> Columns:
+    """Return the numbers and sentences of frames, without images and annotations.
 
     Raises:
-        DatasetError: there are none, or see `read_table`.
+        DatasetError: a table lacks a column that the first one has, or a row has no value.
     """
-    check_folder(root)
-    paths = table_paths(root, FRAME_TABLES)
-    keep = None if only is None else set(only).__contains__
-    tables = [read_table(path, keep, with_images=True) for path in paths]
-    names = only or [column.name for column in tables[0].schema if not is_image(column.type)]
-    for path, table in zip(paths, tables, strict=True):
+    names = [
+        column.name
+        for column in files[0].table.schema
+        if not is_image(column.type) and column.name not in LANGUAGE_COLUMNS
+    ]
+    for path, table in files:
         check_columns(path, table, names)
         check_values(path, table, names)
-    return {name: np.concatenate([_as_array(table[name]) for table in tables]) for name in names}
+    return {name: np.concatenate([as_array(table[name]) for _, table in files]) for name in names}
 
 
-def _as_array(column: Any) -> NDArray[np.generic]:  # Any: pyarrow.ChunkedArray
+def as_array(column: Any) -> NDArray[np.generic]:  # Any: pyarrow.ChunkedArray
     """Return a column that `check_values` has seen, in the type in which it is stored."""
+    if not holds_numbers(column):
+        return np.asarray(column.to_pylist())
     levels = list(_levels(column))
     values = levels[-1]
-    if not any(is_kind(values.type) for is_kind in PLAIN_NUMBERS):
-        return np.asarray(column.to_pylist())
     inner = [len(after) // len(before) if len(before) else 0 for before, after in pairwise(levels)]
     array: NDArray[np.generic] = values.to_numpy().reshape([len(column), *inner])
     return array
+
+
+def holds_numbers(column: Any) -> bool:  # Any: pyarrow.ChunkedArray
+    """Whether a column holds numbers, or lists of them."""
+    *_, values = _levels(column)
+    return any(is_kind(values.type) for is_kind in PLAIN_NUMBERS)
 
 
 def _levels(column: Any) -> Iterator[Any]:  # Any: pyarrow.ChunkedArray

@@ -107,6 +107,20 @@ def without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]
     return {name: value for name, value in environment.items() if name != DEVICE}
 
 
+def known_device(run_file: RunFile) -> dict[str, JsonValue]:
+    """Return what is recorded of the device; nothing before a worker has started."""
+    device = run_file.description.environment.get(DEVICE)
+    return dict(device) if isinstance(device, Mapping) else {}
+
+
+def device_changes(run_file: RunFile, device: Mapping[str, JsonValue]) -> tuple[Change, ...]:
+    """Compare facts about a device with those that are recorded; a session may know fewer or more."""
+    recorded = known_device(run_file)
+    both = [name for name in device if name in recorded]
+    before, now = ({name: facts[name] for name in both} for facts in (recorded, device))
+    return find_changes(before, now, prefix=f"environment.{DEVICE}")
+
+
 def _shard(description: RunDescription) -> dict[str, JsonValue]:
     """Return which shard a run is; its groups follow from the configuration, which may grow."""
     shard = description.shard

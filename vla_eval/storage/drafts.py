@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.durable import sync_folder
+from vla_eval.storage.durable import sync_folder, sync_tree
 
 DRAFT_SUFFIX = ".draft"
 NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS})
@@ -53,14 +53,7 @@ def remove_drafts(path: Path) -> None:
 
 def publish(draft: Path, path: Path) -> None:
     """Make a folder durable and give it its final name, in one step that cannot be cut in half."""
-    for folder, _, names in os.walk(draft):
-        for name in names:
-            descriptor = os.open(Path(folder) / name, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        sync_folder(Path(folder))
+    sync_tree(draft)
     os.rename(draft, path)
     sync_folder(path.parent)
 

@@ -9,10 +9,11 @@ import errno
 import fcntl
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vla_eval.errors import FolderInUseError, RunFolderError, StorageFullError
+from vla_eval.strict.json_text import Source, read_file
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +50,44 @@ def replace_file(path: Path, text: str) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise storage_full(path, exc) from exc
+
+
+def sync_tree(folder: Path) -> None:
+    """Make all files below a folder durable, and their names."""
+    for place, _, names in os.walk(folder):
+        for path in (*(Path(place, name) for name in names), Path(place)):
+            fd = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(fd)
+            finally:
+                os.close(fd)
+
+
+def read_lines(path: Path) -> bytes:
+    """Return the bytes of a file of lines, none if it is not there.
+
+    Raises:
+        RunFolderError: what lies there is not a file, or cannot be read.
+    """
+    source = Source(where=str(path), what="a file of JSON lines", remedy="", error=RunFolderError)
+    try:
+        return read_file(path, source)
+    except (FileNotFoundError, NotADirectoryError):
+        return b""
+
+
+def whole_lines(data: bytes, path: Path) -> Iterator[tuple[bytes, str]]:
+    """Yield each line, and `FILE:NUMBER` for messages. What follows the last newline was being written."""
+    for number, line in enumerate(data.split(b"\n")[:-1], start=1):
+        yield line, f"{path}:{number}"
+
+
+def cut_tail(path: Path) -> None:
+    """Cut off an incomplete last line of a file that no result depends on."""
+    data = read_lines(path)
+    end = data.rfind(b"\n") + 1
+    if end != len(data):
+        os.truncate(path, end)
 
 
 class LineFile:

@@ -10,25 +10,12 @@ from pathlib import Path
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord
+from vla_eval.storage.durable import read_lines, whole_lines
 from vla_eval.storage.planned import PlannedEpisodes
-from vla_eval.strict.json_text import Source, read_file
 
 logger = logging.getLogger(__name__)
 
 MAX_NAMED = 5
-
-
-def read_lines(path: Path) -> bytes:
-    """Return the bytes of a file of lines, none if it is not there.
-
-    Raises:
-        RunFolderError: what lies there is no file, or cannot be read.
-    """
-    source = Source(where=str(path), what="a file of JSON lines", remedy="", error=RunFolderError)
-    try:
-        return read_file(path, source)
-    except (FileNotFoundError, NotADirectoryError):
-        return b""
 
 
 def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
@@ -44,17 +31,17 @@ def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[Epi
     """
     records: dict[EpisodeKey, EpisodeRecord] = {}
     strangers: list[str] = []
-    for number, line in enumerate(data.split(b"\n")[:-1], start=1):
-        record = _parse_record(line, f"{path}:{number}")
+    for line, where in whole_lines(data, path):
+        record = _parse_record(line, where)
         objection = planned.objection(record)
         if objection is not None:
-            strangers.append(f"  line {number}: {shown_key(record.key)}: {objection}")
+            strangers.append(f"  line {where.rpartition(':')[2]}: {shown_key(record.key)}: {objection}")
         known = records.get(record.key)
         if known is None or known.outcome == "error":
             records[record.key] = record
         elif record.outcome != "error":
             raise RunFolderError(
-                f"{path}:{number}: a second result of {shown_key(record.key)}. The file was changed by "
+                f"{where}: a second result of {shown_key(record.key)}. The file was changed by "
                 f"something else; remove one of the two lines or start a new run folder."
             )
     if strangers:
@@ -127,14 +114,6 @@ def _set_end(path: Path, *, size: int, complete: bool) -> None:
         else:
             file.truncate(size)
         os.fsync(file.fileno())
-
-
-def cut_tail(path: Path) -> None:
-    """Cut off an incomplete last line of a file that no result depends on."""
-    data = read_lines(path)
-    end = data.rfind(b"\n") + 1
-    if end != len(data):
-        os.truncate(path, end)
 
 
 def shown_key(key: EpisodeKey) -> str:

@@ -1,9 +1,10 @@
 """Which folder is a run folder, which may become one, and which one may have been meant."""
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
-from vla_eval.errors import RunFolderError, did_you_mean
+from vla_eval.errors import RunFolderError, VlaEvalError, did_you_mean
 from vla_eval.storage.run_file import RUN_FILE
 
 EPISODES_FILE = "episodes.jsonl"
@@ -45,11 +46,24 @@ def check_folder(path: Path) -> None:
             f"{path}: holds {EPISODES_FILE} but no {RUN_FILE}, so nobody knows what its episodes are. "
             f"Restore {RUN_FILE} or use another --out."
         )
-    others = sorted(names - UNSTARTED)
-    shown = ", ".join(others[:3]) + (", …" if len(others) > 3 else "")
-    raise RunFolderError(
-        f"{path}: holds other files ({shown}) and no {RUN_FILE}: it is not a run folder, and nothing is "
-        f"written into it. Use another --out."
+    raise other_files(path, names - UNSTARTED, missing=RUN_FILE, error=RunFolderError)
+
+
+def other_files(
+    path: Path, names: Collection[str], *, missing: str, error: type[VlaEvalError]
+) -> VlaEvalError:
+    """Build the error for a folder that holds something else than what was to be started or resumed in it.
+
+    Args:
+        path: the folder.
+        names: of its files.
+        missing: what it would hold, too.
+        error: class of the error.
+    """
+    shown = ", ".join(sorted(names)[:3]) + (", …" if len(names) > 3 else "")
+    return error(
+        f"{path}: holds other files ({shown}) and no {missing}: nothing is written into it. Use another "
+        f"--out."
     )
 
 

@@ -58,7 +58,7 @@ def merge_runs(folders: Sequence[Path], *, allow_environment_change: bool = Fals
         RunFolderError: one is no run folder, or a file in it is damaged.
     """
     runs = [read_run(folder) for folder in folders]
-    parts = [as_part(run.path, run.description, run.sessions) for run in runs]
+    parts = [as_part(run.path, RunFile(description=run.description, sessions=run.sessions)) for run in runs]
     run_file = merge_descriptions(parts, allow_environment_change=allow_environment_change)
     rank_of = {group: rank for rank, group in enumerate(parts[0].shard.groups)}
     records = sorted(
@@ -105,13 +105,13 @@ def _missing_episodes(part: ShardPart, there: set[EpisodeKey]) -> Iterator[str]:
     if absent:
         yield (
             f"{part.path} (shard {part.shard}): {len(absent)} of {len(absent) + len(there)} episodes were "
-            f"not run, such as {shown_key(absent[0])}. To resume: {part.sessions[-1].command}"
+            f"not run, such as {shown_key(absent[0])}. To resume: {part.run_file.sessions[-1].command}"
         )
 
 
 def _planned(part: ShardPart) -> Iterator[EpisodeKey]:
     """Return every episode of a shard, by its description."""
-    planned = RunFile(description=part.description, sessions=part.sessions).planned(part.path)
+    planned = part.run_file.planned(part.path)
     config, shard = planned.config, part.shard
     if config.episodes is None or config.seed_start is None or config.runs is None:
         raise MergeError(

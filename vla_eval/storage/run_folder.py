@@ -17,15 +17,9 @@ from typing import NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.storage.continuing import check_allowed, continued
-from vla_eval.storage.durable import LineFile, sync_folder
-from vla_eval.storage.episodes_file import (
-    cut_tail,
-    parse_records,
-    read_lines,
-    repair_records,
-    shown_key,
-)
+from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
+from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder
+from vla_eval.storage.episodes_file import parse_records, repair_records, shown_key
 from vla_eval.storage.folders import (
     EPISODES_FILE,
     LOCK_FILE,
@@ -227,10 +221,7 @@ class RunFolder:
         own = {name: environment.get(name) for name in facts}
         changes = find_changes(own, facts, prefix=f"environment.machine {kind}")
         check_allowed(changes, shown=self.path, allowed=self._allow_environment_change)
-        updated = self._run_file.with_changes(changes)
-        if updated != self._run_file:
-            updated.save(self.path)
-            self._run_file = updated
+        self._keep(self._run_file.with_changes(changes))
 
     def note_device(self, device: Mapping[str, JsonValue]) -> None:
         """Record facts about the device; what is known already must not have changed.
@@ -242,10 +233,7 @@ class RunFolder:
             RunChangedError: a value differs from the recorded one, and changes are not allowed.
             StorageFullError: it could not be recorded.
         """
-        updated = self._with_device(self._run_file, device)
-        if updated != self._run_file:
-            updated.save(self.path)
-            self._run_file = updated
+        self._keep(self._with_device(self._run_file, device))
 
     def note_sentence(self, line: str) -> None:
         """Record what a policy's tokenizer made of an instruction; tables quote it.
@@ -253,10 +241,8 @@ class RunFolder:
         Raises:
             StorageFullError: it could not be recorded.
         """
-        if any(line in session.sentences for session in self._run_file.sessions):
-            return
-        self._run_file = self._run_file.with_sentence(line)
-        self._run_file.save(self.path)
+        if not any(line in session.sentences for session in self._run_file.sessions):
+            self._keep(self._run_file.with_sentence(line))
 
     def close(self) -> None:
         """Close the files and let other processes in; a second call does nothing."""
@@ -269,7 +255,6 @@ class RunFolder:
             self._started = None
 
     def _load(self, description: RunDescription) -> RunFile:
-        """Return what run.json must hold from now on."""
         run_file = continued(
             self.path,
             description,
@@ -281,16 +266,17 @@ class RunFolder:
         return self._with_device(run_file, device) if isinstance(device, Mapping) else run_file
 
     def _with_device(self, run_file: RunFile, device: Mapping[str, JsonValue]) -> RunFile:
-        recorded = run_file.description.environment.get(DEVICE)
-        recorded = recorded if isinstance(recorded, Mapping) else {}
-        # A session may know less of the device than the one before, as long as it does not contradict it.
-        again = {name: device[name] for name in device if name in recorded}
-        before = {name: recorded[name] for name in again}
-        changes = find_changes(before, again, prefix=f"environment.{DEVICE}")
+        changes = device_changes(run_file, device)
         check_allowed(changes, shown=self.path, allowed=self._allow_environment_change)
-        if not changes and again.keys() == device.keys():
+        recorded = known_device(run_file)
+        if not changes and device.keys() <= recorded.keys():
             return run_file
         return run_file.with_device({**device, **recorded}, changes)
+
+    def _keep(self, updated: RunFile) -> None:
+        if updated != self._run_file:
+            updated.save(self.path)
+            self._run_file = updated
 
 
 def read_run(path: Path) -> StoredRun:

@@ -3,17 +3,16 @@
 The same for the shards of runs and of recordings: it knows nothing of what their folders hold.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_eval.errors import MergeError, some_of
-from vla_eval.storage.continuing import without_device
+from vla_eval.storage.continuing import device_changes, known_device, without_device
 from vla_eval.storage.run_file import (
     DEVICE,
     Change,
     JsonValue,
-    RunDescription,
     RunFile,
     Session,
     find_changes,
@@ -28,28 +27,28 @@ class ShardPart:
 
     Attributes:
         path: the folder.
-        description, sessions: of its `run.json`.
+        run_file: its `run.json`.
         shard: which one it is.
     """
 
     path: Path
-    description: RunDescription
-    sessions: tuple[Session, ...]
+    run_file: RunFile
     shard: Shard
 
 
-def as_part(path: Path, description: RunDescription, sessions: Sequence[Session]) -> ShardPart:
+def as_part(path: Path, run_file: RunFile) -> ShardPart:
     """Return the shard that a folder holds.
 
     Raises:
         MergeError: it was not made with `--shard`.
     """
-    if description.shard is None:
+    shard = run_file.description.shard
+    if shard is None:
         raise MergeError(
             f"{path}: expected a shard (made with --shard I/N), found a whole run. `mikasa-vla report` puts "
             f"whole runs into one table."
         )
-    return ShardPart(path=path, description=description, sessions=tuple(sessions), shard=description.shard)
+    return ShardPart(path=path, run_file=run_file, shard=shard)
 
 
 def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: bool) -> RunFile:
@@ -62,7 +61,7 @@ def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: 
     for other in others:
         _refuse_other_plan(first, other)
     _refuse_doubles(parts)
-    sessions: list[Session] = list(first.sessions)
+    sessions: list[Session] = list(first.run_file.sessions)
     device: dict[str, JsonValue] = {}
     for part in parts:
         changes = _environment_changes(first, part)
@@ -73,10 +72,12 @@ def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: 
                 f"--allow-environment-change: the change is then recorded and the report names it."
             )
         if part is not first:
-            sessions += [_with_changes(session, changes) for session in part.sessions]
-        device = {**_device(part), **device}
-    environment = without_device(first.description.environment) | ({DEVICE: device} if device else {})
-    description = replace(first.description, environment=environment, shard=None)
+            sessions += [_with_changes(session, changes) for session in part.run_file.sessions]
+        device = {**known_device(part.run_file), **device}
+    environment = without_device(first.run_file.description.environment) | (
+        {DEVICE: device} if device else {}
+    )
+    description = replace(first.run_file.description, environment=environment, shard=None)
     return RunFile(description=description, sessions=tuple(sessions))
 
 
@@ -86,11 +87,11 @@ def missing_shards(parts: Sequence[ShardPart]) -> Iterator[str]:
     absent = sorted(set(range(1, count + 1)) - {part.shard.number for part in parts})
     if absent:
         numbers = some_of(f"{number}/{count}" for number in absent)
-        yield f"{parts[0].description.name}: no folder of shard {numbers} was named."
+        yield f"{parts[0].run_file.description.name}: no folder of shard {numbers} was named."
 
 
 def _refuse_other_plan(first: ShardPart, other: ShardPart) -> None:
-    one, two = first.description, other.description
+    one, two = first.run_file.description, other.run_file.description
     changes = [
         *find_changes(one.config, two.config, prefix="config"),
         *find_changes(one.recipes, two.recipes, prefix="recipes"),
@@ -122,18 +123,11 @@ def _refuse_doubles(parts: Sequence[ShardPart]) -> None:
 
 def _environment_changes(first: ShardPart, other: ShardPart) -> tuple[Change, ...]:
     """Return how the environments differ; of the devices, what is known of both."""
-    environments = [without_device(part.description.environment) for part in (first, other)]
-    one, two = _device(first), _device(other)
-    both = [{name: device[name] for name in one if name in two} for device in (one, two)]
+    environments = [without_device(part.run_file.description.environment) for part in (first, other)]
     return (
         *find_changes(*environments, prefix="environment"),
-        *find_changes(*both, prefix=f"environment.{DEVICE}"),
+        *device_changes(first.run_file, known_device(other.run_file)),
     )
-
-
-def _device(part: ShardPart) -> dict[str, JsonValue]:
-    device = part.description.environment.get(DEVICE)
-    return dict(device) if isinstance(device, Mapping) else {}
 
 
 def _with_changes(session: Session, changes: Sequence[Change]) -> Session:

@@ -11,7 +11,8 @@ from statistics import median
 
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.storage.episodes_file import is_json, read_lines
+from vla_eval.storage.durable import read_lines
+from vla_eval.storage.episodes_file import is_json
 from vla_eval.storage.folders import TIMINGS_FILE
 from vla_eval.strict.json_text import Source, as_dataclass, read_json
 

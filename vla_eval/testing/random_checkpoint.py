@@ -76,7 +76,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
     described = {name: state[name] for name in state if once[id(state[name])] == name}
     write_weights(folder / WEIGHTS_FILE, described, functools.partial(random_parts, described))
     config._save_pretrained(folder)
-    own = contextlib.nullcontext() if tokenizer is None else tokenizer_from(str(tokenizer), config.type)
+    own = contextlib.nullcontext() if tokenizer is None else tokenizer_from(str(tokenizer), config)
     with own, no_foreign_code(config.type):
         processors = make_pre_post_processors(config, dataset_stats=plain_statistics(config))
     for processor in processors:

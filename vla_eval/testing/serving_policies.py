@@ -72,7 +72,7 @@ def write_small_transformer(folder: Path) -> int:
         key: {"mean": torch.zeros(n), "std": torch.ones(n)}
         for key, n in ((STATE_KEY, n_state), (ACTION_KEY, len(ACTION_NAMES)))
     }
-    with tokenizer_from(str(tokenizer), kind), tiny_paligemma(kind, SMALL):
+    with tokenizer_from(str(tokenizer), config), tiny_paligemma(kind, SMALL):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             policy = make_empty_policy(config)

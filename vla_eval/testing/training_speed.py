@@ -57,7 +57,7 @@ def _measure(
     options = LoadOptions(device=device)
     config = read_config(model_folder, options)
     model = load_weights(model_folder, config, options)
-    adapters = peft_config(recipe)
+    adapters = peft_config(recipe, config)
     if adapters is not None:
         config.pretrained_path = model_folder
         model = model.wrap_with_peft(peft_cli_overrides=asdict(adapters))

@@ -14,6 +14,7 @@ from torch import nn
 from vla_eval.checkpoints.files import LAST, MODEL_FOLDER, write_facts
 from vla_eval.checkpoints.processors import save_tokenizers, save_vlm_files
 from vla_eval.errors import TrainingError
+from vla_eval.storage.durable import sync_tree
 from vla_eval.strict.json_text import Source, read_file, read_json, shown
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.run_folder import PARTIAL_PREFIX, STATE_FOLDER, point
@@ -58,7 +59,7 @@ def write_checkpoint(
     write_facts(partial / MODEL_FOLDER, job.facts)
     save_tokenizers(parts["preprocessor"], partial / MODEL_FOLDER)
     save_vlm_files(job.policy, partial / MODEL_FOLDER)
-    _sync(partial)
+    sync_tree(partial)
     os.replace(partial, folder)
     point(folder.parent / LAST, folder.name)
     return folder
@@ -126,13 +127,3 @@ def load_loss_scale(folder: Path, scaler: Any) -> None:
         kinds = ", ".join(f"{name} ({type(value).__name__})" for name, value in fields.items())
         raise source.refuse(shown(data), f"its fields are {kinds}")
     scaler.load_state_dict(data)
-
-
-def _sync(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_file():
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)

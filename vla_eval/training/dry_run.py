@@ -14,15 +14,15 @@ from vla_eval.checkpoints.foreign_code import only_data
 from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
 from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.data.opening import OpenDataset
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
 from vla_eval.models.families import bases
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
-from vla_eval.training.dataset import TrainingDataset, training_dataset
-from vla_eval.training.failures import chosen_episodes
+from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.lora import check_lora_targets
-from vla_eval.training.policy_config import policy_config, used_frames
+from vla_eval.training.policy_config import asked_policy, fit_to_dataset, used_frames
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import newest_step
 
@@ -84,7 +84,6 @@ def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[
     """
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
-    check_lora_targets(recipe)
     out = run_folder_of(config)
     found, missing, passes = _estimate(config, recipe, options)
     done = newest_step(out)
@@ -108,28 +107,31 @@ def _estimate(
     device = "cuda" if is_named else choose_device(config.device)
     missing, dataset = [], None
     if Path(config.dataset).is_dir():
-        dataset = chosen_episodes(
-            training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed), recipe
-        )
+        dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
     else:
         missing.append(f"the dataset {config.dataset}; its fields are taken to be those of recordings")
-    base = recipe.base_checkpoint
-    if base is not None and not _is_there(base):
+    cls = config_class(recipe.type, where="finetune.type")
+    check_lora_targets(recipe, cls)
+    base, folder = recipe.base_checkpoint, _base_folder(recipe)
+    if base is not None and folder is None:
         missing.append(
             f"the base {base}; its sizes are taken to be the defaults of '{recipe.type}'.{how_to_get(base)}"
         )
     with plain_errors(base or "finetune.policy", recipe.type, "cannot be trained"):
-        if dataset is not None and (base is None or _is_there(base)):
-            policy = policy_config(recipe, dataset, device="cpu")
-            passes: str | None = _passes(policy, dataset, recipe)
+        passes: str | None = None
+        if dataset is not None and (base is None or folder is not None):
+            policy = asked_policy(recipe, cls, folder, device="cpu")
+            dataset = chosen_episodes(dataset, recipe, policy)
+            fit_to_dataset(policy, recipe, dataset)
+            passes = _passes(policy, dataset, recipe)
         else:
-            policy, passes = options.assume(recipe), None
+            policy = options.assume(recipe)
         model = unfilled_model(policy, recipe)
         found = estimate(model, policy, recipe, device=device, tflops=options.tflops)
     return found, missing, passes
 
 
-def _passes(policy: Any, dataset: TrainingDataset, recipe: FinetuneRecipe) -> str:
+def _passes(policy: Any, dataset: OpenDataset, recipe: FinetuneRecipe) -> str:
     """Return a line that says how often a training sees the dataset."""
     n_samples, frames = recipe.steps * recipe.batch_size, used_frames(policy, dataset).n_used
     if getattr(policy, "whole_episodes", False):
@@ -141,12 +143,14 @@ def _passes(policy: Any, dataset: TrainingDataset, recipe: FinetuneRecipe) -> st
     return f"dataset: {frames:,} frames begin a sample; {n_samples / frames:.1f} passes over them"
 
 
-def _is_there(base: str) -> bool:
+def _base_folder(recipe: FinetuneRecipe) -> Path | None:
+    """Return the folder of the base's weights; None: there is no base, or it is not on this machine."""
+    if recipe.base_checkpoint is None:
+        return None
     try:
-        find_checkpoint(Path(base))
+        return find_checkpoint(Path(recipe.base_checkpoint))
     except CheckpointError:
-        return False
-    return True
+        return None
 
 
 def _memory_here() -> float | None:

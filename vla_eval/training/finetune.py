@@ -19,9 +19,8 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.cost.estimate import RateWatch, estimate
-from vla_eval.training.decision_frames import about_decisions
+from vla_eval.training.dataset import about_decisions, about_failures
 from vla_eval.training.extension import check_steps
-from vla_eval.training.failures import about_failures
 from vla_eval.training.held_out import METRIC_KEY, HeldOut, asked_warnings, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
@@ -101,8 +100,8 @@ def _describe(job: TrainingJob, say: Say) -> None:
         say(about_failures(dataset))
     if (told := about_decisions(dataset, job.policy)) is not None:
         say(told)
-    if len(dataset.tasks) > 1:
-        say(f"tasks: {', '.join(dataset.tasks)}")
+    if len(dataset.facts.tasks) > 1:
+        say(f"tasks: {', '.join(dataset.facts.tasks)}")
     warning = shared_seeds_warning(dataset)
     if warning is not None:
         say(warning)
@@ -202,21 +201,21 @@ def _open(job: TrainingJob, config: FinetuneConfig, command: str) -> Path | None
     section = compared_fields(job.recipe)
     del section["failed_episodes"]  # its outcome is recorded below
     chosen = {"episodes_left_out": list(job.dataset.left_out)} if job.dataset.left_out else {}
-    base = job.recipe.base_checkpoint
+    base_sha256 = None if job.base is None else checkpoint_sha256(job.base)
     settings: dict[str, Any] = {  # Any: plain data
         "finetune": section,
         "dataset": {"name": job.dataset.name, "sha256": job.dataset.sha256, **chosen},
         "run_seed": job.run_seed,
-        "base_sha256": checkpoint_sha256(Path(base)) if base else None,
+        "base_sha256": base_sha256,
     }
     record: dict[str, Any] = {  # Any: plain data
         "policy": job.name,
         "recipe_sha256": job.recipe_sha256,
         "dataset_was_replayed": job.dataset.was_replayed,
-        "tasks": job.dataset.tasks,
+        "tasks": job.dataset.facts.tasks,
         "environment": collect_environment(),
         "command": command,
-        REQUEST_KEY: request_sha256(config, job.recipe),
+        REQUEST_KEY: request_sha256(job.recipe, job.dataset.root, base_sha256, run_seed=job.run_seed),
         RUN_ID: secrets.token_hex(4),
     }
     return open_folder(

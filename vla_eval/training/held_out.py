@@ -19,8 +19,6 @@ from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.config.prompts import instruction_for
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
-from vla_eval.data.manifest import MANIFEST_FILE, read_failed, read_manifest
-from vla_eval.data.mixture import read_mixture
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
 from vla_eval.evaluation.resolve import resolve
@@ -31,7 +29,7 @@ from vla_eval.tasks.interface import env_spec, offered_by
 from vla_eval.training.run_folder import whole_checkpoints
 
 if TYPE_CHECKING:  # it imports lerobot; a finished training is known without
-    from vla_eval.training.dataset import TrainingDataset
+    from vla_eval.data.opening import OpenDataset
 
 EVALUATIONS_FOLDER = "evaluations"
 METRIC_KEY = "held_out"
@@ -164,7 +162,7 @@ class _UntilStopped(Silence):
         return self._is_stopping()
 
 
-def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "TrainingDataset") -> str:
+def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "OpenDataset") -> str:
     """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
 
     Raises:
@@ -180,7 +178,7 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "Tr
     # A checkpoint that was selected on the seeds of the tables would have a biased rate there.
     for used, what in (
         (EVALUATION_SEEDS, "tables are made from"),
-        (_seeds_of(dataset), "were recorded from"),
+        (dataset.seeds_tried, "were recorded from"),
     ):
         shared = sorted(set(seeds) & set(used))
         if shared:
@@ -189,15 +187,16 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "Tr
                 f"of these seeds ({shared[0]} … {shared[-1]}) are seeds that {what}. Held-out seeds serve "
                 f"nothing else: choose another seed_start, or leave it out."
             )
-    if control_mode_of(settings.env) != dataset.control_mode:
+    control_mode, tasks = dataset.facts.control_mode, dataset.facts.tasks
+    if control_mode_of(settings.env) != control_mode:
         raise RecipeError(
-            f"held_out.env.{CONTROL_MODE}: expected {dataset.control_mode}, the mode of the actions in "
+            f"held_out.env.{CONTROL_MODE}: expected {control_mode}, the mode of the actions in "
             f"{dataset.name}, found {control_mode_of(settings.env)}. Set it: --set "
-            f"held_out.env.{CONTROL_MODE}={dataset.control_mode}."
+            f"held_out.env.{CONTROL_MODE}={control_mode}."
         )
-    task = settings.task or dataset.task
+    task = settings.task or dataset.facts.task
     if not task:
-        names = f"is of {', '.join(dataset.tasks)}" if dataset.tasks else "names no task"
+        names = f"is of {', '.join(tasks)}" if tasks else "names no task"
         raise RecipeError(
             f"held_out.task: {dataset.name} {names}; say which one to evaluate on (`mikasa-vla list tasks`)."
         )
@@ -238,12 +237,12 @@ def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> li
     return [f"every evaluation would refuse this policy: {line}" for line in differences(facts, Asked(env))]
 
 
-def shared_seeds_warning(dataset: "TrainingDataset") -> str | None:
+def shared_seeds_warning(dataset: "OpenDataset") -> str | None:
     """Return a warning if demonstrations are of seeds that tables are made from; None if none is.
 
     Recording refuses such seeds; a dataset from elsewhere, or of an earlier version, may have them.
     """
-    shown = sorted(_seeds_of(dataset) & set(EVALUATION_SEEDS))
+    shown = sorted(dataset.seeds_tried & set(EVALUATION_SEEDS))
     if not shown:
         return None
     return (
@@ -251,14 +250,3 @@ def shared_seeds_warning(dataset: "TrainingDataset") -> str | None:
         f"{shown[-1]}). Evaluate on others (--seed-start), or leave them out: mikasa-vla dataset check-leak "
         f"{dataset.root}"
     )
-
-
-def _seeds_of(dataset: "TrainingDataset") -> set[int]:
-    """Return the seeds that demonstrations were tried at; none for an import, whose seeds are not ours."""
-    mixture = read_mixture(dataset.root)
-    if mixture is not None:
-        return {seed for one in mixture.sources for seed in (*(one.seeds or ()), *one.failed_seeds)}
-    if not (dataset.root / MANIFEST_FILE).is_file():
-        return set()
-    kept = {episode.seed for episode in read_manifest(dataset.root)}
-    return kept | {failed.seed for failed in read_failed(dataset.root)}

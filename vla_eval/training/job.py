@@ -12,18 +12,24 @@ from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from vla_eval.checkpoints.files import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
+from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.control_modes import action_spec
-from vla_eval.data.opening import decoder_for
+from vla_eval.data.opening import OpenDataset, decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.models.shared.earlier_frames import SampleMemory
 from vla_eval.policies.lerobot.device import choose_device
-from vla_eval.training.dataset import TrainingDataset, training_dataset
-from vla_eval.training.failures import chosen_episodes
+from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.held_out import check_asked, check_held_out
 from vla_eval.training.lora import check_lora_targets, peft_config
-from vla_eval.training.policy_config import UsedFrames, image_transforms, policy_config, used_frames
+from vla_eval.training.policy_config import (
+    UsedFrames,
+    asked_policy,
+    fit_to_dataset,
+    image_transforms,
+    used_frames,
+)
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import TRAIN_FOLDER
 
@@ -39,6 +45,7 @@ class TrainingJob:
         policy: lerobot's configuration of the policy, which it completes when the model is made.
         frames: how many of the dataset's frames begin a chunk.
         base: folder of the weights to start from; None: from scratch.
+        below: what those were trained on; None: from scratch, or not known.
         device: `cpu`, `cuda` …
         out: the run folder.
         run_seed: of initial weights, order of samples and noise.
@@ -51,10 +58,11 @@ class TrainingJob:
     name: str
     recipe_sha256: str
     recipe: FinetuneRecipe
-    dataset: TrainingDataset
+    dataset: OpenDataset
     policy: Any
     frames: UsedFrames
     base: Path | None
+    below: TrainingFacts | None
     device: str
     out: Path
     run_seed: int
@@ -91,30 +99,30 @@ class TrainingJob:
 
     @property
     def sample_memory(self) -> SampleMemory | None:
-        """What a sample has beside its own frame, see `RememberedFramesDataset`; None: nothing."""
+        """What a sample has in addition to its own frame, see `RememberedFramesDataset`; None: nothing."""
         memory: SampleMemory | None = getattr(self.policy, "sample_memory", None)
         return memory
 
     @property
     def facts(self) -> TrainingFacts:
-        """What is written beside each checkpoint's weights."""
-        dataset, features = self.dataset, self.dataset.meta.features
-        below = None if self.base is None else read_facts(self.base)
+        """What is written next to each checkpoint's weights."""
+        dataset, below, facts = self.dataset, self.below, self.dataset.facts
+        features = dataset.meta.features
         return TrainingFacts(
             run=self.out.resolve().name,
             dataset=dataset.name,
             dataset_sha256=dataset.sha256,
-            task=dataset.task,
-            state=dataset.state,
+            task=facts.task or "",
+            state=facts.state,
             images={field: tuple(features[field]["shape"][:2]) for field in CAMERA_KEYS.values()},
             fps=float(dataset.meta.fps),
             action_names=tuple(features["action"]["names"]),
-            control_mode=dataset.control_mode,
+            control_mode=facts.control_mode,
             run_seed=self.run_seed,
             seeds=_with_base(dataset.seeds, None if below is None else below.seeds),
-            tasks=dataset.tasks,
+            tasks=facts.tasks,
             sentences=_with_base(dataset.sentences, None if below is None else below.sentences),
-            gripper_open=action_spec(dataset.control_mode).gripper_open,
+            gripper_open=action_spec(facts.control_mode).gripper_open,
         )
 
 
@@ -136,14 +144,16 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
     """
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
-    dataset = chosen_episodes(
-        training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed), recipe
-    )
+    dataset = training_dataset(Path(config.dataset), allow_unreplayed=config.allow_unreplayed)
     held_out = config.held_out
     task = None if held_out is None else check_held_out(held_out, recipe, dataset)
     device = choose_device(config.device)
-    check_lora_targets(recipe)
-    policy = policy_config(recipe, dataset, device=device)
+    cls = config_class(recipe.type, where="finetune.type")
+    check_lora_targets(recipe, cls)
+    base = find_checkpoint(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None
+    policy = asked_policy(recipe, cls, base, device=device)
+    dataset = chosen_episodes(dataset, recipe, policy)
+    fit_to_dataset(policy, recipe, dataset)
     image_transforms(recipe)
     job = TrainingJob(
         name=loaded.name,
@@ -152,7 +162,8 @@ def training_job(config: FinetuneConfig) -> TrainingJob:
         dataset=dataset,
         policy=policy,
         frames=used_frames(policy, dataset),
-        base=find_checkpoint(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None,
+        base=base,
+        below=None if base is None else read_facts(base),
         device=device,
         out=run_folder_of(config),
         run_seed=config.run_seed,
@@ -205,7 +216,7 @@ def lerobot_config(job: TrainingJob) -> Any:
             project=recipe.wandb_project or "none",
             run_id=job.run_id,
         ),
-        peft=peft_config(recipe),
+        peft=peft_config(recipe, job.policy),
     )
     config.checkpoint_path = job.resume_from
     return config

@@ -37,7 +37,6 @@ from tqdm import tqdm
 
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.frames.remembered_frames import RememberedFramesDataset
-from vla_eval.data.opening import local_readers
 from vla_eval.errors import TrainingError
 from vla_eval.models.shared.levels import in_numbers
 from vla_eval.models.shared.sentence_reading import SentenceReading
@@ -243,7 +242,7 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
 
 def _dataset(job: TrainingJob, config: Any) -> Any:
     """Return lerobot's dataset, or one that serves the same from decoded frames."""
-    with local_readers():
+    with job.dataset.local.readers():
         dataset = make_dataset(config)
     if job.sample_memory is not None:
         return RememberedFramesDataset(dataset, job.sample_memory)

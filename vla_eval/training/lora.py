@@ -6,35 +6,40 @@ from lerobot.configs.default import PeftConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 
-from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.models.families import family_of
 from vla_eval.models.shared.trainable import check_lora
 
 
-def peft_config(recipe: FinetuneRecipe) -> PeftConfig | None:
-    """Return lerobot's settings of the adapters; None: all weights are trained."""
+def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
+    """Return lerobot's settings of the adapters; None: all weights are trained.
+
+    Args:
+        recipe: see there.
+        policy: lerobot's configuration.
+    """
     lora = recipe.lora
     if lora is None:
         return None
     return PeftConfig(
         r=lora.rank,
         lora_alpha=lora.alpha or lora.rank,
-        target_modules=lora.target_modules or family_of(recipe.type).lora_targets,
+        target_modules=lora.target_modules or family_of(policy.type).lora_targets,
         full_training_modules=list(lora.full_modules) or None,
     )
 
 
-def check_lora_targets(recipe: FinetuneRecipe) -> None:
-    """Refuse LoRA where neither the recipe nor the policy says which layers get an adapter.
+def check_lora_targets(recipe: FinetuneRecipe, cls: Any) -> None:
+    """Raise `RecipeError` where neither the recipe nor the policy says which layers get an adapter.
 
-    Raises:
-        RecipeError: neither does.
+    Args:
+        recipe: see there.
+        cls: class of the policy's configuration.
     """
     if recipe.lora is None or recipe.lora.target_modules is not None:
         return
-    if hasattr(config_class(recipe.type, where="finetune.type"), "lora_defaults"):
+    if hasattr(cls, "lora_defaults"):
         return
     chosen = get_policy_class(recipe.type)._get_default_peft_targets
     if chosen is PreTrainedPolicy._get_default_peft_targets:

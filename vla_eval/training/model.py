@@ -68,7 +68,7 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
     config.pretrained_path = job.weights  # only now: lerobot's loaders leave out what does not fit
     if job.weights is not None:
         model = _filled(model, job, job.weights)
-    adapters = peft_config(job.recipe)
+    adapters = peft_config(job.recipe, config)
     if adapters is not None and not hasattr(model, "peft_config"):
         model = model.wrap_with_peft(peft_cli_overrides=asdict(adapters))
     check_adapters(model, job.recipe, config)
@@ -161,23 +161,25 @@ def _address_ours(
 @contextlib.contextmanager
 def local_files_only(job: TrainingJob) -> Iterator[None]:
     """Let the policy's processors use the recipe's tokenizer, and nothing run code that a file names."""
-    with tokenizer_from(job.recipe.tokenizer, job.recipe.type), no_foreign_code(job.recipe.type):
+    with tokenizer_from(job.recipe.tokenizer, job.policy), no_foreign_code(job.recipe.type):
         yield
 
 
 @contextlib.contextmanager
-def tokenizer_from(folder: str | None, kind: str) -> Iterator[None]:
-    """Replace the tokenizer of new processors: lerobot has the names of π0's written into its code."""
+def tokenizer_from(folder: str | None, policy: Any) -> Iterator[None]:
+    """Replace the tokenizer of a policy's new processors: lerobot has the names of π0's in its code."""
     if folder is None:
         yield
         return
-    cls = config_class(family_of(kind).lerobot_type, where="finetune.type")  # whose processors it takes
+    cls, family = type(policy), family_of(policy.type)
+    if family.wraps:  # whose processors it takes
+        cls = config_class(family.wraps, where="finetune.type")
     name = cls.__module__.replace("configuration_", "processor_")
     processing: Any = importlib.import_module(name)
     if not Path(folder).is_dir() or not hasattr(processing, TOKENIZER_STEP):
         raise RecipeError(
             f"finetune.tokenizer: expected the folder of a tokenizer and a policy that uses one, found "
-            f"{folder} and '{kind}'."
+            f"{folder} and '{policy.type}'."
         )
     step = getattr(processing, TOKENIZER_STEP)
     with patch.object(

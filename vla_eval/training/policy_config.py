@@ -12,23 +12,21 @@ import numpy as np
 import torch
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from numpy.typing import NDArray
 
 from vla_eval.checkpoints.config_check import check_config
 from vla_eval.checkpoints.files import (
     CONFIG_FILE,
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
-    find_checkpoint,
     read_json,
 )
 from vla_eval.checkpoints.foreign_code import only_data
-from vla_eval.checkpoints.loading import asked_for, config_class, with_local_files
+from vla_eval.checkpoints.loading import asked_for, with_local_files
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
 from vla_eval.checkpoints.saved_processor import read_saved_processor, refuse_built_in_normalization
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.data.exact_statistics import usable_statistics
-from vla_eval.data.tables import read_columns
+from vla_eval.data.opening import OpenDataset
 from vla_eval.errors import (
     CheckpointError,
     RecipeError,
@@ -39,7 +37,6 @@ from vla_eval.errors import (
 )
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
 from vla_eval.models.families import family_of
-from vla_eval.training.dataset import TrainingDataset
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
 
@@ -51,28 +48,32 @@ class UsedFrames(NamedTuple):
     n_frames: int
 
 
-def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: str) -> Any:
-    """Return lerobot's configuration: the base's, if any, with the recipe's values and the dataset's fields.
+def asked_policy(recipe: FinetuneRecipe, cls: Any, base: Path | None, *, device: str) -> Any:
+    """Return lerobot's configuration that a recipe asks for: the base's, if any, with the recipe's values.
+
+    Args:
+        recipe: see there.
+        cls: class of the configuration.
+        base: folder of the base's weights.
+        device: `cpu`, `cuda` …
 
     Raises:
         RecipeError: a field that the policy does not have, or a value that it refuses.
-        CheckpointError: the base checkpoint cannot be read, or there is no such type of policy.
-        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the dataset's
-            fields.
+        CheckpointError: the base checkpoint cannot be read.
     """
-    cls = config_class(recipe.type, where="finetune.type")
     known = [field.name for field in dataclasses.fields(cls)]
     check_names("field", recipe.policy, known, where=f"finetune.policy ({recipe.type})")
     data: dict[str, Any] = {}
-    if recipe.base_checkpoint is not None:
+    if base is not None:
         of_this_base_alone = getattr(cls, "not_of_base", ())
-        data = {key: value for key, value in _base_config(recipe).items() if key not in of_this_base_alone}
+        of_base = _base_config(recipe, cls, base)
+        data = {key: value for key, value in of_base.items() if key not in of_this_base_alone}
     if recipe.tokenizer is not None and "text_tokenizer_name" in known:
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
     try:
         with only_data():  # some configurations open the backbone that they name
-            config = draccus.decode(cls, data)
+            return draccus.decode(cls, data)
     except CheckpointError:
         raise
     except OSError as exc:  # of a backbone that is not here
@@ -81,22 +82,30 @@ def policy_config(recipe: FinetuneRecipe, dataset: TrainingDataset, *, device: s
         raise RecipeError(
             f"finetune.policy: not a configuration of '{recipe.type}': {exc} {exc.__cause__ or ''}"
         ) from exc
+
+
+def fit_to_dataset(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) -> None:
+    """Give a configuration the dataset's fields, and what the policy computes from its numbers.
+
+    Raises:
+        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the dataset's
+            fields.
+    """
     with plain_errors(recipe.base_checkpoint or "finetune.policy", recipe.type, "does not fit the dataset"):
         _set_features(config, recipe, dataset)
         if hasattr(config, "fit_to_control_mode"):
-            config.fit_to_control_mode(dataset.control_mode)
+            config.fit_to_control_mode(dataset.facts.control_mode)
         if hasattr(config, "window_steps"):
             _set_window(config, dataset)
         _check_features(config, dataset)
         if hasattr(config, "fit_to_actions"):
-            actions = torch.from_numpy(_columns_trained_on(dataset)[ACTION_KEY].astype(np.float32))
+            actions = torch.from_numpy(dataset.columns_used[ACTION_KEY].astype(np.float32))
             statistics = usable_statistics(dataset.meta.stats, dataset.meta.features)
             config.fit_to_actions(actions, statistics[ACTION_KEY])
         if hasattr(config, "fit_to_rewards"):
-            config.fit_to_rewards(_columns_trained_on(dataset))
+            config.fit_to_rewards(dataset.columns_used)
         if not masks_padding(config):
             _leave_out_tails(config)
-    return config
 
 
 def _leave_out_tails(config: Any) -> None:
@@ -122,14 +131,7 @@ def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
     return config
 
 
-def _columns_trained_on(dataset: TrainingDataset) -> dict[str, NDArray[Any]]:
-    """Return field -> (N, …) of the frames of the episodes that are trained on."""
-    columns = read_columns(dataset.root)
-    chosen = ~np.isin(columns["episode_index"], dataset.left_out)
-    return {key: values[chosen] for key, values in columns.items()}
-
-
-def _check_features(config: Any, dataset: TrainingDataset) -> None:
+def _check_features(config: Any, dataset: OpenDataset) -> None:
     """Ask the policy whether it takes the dataset's fields, before anything is built."""
     try:
         copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
@@ -139,7 +141,7 @@ def _check_features(config: Any, dataset: TrainingDataset) -> None:
         raise SpecMismatchError(f"{dataset.root} does not fit the policy: {exc}") from exc
 
 
-def _set_window(config: Any, dataset: TrainingDataset) -> None:
+def _set_window(config: Any, dataset: OpenDataset) -> None:
     """Let the history of a policy with a memory reach back to the beginning of every episode."""
     longest = max(dataset.lengths)
     if config.window_steps is None:
@@ -168,7 +170,7 @@ def masks_padding(config: Any) -> bool:
     return bool(getattr(config, "do_mask_loss_for_padding", True))
 
 
-def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
+def used_frames(config: Any, dataset: OpenDataset) -> UsedFrames:
     """Return the number of frames that are trained on.
 
     Raises:
@@ -186,18 +188,12 @@ def used_frames(config: Any, dataset: TrainingDataset) -> UsedFrames:
     return used
 
 
-def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
-    assert recipe.base_checkpoint is not None
-    folder = find_checkpoint(Path(recipe.base_checkpoint))
+def _base_config(recipe: FinetuneRecipe, cls: Any, folder: Path) -> dict[str, Any]:
     refuse_built_in_normalization(folder)
-    for name in (
-        PREPROCESSOR_FILE,
-        POSTPROCESSOR_FILE,
-    ):  # what they normalise by is replaced, their steps are not
+    for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):  # their steps are kept, their statistics replaced
         read_saved_processor(folder / name)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
-    cls = config_class(recipe.type, where="finetune.type")
     expected = dict.fromkeys((family_of(recipe.type).lerobot_type, recipe.type))
     if kind not in expected:
         raise RecipeError(
@@ -209,7 +205,7 @@ def _base_config(recipe: FinetuneRecipe) -> dict[str, Any]:
     return {**data, "use_peft": False, "pretrained_path": None}
 
 
-def _set_features(config: Any, recipe: FinetuneRecipe, dataset: TrainingDataset) -> None:
+def _set_features(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) -> None:
     """Let the policy expect just what the dataset has, under the base's names."""
     for field in recipe.rename_cameras:
         if field not in CAMERA_KEYS.values():

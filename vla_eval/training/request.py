@@ -14,9 +14,8 @@ from vla_eval.config.finetuning import (
     merge_fields,
 )
 from vla_eval.config.policy import load_policy
-from vla_eval.data.imported import IMPORT_FILE
+from vla_eval.data.facts import KINDS
 from vla_eval.data.info_file import one_dataset
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE
 from vla_eval.errors import RecipeError
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
@@ -83,19 +82,14 @@ def compared_fields(recipe: FinetuneRecipe) -> dict[str, Any]:  # Any: plain dat
     return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
 
 
-def request_sha256(config: FinetuneConfig, recipe: FinetuneRecipe) -> str:
-    """Return a digest of all that the weights depend on: recipe, seed, base, and what the dataset records.
+def request_sha256(recipe: FinetuneRecipe, dataset: Path, base_sha256: str | None, *, run_seed: int) -> str:
+    """Return a digest of all that the weights depend on: recipe, seed, base, and the dataset's facts.
 
     Where it is as it was, so are the settings of the run. Where it is not, they may be all the same.
-
-    Raises:
-        VlaEvalError: there is no such dataset or base.
     """
-    folder = one_dataset(Path(config.dataset))
-    files = [folder / name for name in (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE)]  # digests of all others
-    dataset = [file_sha256(file) for file in files if file.is_file()]
-    base = checkpoint_sha256(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None
-    return digest_of([compared_fields(recipe), config.run_seed, dataset, folder.resolve().name, base])
+    files = [dataset / kind.file for kind in KINDS]  # digests of all others
+    facts = [file_sha256(file) for file in files if file.is_file()]
+    return digest_of([compared_fields(recipe), run_seed, facts, dataset.resolve().name, base_sha256])
 
 
 def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
@@ -109,7 +103,9 @@ def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
     if step != recipe.steps:
         return None
     record = read_record(out)
-    if record.get(REQUEST_KEY) != request_sha256(config, recipe):
+    dataset = one_dataset(Path(config.dataset))
+    base = checkpoint_sha256(Path(recipe.base_checkpoint)) if recipe.base_checkpoint else None
+    if record.get(REQUEST_KEY) != request_sha256(recipe, dataset, base, run_seed=config.run_seed):
         return None
     if config.held_out is not None:
         tasks = record.get("tasks")

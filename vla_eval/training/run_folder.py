@@ -20,8 +20,9 @@ from typing import Any
 from vla_eval.checkpoints.files import LAST, step_folders
 from vla_eval.config.finetuning import LOGGERS
 from vla_eval.errors import TrainingError
-from vla_eval.storage.durable import replace_file
-from vla_eval.storage.run_file import JsonValue, find_changes
+from vla_eval.storage.durable import read_lines, replace_file, whole_lines
+from vla_eval.storage.folders import other_files
+from vla_eval.storage.run_file import JsonValue, find_changes, listed
 from vla_eval.strict.json_text import Source, read_file, read_json, read_version, shown
 
 FORMAT_VERSION = 1
@@ -65,23 +66,21 @@ def open_folder(
     Raises:
         TrainingError: the folder holds other files, or a run with other settings.
     """
-    file = path / RUN_FILE
     path.mkdir(parents=True, exist_ok=True)
-    if {entry.name for entry in path.iterdir()} <= ignore:
-        data = {"format_version": FORMAT_VERSION, COMPARED: settings, **record}
-        replace_file(file, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
+    names = set(os.listdir(path))
+    if names <= ignore:
+        _save(path, {COMPARED: settings, **record})
         return None
-    if not file.is_file():
-        raise TrainingError(f"{path}: holds other files and no {RUN_FILE}. Use another --out.")
+    if not (path / RUN_FILE).is_file():
+        raise other_files(path, names - ignore, missing=RUN_FILE, error=TrainingError)
     known = read_record(path)
-    changes = find_changes(_settings(known, file), settings, prefix="")
+    changes = find_changes(_settings(known, path / RUN_FILE), settings, prefix="")
     if [change.path for change in changes] == [f"{RECIPE}.{STEPS}"]:
         _change_steps(path, known, settings, record, check_steps)
     elif changes:
-        listed = "\n".join(f"  {change}" for change in changes)
         raise TrainingError(
-            f"{path}: this fine-tuning was started with other settings:\n{listed}\nUse another --out, or "
-            f"restore the old settings to resume."
+            f"{path}: this fine-tuning was started with other settings:\n{listed(changes)}\nUse another "
+            f"--out, or restore the old settings to resume."
         )
     return newest_checkpoint(path)
 
@@ -96,14 +95,16 @@ def _change_steps(
     """Let a run have another number of steps, and write down that it was changed."""
     before, done = known[COMPARED][RECIPE].get(STEPS), newest_step(path)
     if type(before) is not int:
-        raise _source(str(path / RUN_FILE), "the description of a fine-tuning").refuse(
-            f"{STEPS} {shown(before)}", "expected a whole number"
-        )
+        raise _source(path / RUN_FILE).refuse(f"{STEPS} {shown(before)}", "expected a whole number")
     if done:
         check_steps(before, done)
     entry = {"before": before, "at": done, **{name: record[name] for name in ("environment", "command")}}
-    data = {"format_version": FORMAT_VERSION, **known, COMPARED: settings, REQUEST_KEY: record[REQUEST_KEY]}
-    data[STEPS_CHANGED] = [*known.get(STEPS_CHANGED, ()), entry]
+    data = {**known, COMPARED: settings, REQUEST_KEY: record[REQUEST_KEY]}
+    _save(path, {**data, STEPS_CHANGED: [*known.get(STEPS_CHANGED, ()), entry]})
+
+
+def _save(path: Path, record: Mapping[str, JsonValue]) -> None:
+    data = {"format_version": FORMAT_VERSION, **record}
     replace_file(path / RUN_FILE, f"{json.dumps(data, indent=2, ensure_ascii=False)}\n")
 
 
@@ -113,11 +114,11 @@ def read_record(path: Path) -> dict[str, Any]:  # Any: JSON
     Raises:
         TrainingError: it is damaged.
     """
-    file, what = path / RUN_FILE, "the description of a fine-tuning"
+    file = path / RUN_FILE
     if not file.is_file():
         return {}
-    source = _source(str(file), what)
-    data = read_json(_read(file, what), source)
+    source = _source(file)
+    data = read_json(read_file(file, source), source)
     read_version(data, "format_version", FORMAT_VERSION, source)
     changes = data.get(STEPS_CHANGED, [])
     if not isinstance(changes, list) or not all(
@@ -175,19 +176,12 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
         TrainingError: a line is damaged.
     """
     file = path / METRICS_FILE
-    if file.is_file():
-        what = "a line of metrics"
-        for number, line in enumerate(_read(file, what).split(b"\n")[:-1], start=1):
-            try:
-                values = json.loads(line)  # not strict: a loss may be NaN
-                steps = values["step"]
-            except (ValueError, KeyError, TypeError, RecursionError) as exc:
-                raise _source(f"{file}:{number}", what).refuse(shown(line), exc) from exc
-            if type(steps) is not int:
-                raise _source(f"{file}:{number}", what).refuse(
-                    f"step {shown(steps)}", "expected a whole number"
-                )
-            yield values
+    for line, where in whole_lines(read_lines(file), file):
+        source = _source(where, "a line of metrics")
+        values = read_json(line, source, non_finite=True)  # a loss may be NaN
+        if type(values.get("step")) is not int:
+            raise source.refuse(f"step {shown(values.get('step'))}", "expected a whole number")
+        yield values
 
 
 def point(link: Path, target: str) -> None:
@@ -215,28 +209,19 @@ def _settings(record: dict[str, Any], file: Path) -> dict[str, Any]:  # Any: JSO
     """Return what the run of this `finetune.json` was started with, loggers left out."""
     settings = record.get(COMPARED)
     if not isinstance(settings, dict) or not isinstance(settings.get(RECIPE), dict):
-        raise _source(str(file), "the description of a fine-tuning").refuse(
-            f"{COMPARED} {shown(settings)}", f"expected a mapping that holds {RECIPE}"
-        )
+        problem = f"expected a mapping that holds {RECIPE}"
+        raise _source(file).refuse(f"{COMPARED} {shown(settings)}", problem)
     recipe = {name: value for name, value in settings[RECIPE].items() if name not in LOGGERS}
     return {**settings, RECIPE: recipe}
 
 
-def _read(file: Path, what: str) -> bytes:
-    return read_file(file, _source(str(file), what))
-
-
-def _source(where: str, what: str) -> Source:
+def _source(where: Path | str, what: str = "the description of a fine-tuning") -> Source:
     remedy = "The file was changed by something else; restore it, or use another --out."
-    return Source(where=where, what=what, remedy=remedy, error=TrainingError)
+    return Source(where=str(where), what=what, remedy=remedy, error=TrainingError)
 
 
 def _cut_metrics(path: Path, step: int) -> None:
     """Drop the lines of steps that will be run again."""
-    if not path.is_file():
-        return
-    kept = []
-    for line in read_metrics(path.parent):  # what follows the last newline was being written
-        if line["step"] <= step:
-            kept.append(line)
-    replace_file(path, "".join(f"{json.dumps(line)}\n" for line in kept))
+    if path.is_file():
+        kept = [line for line in read_metrics(path.parent) if line["step"] <= step]
+        replace_file(path, "".join(f"{json.dumps(line)}\n" for line in kept))

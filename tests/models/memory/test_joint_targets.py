@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training.fitted_policies import policy_config
 from vla_eval.checkpoints.files import read_facts
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.dataset import DatasetRecipe
@@ -28,7 +29,6 @@ from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.tasks.interface import env_spec
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
-from vla_eval.training.policy_config import policy_config
 
 TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}
 

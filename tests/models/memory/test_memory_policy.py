@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.models.sample_frames import BASE, WRIST, at, between, frames
+from tests.training.fitted_policies import policy_config
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.files import load_recipe, to_data
@@ -25,7 +26,6 @@ from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
-from vla_eval.training.policy_config import policy_config
 
 TASK = "RememberColor3-v0"
 TINY = {"channels": 4, "heads": 2, "key": 4, "memory": 8, "hidden": 16, "chunk_size": 3, "n_action_steps": 2}

@@ -8,6 +8,7 @@ import torch
 
 from tests.models.sample_frames import BASE, WRIST, at, between, frames
 from tests.models.sequence.test_sequence_parts import SMALL_OPTIONS
+from tests.training.fitted_policies import policy_config
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
@@ -17,7 +18,6 @@ from vla_eval.models.episodes.samples import Episodes, episodes_of
 from vla_eval.models.sequence.modeling_sequence import Demonstrated, MikasaSequencePolicy
 from vla_eval.models.sequence.sizes import CORES
 from vla_eval.training.dataset import training_dataset
-from vla_eval.training.policy_config import policy_config
 
 TINY = {"width": 16, "heads": 2, "context_steps": 2, "chunk_size": 3, "n_action_steps": 2}
 RETURNS = {"tokens": "return_observation_action", "reward": "sparse"}

@@ -16,6 +16,7 @@ from torch import Tensor
 from tests.models.golden_values import GoldenFields
 from tests.models.spatialvla import spatialvla_golden as golden
 from tests.models.stored_frames import StoredFrames, context, executed
+from tests.training.fitted_policies import policy_config
 from vla_eval.checkpoints.conversion import convert
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
 from vla_eval.checkpoints.verify import verify_checkpoint
@@ -33,7 +34,6 @@ from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, NetworkSizes
 from vla_eval.models.spatialvla.weight_names import EMBEDDINGS, HEAD
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.training.dataset import training_dataset
-from vla_eval.training.policy_config import policy_config
 
 SMALL = {**golden.SMALL, **golden.DEPTH}
 (UNNORM_KEY,) = golden.config()["statistics"]

@@ -16,6 +16,7 @@ from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import FloatArray
 from vla_eval.data.dataset_folder import check_dataset, digest_files
 from vla_eval.data.exact_statistics import vector_statistics
+from vla_eval.data.facts import DatasetFacts
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.lerobot_tables import STATS_FILE
 from vla_eval.data.manifest import (
@@ -23,7 +24,6 @@ from vla_eval.data.manifest import (
     MANIFEST_FILE,
     MIKASA_FOLDER,
     RECORDING_FILE,
-    DatasetFacts,
     RecordedEpisode,
     read_failed,
     write_entry,

@@ -17,14 +17,15 @@ from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
 from vla_eval.data.derived.changed_actions import copy_with_actions
 from vla_eval.data.derived.converted_episode import convert_episode
 from vla_eval.data.derived.rebuild import failed_attempt
-from vla_eval.data.manifest import RecordedEpisode, read_facts, read_failed, read_manifest
+from vla_eval.data.facts import read_facts
+from vla_eval.data.manifest import RecordedEpisode, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.jobs import TaskPlan
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
 from vla_eval.data.recording.seed_queue import Selection
+from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.replaying.replay import check_task_versions, recipe_of
-from vla_eval.data.replaying.report import manifest_sha256
 from vla_eval.data.tables import read_columns
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError

@@ -6,7 +6,6 @@ new dataset appears whole or not at all. The sources stay as they are.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
@@ -15,33 +14,19 @@ from lerobot.datasets.io_utils import write_stats
 
 from vla_eval import __version__
 from vla_eval.data.check import require_checked
-from vla_eval.data.completeness import check_complete, files_sha256
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
-from vla_eval.data.imported import ImportFacts
-from vla_eval.data.manifest import DatasetFacts, read_failed, read_manifest
-from vla_eval.data.mixture import MixtureFacts, MixtureSource, write_mixture
-from vla_eval.data.opening import join_datasets, open_local_dataset
-from vla_eval.data.replaying.report import require_passed
+from vla_eval.data.facts import (
+    DatasetFacts,
+    MixtureFacts,
+    MixtureSource,
+)
+from vla_eval.data.manifest import MIXTURE_FILE, write_entry
+from vla_eval.data.opening import OpenDataset, join_datasets, open_dataset
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import whole_folder
 from vla_eval.storage.durable import storage_full
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Opened:
-    """A complete dataset of one task.
-
-    Attributes:
-        root: its folder.
-        facts: what it says of itself.
-        meta: lerobot's description of it.
-    """
-
-    root: Path
-    facts: DatasetFacts | ImportFacts
-    meta: Any
 
 
 def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
@@ -75,40 +60,39 @@ def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
                 files=digest_files(draft),
                 vla_eval_version=__version__,
             )
-            write_mixture(draft, facts)
+            write_entry(draft / MIXTURE_FILE, facts)
     except OSError as exc:
         raise storage_full(out, exc) from exc
     return facts
 
 
-def _open(root: Path) -> _Opened:
-    facts = check_complete(root)
-    if isinstance(facts, MixtureFacts):
-        names = ", ".join(source.name for source in facts.sources)
+def _open(root: Path) -> OpenDataset:
+    dataset = open_dataset(root)
+    if isinstance(dataset.facts, MixtureFacts):
+        names = ", ".join(source.name for source in dataset.facts.sources)
         raise DatasetError(f"{root}: is a mixture itself, of {names}. Name those instead.")
-    dataset = open_local_dataset(root)
-    require_checked(dataset, facts)
-    return _Opened(root=root, facts=facts, meta=dataset.meta)
+    require_checked(dataset)
+    return dataset
 
 
-def _source(opened: _Opened) -> MixtureSource:
-    root, facts, meta = opened.root, opened.facts, opened.meta
+def _source(opened: OpenDataset) -> MixtureSource:
+    facts, meta = opened.facts, opened.meta
     is_recorded = isinstance(facts, DatasetFacts)
     return MixtureSource(
-        name=root.resolve().name,
+        name=opened.name,
         task=facts.task,
         task_version=facts.task_version if isinstance(facts, DatasetFacts) else None,
         instructions=tuple(sorted(str(sentence) for sentence in meta.tasks.index)),
         n_episodes=int(meta.total_episodes),
         n_frames=int(meta.total_frames),
-        sha256=files_sha256(facts.files),
-        seeds=tuple(episode.seed for episode in read_manifest(root)) if is_recorded else None,
-        failed_seeds=tuple(failed.seed for failed in read_failed(root)) if is_recorded else (),
-        was_replayed=is_recorded and require_passed(root) is not None,
+        sha256=opened.sha256,
+        seeds=tuple(episode.seed for episode in opened.manifest) if is_recorded else None,
+        failed_seeds=tuple(failed.seed for failed in opened.failed_seeds),
+        was_replayed=opened.was_replayed,
     )
 
 
-def _refuse_difference(first: _Opened, other: _Opened) -> None:
+def _refuse_difference(first: OpenDataset, other: OpenDataset) -> None:
     """Raise `DatasetError` where two datasets differ in what a policy sees or does."""
     expected, found = _form(first), _form(other)
     for what in {**expected, **found}:
@@ -119,7 +103,7 @@ def _refuse_difference(first: _Opened, other: _Opened) -> None:
             )
 
 
-def _form(opened: _Opened) -> dict[str, Any]:
+def _form(opened: OpenDataset) -> dict[str, Any]:
     """Return what has to be alike: name -> value. How frames were encoded may differ."""
     features: dict[str, Any] = opened.meta.features
     return {

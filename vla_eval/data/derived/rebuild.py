@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vla_eval.data.manifest import FAILED_FILE, RecordedEpisode, read_facts, read_failed, read_manifest
+from vla_eval.data.facts import read_facts
+from vla_eval.data.manifest import FAILED_FILE, RecordedEpisode, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, run_plan
 from vla_eval.data.recording.seed_queue import Selection
+from vla_eval.data.replay_report import manifest_sha256
 from vla_eval.data.replaying.replay import check_task_versions, recipe_of
-from vla_eval.data.replaying.report import manifest_sha256
 from vla_eval.errors import DatasetError
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL

@@ -11,15 +11,16 @@ from typing import Any  # arrays of several types
 import numpy as np
 
 from vla_eval.data.checks.rules import require_sound
+from vla_eval.data.facts import ImportFacts
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.changes import Changes, prepare
 from vla_eval.data.foreign.episodes import JOINTS_KEY, Source, SourceEpisode
 from vla_eval.data.foreign.import_writer import ImportWriter
 from vla_eval.data.foreign.lerobot_files import lerobot_source
 from vla_eval.data.foreign.npz_files import npz_files, npz_source
-from vla_eval.data.imported import ImportFacts
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import RECORDING_FILE
+from vla_eval.data.opening import LocalDataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY, DONE_KEY, REWARD_KEY, SUCCESS_KEY, StateKind
 from vla_eval.storage.drafts import whole_folder
@@ -37,7 +38,7 @@ def find_source(path: Path) -> Source:
     """
     check_folder(path)
     if (path / INFO_FILE).is_file():
-        return lerobot_source(path)
+        return lerobot_source(LocalDataset(path))
     npz = npz_files(path)
     if not npz:
         raise DatasetError(

@@ -13,6 +13,7 @@ from vla_eval.core import FloatArray
 from vla_eval.data.checks.demonstrated import Numbers
 from vla_eval.data.dataset_folder import digest_file, digest_files
 from vla_eval.data.exact_statistics import count_levels, empty_histogram
+from vla_eval.data.facts import ImportedEpisode, ImportFacts
 from vla_eval.data.foreign.episodes import (
     EEF_KEY,
     JOINTS_KEY,
@@ -22,7 +23,7 @@ from vla_eval.data.foreign.episodes import (
     Source,
     SourceEpisode,
 )
-from vla_eval.data.imported import ImportedEpisode, ImportFacts, write_import
+from vla_eval.data.manifest import IMPORT_FILE, write_entry
 from vla_eval.data.recording.shard_writer import new_dataset, write_exact_statistics
 from vla_eval.errors import DatasetError
 from vla_eval.features import (
@@ -122,7 +123,7 @@ class ImportWriter:
             converted=converted,
             kept=kept,
         )
-        write_import(self._draft, facts)
+        write_entry(self._draft / IMPORT_FILE, facts)
         return facts
 
 

@@ -21,9 +21,15 @@ from vla_eval.data.foreign.episodes import (
     Source,
     SourceEpisode,
 )
-from vla_eval.data.frames.frame_cache import EpisodeRows, FrameSource, channels_first, decode_camera
-from vla_eval.data.opening import UNREADABLE, open_local_dataset, reason
-from vla_eval.data.tables import Columns, read_columns
+from vla_eval.data.frames.frame_cache import (
+    EpisodeRows,
+    FrameSource,
+    channels_first,
+    decode_camera,
+    episode_rows,
+)
+from vla_eval.data.opening import UNREADABLE, LocalDataset, reason
+from vla_eval.data.tables import Columns
 from vla_eval.errors import DatasetError, did_you_mean
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
 
@@ -37,16 +43,15 @@ OF_LEROBOT = frozenset({"timestamp", "frame_index", "episode_index", "index", "t
 OF_JOINTS = re.compile(r"joint|motor|\.pos$|shoulder|elbow|wrist_(flex|roll)", re.IGNORECASE)
 
 
-def lerobot_source(root: Path) -> Source:
+def lerobot_source(opened: LocalDataset) -> Source:
     """Read a dataset without its images.
 
     Raises:
         DatasetError: it is damaged, or its fields are not those of a layout that can be read.
     """
-    dataset = open_local_dataset(root)
+    root, dataset, columns = opened.root, opened.whole, opened.columns
     features = dataset.meta.features
     layout = lerobot_layout(features, where=root)
-    columns = read_columns(root)
     numbers, remarks = _numbers(root, columns, features)
     cameras = LEROBOT_CAMERAS[layout]
     used = {*cameras, *numbers, *OF_LEROBOT, STATE_KEY}
@@ -60,7 +65,7 @@ def lerobot_source(root: Path) -> Source:
         files=files,
         fps=dataset.meta.fps,
         episodes=tuple(
-            _episode(dataset, rows, numbers, columns, cameras) for rows in _rows(dataset, columns)
+            _episode(dataset, rows, numbers, columns, cameras) for rows in episode_rows(dataset, columns)
         ),
         left_out=tuple(sorted(set(features) - used)),
         remarks=remarks,
@@ -167,17 +172,6 @@ def _check_vector(
             f"{meaning}. Nothing is computed from joints alone."
         )
     return (f"the {n_dims} numbers of {name} ({', '.join(names)}) are read as {meaning}",)
-
-
-def _rows(dataset: Any, columns: Columns) -> list[EpisodeRows]:
-    times_s = columns["timestamp"]
-    ends = dataset.meta.episodes
-    return [
-        EpisodeRows(index=index, first=first, stop=stop, timestamps_s=tuple(times_s[first:stop].tolist()))
-        for index, (first, stop) in enumerate(
-            zip(ends["dataset_from_index"], ends["dataset_to_index"], strict=True)
-        )
-    ]
 
 
 def _episode(

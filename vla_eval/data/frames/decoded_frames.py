@@ -6,7 +6,7 @@ take 470 MiB, which a memory map serves from the page cache to any number of loa
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args  # Any: lerobot and datasets are untyped
+from typing import Any, Literal, get_args  # Any: lerobot, datasets and pyarrow are untyped
 
 import numpy as np
 import torch
@@ -14,13 +14,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.core import ImageArray
 from vla_eval.data.frames.frame_cache import (
-    EpisodeRows,
-    FrameSource,
-    channels_first,
+    frame_source,
     frames_in_ram,
     frames_on_disk,
 )
 from vla_eval.data.rewards import rewards_of
+from vla_eval.data.tables import as_array, holds_numbers
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, RewardKind
 from vla_eval.models.shared.levels import in_numbers
@@ -28,13 +27,7 @@ from vla_eval.strict.renamed import warn_renamed
 
 Storage = Literal["disk", "ram"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence
-
-
-class FrameLayout(NamedTuple):
-    """(N, 2) first and stop row of each sample's episode, and what has to be decoded."""
-
-    bounds: torch.Tensor
-    frames: FrameSource
+TENSOR_TYPES = {"b": np.bool_, "i": np.int64, "u": np.int64, "f": np.float32}
 
 
 class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
@@ -79,19 +72,21 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         self._deltas: Mapping[str, list[int]] | None = reader.delta_indices
         self._transforms: Callable[[Any], Any] | None = reader._image_transforms
         self._return_uint8 = bool(reader._return_uint8)
-        self._columns = read_columns(source)
+        self._columns = _columns(source)
         check_names("field", self._deltas or (), source.meta.features, where="delta_timestamps")
-        self._bounds, frame_source = frame_layout(source, self._columns)
+        frames = frame_source(source, self._columns)
+        rows = [(one.first, one.stop) for one in frames.episodes for _ in one.timestamps_s]
+        self._bounds = torch.tensor(rows, dtype=torch.long).reshape(-1, 2)  # of each sample's episode
         if reward is not None:
             rewards = rewards_of(self._columns, self._bounds, reward, root=source.root)
             self._columns[REWARD_KEY] = rewards
         self._files: dict[str, Path] = {}
         self._frames: dict[str, Any] = {}  # Any: a memory map, or a tensor that processes can share
         if storage == "disk":
-            self._files = frames_on_disk(frame_source, cache)
+            self._files = frames_on_disk(frames, cache)
             self._open()
         else:
-            arrays = frames_in_ram(frame_source)
+            arrays = frames_in_ram(frames)
             self._frames = {camera: torch.from_numpy(array) for camera, array in arrays.items()}
 
     @property
@@ -189,10 +184,10 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         return frames if self._transforms is None else self._transforms(frames)
 
 
-def read_columns(source: LeRobotDataset) -> dict[str, Any]:
-    """Return column -> a tensor with one row per frame, or the list of values if they are no numbers.
+def _columns(source: LeRobotDataset) -> dict[str, Any]:
+    """Return column -> a tensor with one row per frame, or the list of values if they are not numbers.
 
-    `torch.tensor` of Python numbers, as lerobot's own transform does it row by row: same types.
+    Types as lerobot's own transform, `torch.tensor` of Python numbers, has them.
     """
     refused = [key for key in source.meta.camera_keys if key not in source.meta.video_keys]
     refused += list(source.meta.depth_keys)
@@ -201,42 +196,12 @@ def read_columns(source: LeRobotDataset) -> dict[str, Any]:
             f"{source.root}: the cameras {', '.join(refused)} are not RGB videos. Only those are decoded "
             f"ahead; use lerobot's own loader for this dataset."
         )
-    plain = source.hf_dataset.with_format(None)[:]
-    columns: dict[str, Any] = {}
-    for key, values in plain.items():
-        is_text = bool(values) and isinstance(values[0], str | dict | type(None))
-        columns[key] = values if is_text else torch.tensor(values)
-    return columns
+    table = source.hf_dataset.with_format("arrow")[:]
+    return {name: _tensor(table[name]) for name in table.column_names}
 
 
-def frame_layout(source: LeRobotDataset, columns: Mapping[str, Any]) -> FrameLayout:
-    """Return where the loaded dataset's frames are.
-
-    Args:
-        source: the dataset.
-        columns: see `read_columns`.
-
-    Raises:
-        DatasetError: the frames of an episode do not follow each other.
-    """
-    indices, numbers = columns["index"].tolist(), columns["episode_index"].tolist()
-    times_s = columns["timestamp"].tolist()
-    bounds = torch.empty((len(indices), 2), dtype=torch.long)
-    episodes = []
-    row = 0
-    while row < len(indices):
-        ends = source.meta.episodes[numbers[row]]
-        stop = row + ends["dataset_to_index"] - ends["dataset_from_index"]
-        expected = list(range(ends["dataset_from_index"], ends["dataset_to_index"]))
-        if indices[row:stop] != expected:
-            raise DatasetError(
-                f"{source.root}: the frames of episode {numbers[row]} are not numbered {expected[0]} to "
-                f"{expected[-1]} in a row. The files in data/ and meta/episodes/ are not of one dataset."
-            )
-        bounds[row:stop] = torch.tensor([row, stop])
-        episodes.append(
-            EpisodeRows(index=numbers[row], first=row, stop=stop, timestamps_s=tuple(times_s[row:stop]))
-        )
-        row = stop
-    shapes = {key: channels_first(source.meta.features[key]) for key in source.meta.video_keys}
-    return FrameLayout(bounds, FrameSource(dataset=source, shapes=shapes, episodes=episodes))
+def _tensor(column: Any) -> Any:  # Any: pyarrow.ChunkedArray; a tensor, or a list
+    if not holds_numbers(column):
+        return column.to_pylist()
+    values = as_array(column)
+    return torch.from_numpy(np.array(values, dtype=TENSOR_TYPES[values.dtype.kind]))

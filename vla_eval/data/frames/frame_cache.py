@@ -78,6 +78,41 @@ class FrameSource:
         return self.n_frames * sum(int(np.prod(shape)) for shape in self.shapes.values())
 
 
+def episode_rows(dataset: Any, columns: Mapping[str, Any]) -> list[EpisodeRows]:
+    """Return where the episodes of a loaded dataset are.
+
+    Args:
+        dataset: a `LeRobotDataset`, of which some episodes may be selected.
+        columns: its `index`, `episode_index` and `timestamp`, as arrays or tensors of loaded rows.
+
+    Raises:
+        DatasetError: the frames of an episode do not follow each other.
+    """
+    indices, numbers, times_s = (columns[key].tolist() for key in ("index", "episode_index", "timestamp"))
+    episodes = []
+    row = 0
+    while row < len(indices):
+        ends = dataset.meta.episodes[numbers[row]]
+        expected = list(range(ends["dataset_from_index"], ends["dataset_to_index"]))
+        stop = row + len(expected)
+        if indices[row:stop] != expected:
+            raise DatasetError(
+                f"{dataset.root}: the frames of episode {numbers[row]} are not numbered {expected[0]} to "
+                f"{expected[-1]} in a row. The files in data/ and meta/episodes/ are not of one dataset."
+            )
+        episodes.append(
+            EpisodeRows(index=numbers[row], first=row, stop=stop, timestamps_s=tuple(times_s[row:stop]))
+        )
+        row = stop
+    return episodes
+
+
+def frame_source(dataset: Any, columns: Mapping[str, Any]) -> FrameSource:
+    """Return what has to be decoded of a loaded dataset; see `episode_rows`."""
+    shapes = {key: channels_first(dataset.meta.features[key]) for key in dataset.meta.video_keys}
+    return FrameSource(dataset=dataset, shapes=shapes, episodes=episode_rows(dataset, columns))
+
+
 def dataset_digest(source: FrameSource) -> str:
     """Return a digest of all that the decoded frames depend on: files, selection, decoder."""
     root = Path(source.dataset.root)

@@ -12,6 +12,7 @@ Only the parent process writes here, but for shards and datasets. Knows nothing 
 
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,18 +23,16 @@ from vla_eval.data.manifest import RECORDING_FILE
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.continuing import continued, without_device
-from vla_eval.storage.durable import LineFile, sync_folder
-from vla_eval.storage.episodes_file import cut_tail, read_lines
-from vla_eval.storage.run_file import (
-    DEVICE,
-    RUN_FILE,
-    JsonValue,
-    RunDescription,
-    RunFile,
-    environment_changed,
-    find_changes,
+from vla_eval.storage.continuing import (
+    check_allowed,
+    continued,
+    device_changes,
+    known_device,
+    without_device,
 )
+from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder, whole_lines
+from vla_eval.storage.folders import other_files
+from vla_eval.storage.run_file import RUN_FILE, JsonValue, RunDescription, RunFile
 from vla_eval.storage.starting import StartedFolder, starting
 from vla_eval.strict.json_text import Source, as_dataclass, read_json
 
@@ -115,13 +114,8 @@ class RecordingFolder:
         Raises:
             RunChangedError: it is another one than before, and changes are not allowed.
         """
-        changes = find_changes(
-            {name: value for name, value in self.device.items() if name in device},
-            {name: value for name, value in device.items() if name in self.device},
-            prefix=f"environment.{DEVICE}",
-        )
-        if changes and not allow_change:
-            raise environment_changed(changes, self.out)
+        changes = device_changes(self._run_file, device)
+        check_allowed(changes, shown=self.out, allowed=allow_change)
         if dict(device) != self.device:
             self._run_file = self._run_file.with_device({**self.device, **device}, changes)
             self._run_file.save(self.out / STATE_FOLDER)
@@ -178,8 +172,7 @@ def read_attempts(out: Path, task: str) -> dict[int, Attempt]:
         DatasetError: the file is damaged.
     """
     path = out / STATE_FOLDER / task / ATTEMPTS_FILE
-    lines = read_lines(path).split(b"\n")[:-1]
-    found = [_attempt(line, where=f"{path}:{i}") for i, line in enumerate(lines, start=1)]
+    found = [_attempt(line, where=where) for line, where in whole_lines(read_lines(path), path)]
     return {one.seed: one for one in found}
 
 
@@ -190,8 +183,7 @@ def shard_path(out: Path, task: str, index: int) -> Path:
 
 def device_of(run_file: RunFile) -> dict[str, str]:
     """Return what is known of the device that renders the images."""
-    device = run_file.description.environment.get(DEVICE)
-    return {name: str(value) for name, value in device.items()} if isinstance(device, Mapping) else {}
+    return {name: str(value) for name, value in known_device(run_file).items()}
 
 
 def remove_shards(out: Path, task: str) -> None:
@@ -204,13 +196,8 @@ def _refuse_foreign(out: Path) -> None:
         raise RunFolderError(f"{out}: expected a folder, found a file. Use another --out.")
     if not out.exists() or (out / STATE_FOLDER).exists():
         return
-    names = sorted(entry.name for entry in out.iterdir())
-    if names:
-        shown = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
-        raise RunFolderError(
-            f"{out}: holds other files ({shown}) and no recording: nothing is written into it. Use another "
-            f"--out."
-        )
+    if names := os.listdir(out):
+        raise other_files(out, names, missing="recording", error=RunFolderError)
 
 
 def _attempt(line: bytes, *, where: str) -> Attempt:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
 from vla_eval.config.files import content_of
 from vla_eval.core import EpisodeStart
-from vla_eval.data.manifest import DatasetFacts, FailedSeed
+from vla_eval.data.facts import DatasetFacts
+from vla_eval.data.manifest import FailedSeed
 from vla_eval.data.recording.demonstrations import SLOT, Attempt
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.storage.run_file import JsonValue

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.config.dataset import DatasetRecipe
-from vla_eval.data.manifest import DatasetFacts
+from vla_eval.data.facts import DatasetFacts
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import (
     ATTEMPTS_FILE,
@@ -94,10 +94,7 @@ def merge_recordings(folders: Sequence[Path], *, allow_environment_change: bool 
             that is allowed, environments; or an expert has acted differently.
         VlaEvalError: the recipe cannot be planned here; a file is damaged.
     """
-    parts = []
-    for folder in folders:
-        stored = RunFile.load(folder / STATE_FOLDER)
-        parts.append(as_part(folder, stored.description, stored.sessions))
+    parts = [as_part(folder, RunFile.load(folder / STATE_FOLDER)) for folder in folders]
     run_file = merge_descriptions(parts, allow_environment_change=allow_environment_change)
     tasks = tuple(_merge_task(task, parts) for task in _plan(run_file, folders[0]))
     missing = (*missing_shards(parts), *(line for task in tasks for line in task.missing))
@@ -152,7 +149,7 @@ def _merge_task(task: TaskPlan, parts: Sequence[ShardPart]) -> MergedTask:
     for other in tried[1:]:
         _refuse_other_attempts(task, tried[0], other)
     missing = [
-        f"{_of_task(task, part)}: not all seeds are tried. To resume: {part.sessions[-1].command}"
+        f"{_of_task(task, part)}: not all seeds are tried. To resume: {part.run_file.sessions[-1].command}"
         for part in parts
         if selections[part.path] is None
     ]
@@ -166,7 +163,7 @@ def _merge_task(task: TaskPlan, parts: Sequence[ShardPart]) -> MergedTask:
             if path.is_dir():
                 shards[index] = path
             elif selections[part.path] is not None:
-                command = part.sessions[-1].command
+                command = part.run_file.sessions[-1].command
                 missing.append(f"{_of_task(task, part)}: {path.name} is not rendered. To resume: {command}")
     return MergedTask(
         plan=task,

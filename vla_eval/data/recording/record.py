@@ -17,7 +17,8 @@ from typing import Literal, Protocol, Self
 
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe
 from vla_eval.config.files import content_of, options_of
-from vla_eval.data.manifest import DatasetFacts, FailedSeed, read_facts, read_failed, read_manifest
+from vla_eval.data.facts import DatasetFacts, read_facts
+from vla_eval.data.manifest import FailedSeed, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import RecordingFolder
 from vla_eval.data.recording.jobs import (

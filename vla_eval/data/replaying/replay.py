@@ -16,17 +16,10 @@ from typing import Literal, NamedTuple, Protocol
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
-from vla_eval.data.manifest import (
-    MIXTURE_FILE,
-    RECORDING_FILE,
-    DatasetFacts,
-    RecordedEpisode,
-    ReplayReport,
-    read_facts,
-    read_manifest,
-)
+from vla_eval.data.facts import DatasetFacts, read_facts
+from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, RecordedEpisode, ReplayReport, read_manifest
+from vla_eval.data.replay_report import keep_report, manifest_sha256
 from vla_eval.data.replaying.episode_check import STATE_TOLERANCE
-from vla_eval.data.replaying.report import keep_report, manifest_sha256
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.storage.provenance import collect_environment

@@ -12,8 +12,9 @@ from huggingface_hub import DatasetCard, DatasetCardData
 
 from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.data.exact_statistics import RESOLUTION, about_still_dimensions
-from vla_eval.data.manifest import MANIFEST_FILE, DatasetFacts
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.facts import DatasetFacts, ImportFacts, MixtureFacts
+from vla_eval.data.manifest import MANIFEST_FILE
+from vla_eval.data.opening import open_dataset
 from vla_eval.data.sharing.summary import DatasetSummary, draw_sheet, summarize
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
 from vla_eval.storage.durable import replace_file
@@ -37,27 +38,26 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
         DatasetError: the dataset is not complete, or damaged.
         StorageFullError: the disk is full.
     """
-    summary = summarize(root)
+    summary = summarize(open_dataset(root))
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)
-    (root / SHEET_FILE).write_bytes(draw_sheet(root, summary))
-    meta = open_local_dataset(root).meta
-    still = tuple(about_still_dimensions(meta.stats, meta.features))
-    text = render_card(summary, license_id=license_id, still=still)
+    (root / SHEET_FILE).write_bytes(draw_sheet(summary))
+    text = _render(summary, license_id=license_id)
     replace_file(root / CARD_FILE, text)
     return text
 
 
-def render_card(
-    summary: DatasetSummary, *, license_id: str | None = None, still: tuple[str, ...] = ()
-) -> str:
-    """Return the card of a dataset; `still`: lines on the dimensions that hardly move."""
-    if license_id is None and _is_recorded_here(summary):
+def _render(summary: DatasetSummary, *, license_id: str | None = None) -> str:
+    """Return the card of a dataset."""
+    facts = summary.dataset.facts
+    if license_id is None and (
+        all(source.task_version is not None for source in facts.sources)
+        if isinstance(facts, MixtureFacts)
+        else isinstance(facts, DatasetFacts)
+    ):
         license_id = OWN_LICENSE
     sections = [f"# {_title(summary)}\n", _introduction(summary)]
     for heading, section in _SECTIONS.items():
         text = section(summary)
-        if section is _statistics:
-            text += "".join(f"\n- {markdown_cell(line)}" for line in still) + ("\n" if still else "")
         if text:
             sections.append(f"## {heading}\n\n{text}")
     if license_id is None:
@@ -73,25 +73,18 @@ def render_card(
     return str(DatasetCard(f"---\n{data.to_yaml()}\n---\n\n{text}"))
 
 
-def _is_recorded_here(summary: DatasetSummary) -> bool:
-    if summary.mixture is not None:
-        return all(source.task_version is not None for source in summary.mixture.sources)
-    return summary.facts is not None
-
-
 def _title(summary: DatasetSummary) -> str:
-    if summary.mixture is not None:
-        n_tasks, n_sources = len(summary.mixture.tasks), len(summary.mixture.sources)
-        return f"{n_tasks} tasks of {n_sources} datasets: {len(summary.lengths)} demonstrations"
-    task = summary.facts.task if summary.facts else summary.imported.task if summary.imported else None
-    n_episodes = len(summary.lengths)
+    facts, n_episodes = summary.dataset.facts, len(summary.lengths)
+    if isinstance(facts, MixtureFacts):
+        return f"{len(facts.tasks)} tasks of {len(facts.sources)} datasets: {n_episodes} demonstrations"
     all_succeed = summary.n_success in (None, n_episodes)
     what = "demonstrations" if all_succeed else f"episodes, {summary.n_success} with success"
-    return f"{markdown_cell(task or 'Imported demonstrations')}: {n_episodes} {what}"
+    return f"{markdown_cell(facts.task or 'Imported demonstrations')}: {n_episodes} {what}"
 
 
 def _introduction(summary: DatasetSummary) -> str:
-    task = find_task(summary.facts.task) if summary.facts else None
+    facts = summary.dataset.facts
+    task = find_task(facts.task) if isinstance(facts, DatasetFacts) else None
     about = f"{task.description} " if task else ""
     sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
     height_px, width_px = summary.image_size_px
@@ -111,15 +104,17 @@ def _statistics(summary: DatasetSummary) -> str:
         ("frames per episode", f"{lengths.min()} to {lengths.max()}, mean {lengths.mean():.1f}"),
         ("episodes with success", "not stored" if summary.n_success is None else str(summary.n_success)),
     ]
-    if summary.facts is not None:
-        seeds = [episode.seed for episode in summary.episodes]
-        experts = sorted({f"{one.expert}, version {one.expert_version}" for one in summary.episodes})
+    dataset = summary.dataset
+    still = [*about_still_dimensions(dataset.meta.stats, dataset.meta.features)]
+    if dataset.manifest:
+        seeds = [episode.seed for episode in dataset.manifest]
+        experts = sorted({f"{one.expert}, version {one.expert_version}" for one in dataset.manifest})
         rows += [
             ("seeds", f"{min(seeds)} to {max(seeds)}"),
-            ("seeds left out because the expert failed", _listed([one.seed for one in summary.failed])),
+            ("seeds left out because the expert failed", _listed([one.seed for one in dataset.failed_seeds])),
             (
                 "seeds kept although the expert failed",
-                _listed([one.seed for one in summary.episodes if one.success_step is None]),
+                _listed([one.seed for one in dataset.manifest if one.success_step is None]),
             ),
             ("expert", markdown_cell("; ".join(experts))),
         ]
@@ -134,6 +129,7 @@ def _statistics(summary: DatasetSummary) -> str:
         [
             *("| | |", "|:--|:--|", *lines, ""),
             *("| action | mean | std | min | max |", "|:--|--:|--:|--:|--:|", *per_dim, ""),
+            *((*(f"- {markdown_cell(line)}" for line in still), "") if still else ()),
         ]
     )
 
@@ -151,10 +147,9 @@ def _fields(summary: DatasetSummary) -> str:
 
 def _origin(summary: DatasetSummary) -> str:
     """Say how a recording came about, and what proves it."""
-    facts = summary.facts
-    if facts is None:
+    facts, replay = summary.dataset.facts, summary.dataset.replay
+    if not isinstance(facts, DatasetFacts):
         return ""
-    replay = summary.replay
     said = "not replayed yet (`mikasa-vla replay`)"
     if replay is not None:
         verdict = "passed" if replay.passed else f"FAILED ({len(replay.mismatches)} mismatches)"
@@ -185,8 +180,8 @@ def _origin(summary: DatasetSummary) -> str:
 
 def _import(summary: DatasetSummary) -> str:
     """Say where an import came from, and what it lacks."""
-    facts = summary.imported
-    if facts is None:
+    facts = summary.dataset.facts
+    if not isinstance(facts, ImportFacts):
         return ""
     lines = [
         f"- layout of the source: {markdown_code(facts.source_layout)}; digests of its files: "
@@ -206,7 +201,8 @@ def _import(summary: DatasetSummary) -> str:
 
 def _mixture(summary: DatasetSummary) -> str:
     """Say of which datasets a mixture was made."""
-    if summary.mixture is None:
+    facts = summary.dataset.facts
+    if not isinstance(facts, MixtureFacts):
         return ""
     rows = [
         (
@@ -219,7 +215,7 @@ def _mixture(summary: DatasetSummary) -> str:
             "yes" if one.was_replayed else "no",
             markdown_code(one.sha256),
         )
-        for one in summary.mixture.sources
+        for one in facts.sources
     ]
     lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     return (
@@ -227,14 +223,14 @@ def _mixture(summary: DatasetSummary) -> str:
         "seeds and the digests of all files. A mixture has no manifest: replay its sources.\n\n"
         "| dataset | task | rules | episodes | frames | seeds | replayed | sha256 |\n"
         f"|:--|:--|--:|--:|--:|:--|:--|:--|\n{lines}\n\nActions are for the control mode "
-        f"{markdown_code(summary.mixture.control_mode)}.\n"
+        f"{markdown_code(facts.control_mode)}.\n"
     )
 
 
 def _differences(summary: DatasetSummary) -> str:
     """Say how a recording differs from the data that the paper's policies were trained on."""
-    facts = summary.facts
-    if facts is None:
+    facts = summary.dataset.facts
+    if not isinstance(facts, DatasetFacts):
         return ""
     lines = [
         "- The simulation is a new implementation of the tasks, not the authors' code "

@@ -16,16 +16,16 @@ from huggingface_hub import HfApi
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 
-from vla_eval.data.completeness import check_complete
-from vla_eval.data.imported import IMPORT_FILE
-from vla_eval.data.manifest import MIXTURE_FILE, RECORDING_FILE, REPLAY_FILE
+from vla_eval.data.dataset_folder import check_complete
+from vla_eval.data.facts import KINDS
+from vla_eval.data.manifest import REPLAY_FILE
 from vla_eval.data.sharing.card import CARD_FILE, SHEET_FILE, write_card
 from vla_eval.errors import DatasetError
 from vla_eval.lock.switch import let_connect, let_write
 from vla_eval.storage.drafts import publish
 
 REPO_TYPE = "dataset"
-BESIDES = (RECORDING_FILE, IMPORT_FILE, MIXTURE_FILE, REPLAY_FILE, CARD_FILE, SHEET_FILE)
+BESIDES = (*(kind.file for kind in KINDS), REPLAY_FILE, CARD_FILE, SHEET_FILE)
 """Files that belong to a dataset but are not among those it has digests of."""
 PARTIAL_SUFFIX = ".partial"
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
+from vla_eval.data.facts import DatasetFacts, MixtureFacts, find_facts
 from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.foreign.episodes import EEF_KEY, JOINTS_KEY, SOURCE_PROPRIO_KEY, Source, SourceEpisode
 from vla_eval.data.foreign.import_writer import eef_of_proprio
-from vla_eval.data.imported import IMPORT_FILE, read_import
-from vla_eval.data.manifest import RECORDING_FILE, read_facts, read_manifest
-from vla_eval.data.mixture import read_mixture
+from vla_eval.data.manifest import read_manifest
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, StateKind
 
@@ -105,9 +104,9 @@ def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, S
         DatasetError: the dataset is one of several tasks, whose seeds are episodes of each.
     """
     root, n_episodes = source.path, len(source.episodes)
-    mixture = read_mixture(root)
-    if mixture is not None:
-        names = ", ".join(source.name for source in mixture.sources)
+    facts = find_facts(root)
+    if isinstance(facts, MixtureFacts):
+        names = ", ".join(source.name for source in facts.sources)
         raise DatasetError(
             f"{root}: was mixed of several datasets ({names}). Compare each of those with the evaluation's "
             "episodes of its task: mikasa-vla dataset check-leak DIR"
@@ -115,14 +114,13 @@ def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, S
     seeds: Sequence[int | None] = [episode.seed for episode in source.episodes]
     task: str | None = None
     simulator: Simulator = "maniskill"
-    if (root / RECORDING_FILE).is_file():
-        facts = read_facts(root)
+    if isinstance(facts, DatasetFacts):
         task = facts.task
         simulator = "fake" if facts.recipe.get("simulator") == "fake" else "maniskill"
         seeds = [episode.seed for episode in read_manifest(root)]
-    elif (root / IMPORT_FILE).is_file() and (imported := read_import(root)) is not None:
-        task = imported.task
-        seeds = [episode.source_seed for episode in imported.episodes]
+    elif facts is not None:
+        task = facts.task
+        seeds = [episode.source_seed for episode in facts.episodes]
     if len(seeds) != n_episodes:
         raise DatasetError(
             f"{root}: its tables hold {n_episodes} episodes, meta/mikasa describes {len(seeds)}. Fetch or "

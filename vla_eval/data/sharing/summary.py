@@ -1,29 +1,15 @@
 """Read from a dataset what its card says: lengths, success, actions, a few images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any  # lerobot is untyped
 
 import numpy as np
 
 from vla_eval.core import FloatArray
-from vla_eval.data.completeness import check_complete
 from vla_eval.data.exact_statistics import RESOLUTION
-from vla_eval.data.frames.decoded_frames import frame_layout, read_columns
-from vla_eval.data.frames.frame_cache import decode_camera
-from vla_eval.data.imported import ImportFacts
-from vla_eval.data.manifest import (
-    DatasetFacts,
-    FailedSeed,
-    RecordedEpisode,
-    ReplayReport,
-    read_failed,
-    read_manifest,
-    read_replay,
-)
-from vla_eval.data.mixture import MixtureFacts
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.frames.frame_cache import decode_camera, frame_source
+from vla_eval.data.opening import OpenDataset
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.viz.contact_sheet import SheetRow, contact_sheet
 
@@ -51,9 +37,7 @@ class DatasetSummary:
     """What a card is written from.
 
     Attributes:
-        facts, episodes, failed, replay: what a recording says of itself; None and empty for others.
-        imported: what a conversion says of itself; None for others.
-        mixture: of what the dataset was mixed; None for others.
+        dataset: what it summarises.
         lengths: (E,) frames per episode.
         n_success: episodes in which the success rule held at some frame; None if that is not stored.
         instructions: every sentence that occurs.
@@ -62,12 +46,7 @@ class DatasetSummary:
         image_size_px: height and width of the images.
     """
 
-    facts: DatasetFacts | None
-    episodes: tuple[RecordedEpisode, ...]
-    failed: tuple[FailedSeed, ...]
-    replay: ReplayReport | None
-    imported: ImportFacts | None
-    mixture: MixtureFacts | None
+    dataset: OpenDataset
     lengths: tuple[int, ...]
     n_success: int | None
     instructions: tuple[str, ...]
@@ -76,28 +55,15 @@ class DatasetSummary:
     image_size_px: tuple[int, int]
 
 
-def summarize(root: Path) -> DatasetSummary:
-    """Read a complete dataset.
-
-    Raises:
-        DatasetError: it is no finished recording, import or mixture, or it is damaged.
-    """
-    found = check_complete(root)
-    facts = found if isinstance(found, DatasetFacts) else None
-    dataset = open_local_dataset(root)
-    columns = read_columns(dataset)
-    numbers = columns["episode_index"].numpy()
-    success = columns[SUCCESS_KEY].numpy() if SUCCESS_KEY in columns else None
-    action = columns[ACTION_KEY].numpy().astype(np.float64)
+def summarize(dataset: OpenDataset) -> DatasetSummary:
+    """Return what the card of a dataset says."""
+    columns, numbers = dataset.columns, dataset.columns["episode_index"]
+    success = columns[SUCCESS_KEY].astype(bool).reshape(-1) if SUCCESS_KEY in columns else None
+    action = columns[ACTION_KEY].astype(np.float64)
     features = dataset.meta.features
     return DatasetSummary(
-        facts=facts,
-        episodes=read_manifest(root) if facts else (),
-        failed=read_failed(root) if facts else (),
-        replay=read_replay(root) if facts else None,
-        imported=found if isinstance(found, ImportFacts) else None,
-        mixture=found if isinstance(found, MixtureFacts) else None,
-        lengths=tuple(int(n) for n in np.bincount(numbers)),
+        dataset=dataset,
+        lengths=tuple(dataset.lengths),
         n_success=None if success is None else len(np.unique(numbers[success])),
         instructions=tuple(sorted(str(task) for task in dataset.meta.tasks.index)),
         fields={name: _type(feature) for name, feature in sorted(features.items())},
@@ -112,16 +78,18 @@ def summarize(root: Path) -> DatasetSummary:
     )
 
 
-def draw_sheet(root: Path, summary: DatasetSummary) -> bytes:
+def draw_sheet(summary: DatasetSummary) -> bytes:
     """Return a PNG of the first, the middle and the last episode, one frame per phase."""
     n_episodes = len(summary.lengths)
     chosen = sorted({0, n_episodes // 2, n_episodes - 1})[:N_SHEET_EPISODES]
-    dataset = open_local_dataset(root, episodes=chosen)
-    frames = frame_layout(dataset, read_columns(dataset)).frames
+    dataset = summary.dataset
+    frames = frame_source(dataset.local.whole, dataset.columns)
+    frames = replace(frames, episodes=[frames.episodes[number] for number in chosen])
     cameras = list(CAMERA_KEYS.values())
     videos = zip(*(decode_camera(frames, camera) for camera in cameras), strict=True)
     rows = []
     labels: Sequence[str] = ()
+    manifest = dataset.manifest
     for number, (base_TCHW, wrist_TCHW) in zip(chosen, videos, strict=True):
         moments = _moments(summary, number)
         labels = [*(f"base, {label}" for label, _ in moments), "wrist, last"]
@@ -129,7 +97,7 @@ def draw_sheet(root: Path, summary: DatasetSummary) -> bytes:
         pictures = [*base_TCHW[steps], wrist_TCHW[-1]]
         rows.append(
             SheetRow(
-                name=_name(summary, number),
+                name=f"episode {number}" + (f"\nseed {manifest[number].seed}" if manifest else ""),
                 frames=tuple(np.ascontiguousarray(picture.transpose(1, 2, 0)) for picture in pictures),
             )
         )
@@ -139,21 +107,16 @@ def draw_sheet(root: Path, summary: DatasetSummary) -> bytes:
 def _moments(summary: DatasetSummary, number: int) -> list[tuple[str, int]]:
     """Return what to show of an episode, and at which frame; as many for every episode of a dataset."""
     last = summary.lengths[number] - 1
-    if summary.episodes and summary.episodes[0].cue_steps:
-        episode = summary.episodes[number]
+    episodes = summary.dataset.manifest
+    if episodes and episodes[0].cue_steps:
+        episode = episodes[number]
         choice = episode.cue_steps + episode.delay_steps
         moments = [("cue", 0), ("choice", choice), ("last", last)]
-        if all(one.delay_steps for one in summary.episodes):
+        if all(one.delay_steps for one in episodes):
             moments.insert(1, ("delay", episode.cue_steps))
     else:
         moments = [("first", 0), ("1/3", last // 3), ("2/3", 2 * last // 3), ("last", last)]
     return [(label, min(step, last)) for label, step in moments]
-
-
-def _name(summary: DatasetSummary, number: int) -> str:
-    if summary.episodes:
-        return f"episode {number}\nseed {summary.episodes[number].seed}"
-    return f"episode {number}"
 
 
 def _type(feature: Any) -> str:

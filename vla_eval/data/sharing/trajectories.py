@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray, ImageArray
-from vla_eval.data.completeness import check_complete
-from vla_eval.data.frames.decoded_frames import frame_layout, read_columns
-from vla_eval.data.frames.frame_cache import frames_on_disk
-from vla_eval.data.opening import open_local_dataset
+from vla_eval.data.frames.frame_cache import frame_source, frames_on_disk
+from vla_eval.data.opening import open_dataset
 from vla_eval.errors import DatasetError, did_you_mean
 from vla_eval.features import (
     ACTION_KEY,
@@ -104,8 +102,7 @@ class Trajectories(Sequence[Trajectory]):
     """
 
     def __init__(self, root: Path, *, cache: Path | None = None) -> None:
-        check_complete(root)
-        dataset = open_local_dataset(root)
+        dataset = open_dataset(root)
         for name in (*CAMERA_KEYS.values(), *FIELDS):
             if name not in dataset.meta.features:
                 known = dataset.meta.features
@@ -113,9 +110,8 @@ class Trajectories(Sequence[Trajectory]):
                     f"{root}: expected the field '{name}', found {', '.join(known)}."
                     f"{did_you_mean(name, known)} Imported data may lack rewards; a recording has all fields."
                 )
-        columns = read_columns(dataset)
-        self._columns = {name: columns[name].numpy() for name in FIELDS}
-        frames = frame_layout(dataset, columns).frames
+        self._columns: dict[str, Any] = {name: dataset.columns[name] for name in FIELDS}  # arrays of types
+        frames = frame_source(dataset.local.whole, dataset.columns)
         self._episodes = frames.episodes
         files = frames_on_disk(frames, cache)
         self._frames: list[ImageArray] = [

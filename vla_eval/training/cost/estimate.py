@@ -91,7 +91,7 @@ def unfilled_model(policy: Any, recipe: FinetuneRecipe) -> Any:
 
 def with_adapters(model: Any, recipe: FinetuneRecipe) -> Any:
     """Return a model with adapters where the recipe has LoRA; they get no memory."""
-    adapters = peft_config(recipe)
+    adapters = peft_config(recipe, model.config)
     if adapters is None:
         return model
     model.config.pretrained_path = Path(str(recipe.base_checkpoint))

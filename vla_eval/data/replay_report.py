@@ -27,16 +27,20 @@ def keep_report(dataset: Path, report: ReplayReport) -> None:
     write_entry(dataset / REPLAY_FILE, report)
 
 
-def require_passed(dataset: Path) -> ReplayReport | None:
-    """Raise `DatasetError` if a replay of the dataset has failed, or was one of another manifest.
+def require_passed(dataset: Path, report: ReplayReport | None, manifest: str) -> ReplayReport | None:
+    """Return the report of a dataset's last replay.
 
-    Returns:
-        The report; None if the dataset has never been replayed.
+    Args:
+        dataset: its folder, for messages.
+        report: what `read_replay` returned.
+        manifest: digest of its manifest.
+
+    Raises:
+        DatasetError: the replay has failed, or was one of another manifest.
     """
-    report = read_replay(dataset)
     if report is None:
         return None
-    if report.manifest_sha256 != manifest_sha256(dataset):
+    if report.manifest_sha256 != manifest:
         raise DatasetError(
             f"{dataset}: {REPLAY_FILE} is about another manifest. Replay the dataset: mikasa-vla replay "
             f"{dataset}"

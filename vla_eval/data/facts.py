@@ -1,0 +1,377 @@
+"""What a dataset of this project is: recorded, imported or mixed. A file in `meta/mikasa/`, written last.
+
+Knows nothing of lerobot.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path, PurePosixPath
+from typing import Any  # plain data
+
+from vla_eval.control_modes import control_mode_of
+from vla_eval.data.folder_contents import check_folder
+from vla_eval.data.manifest import (
+    FETCH_AGAIN,
+    IMPORT_FILE,
+    MIXTURE_FILE,
+    RECORDING_FILE,
+    FileDigest,
+    from_json,
+    read_content,
+)
+from vla_eval.errors import DatasetError
+from vla_eval.seeding import SeedRange, seed_ranges
+from vla_eval.strict.json_text import Count, Positive, shown
+
+MAX_NAME = 255  # bytes; what file systems take
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetFacts:
+    """What a recorded dataset is, and how it came about; for the rest see `Facts`.
+
+    Attributes:
+        name: the recipe's name.
+        task, task_version, instruction: the one task of the dataset.
+        n_episodes, n_frames, n_failed_seeds: counts.
+        recipe: the resolved recipe; `recipe_sha256` is the digest of the part that content depends on.
+        recipe_files: `policies/oracle` -> sha256 of the file; likewise the prompts, and the weights of a
+            learned expert.
+        environment: commit, versions and machine, see `provenance.collect_environment`.
+        device: the device that rendered, as the environment describes it.
+        files: digests of lerobot's files and of the manifest.
+    """
+
+    complete: bool
+    name: str
+    task: str
+    task_version: Positive
+    instruction: str
+    state: str
+    n_episodes: Count
+    n_frames: Count
+    n_failed_seeds: Count
+    recipe: dict[str, Any]
+    recipe_sha256: str
+    recipe_files: dict[str, str]
+    environment: dict[str, Any]
+    device: dict[str, str]
+    files: dict[str, FileDigest]
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Its one task."""
+        return (self.task,)
+
+    @property
+    def control_mode(self) -> str:
+        """What the actions are for."""
+        env = self.recipe.get("env")
+        return control_mode_of(env if isinstance(env, dict) else {})
+
+    @property
+    def is_checked(self) -> bool:
+        """A recording follows the rules."""
+        return True
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    @property
+    def kind(self) -> str:
+        """What it is, for a person."""
+        return f"a recording of {self.task}, complete"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportedEpisode:
+    """What the source of an import says about an episode.
+
+    Attributes:
+        name: its file, or its number in the source.
+        n_steps: number of frames.
+        instruction: the language instruction.
+        source_seed: its seed in the source's environment; ours gives another episode for it.
+        success: whether the source's success flag holds at any frame; None if it has none.
+    """
+
+    name: str
+    n_steps: Positive
+    instruction: str
+    source_seed: int | None
+    success: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportFacts:
+    """What a converted dataset is, where it came from, and what it does not have; for the rest see `Facts`.
+
+    Attributes:
+        source_layout: `npz_joints`, `npz_proprio`, `lerobot_official`, `lerobot_suite90`, `lerobot_mikasa`;
+            or `adopted`, if the files are those of the source.
+        task: the task id that the user named.
+        instruction_source: where the instruction comes from: `source`, or the prompt set of that task.
+        executable_by_pd_ee_delta_pose: whether this project's environments can execute the actions.
+        absent: fields of our own datasets that the source does not have.
+        left_out: arrays of the source that were not taken over.
+        episodes: the source's description of each.
+        source_files: path below the source -> digest.
+        vla_eval_version: what converted it.
+        is_checked: False for what an older version wrote.
+        converted: what was changed because it was asked for, a sentence each.
+    """
+
+    complete: bool
+    source_layout: str
+    task: str | None
+    instruction_source: str
+    state: str
+    control_mode: str
+    executable_by_pd_ee_delta_pose: bool
+    absent: tuple[str, ...]
+    left_out: tuple[str, ...]
+    n_frames: Count
+    episodes: tuple[ImportedEpisode, ...]
+    source_files: dict[str, FileDigest]
+    files: dict[str, FileDigest]
+    vla_eval_version: str
+    is_checked: bool = False
+    converted: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Its task, if one was named."""
+        return () if self.task is None else (self.task,)
+
+    @property
+    def kind(self) -> str:
+        """What it is, for a person."""
+        made = "adopted dataset" if self.source_layout == "adopted" else f"import from {self.source_layout}"
+        return f"an {made}, complete"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MixtureSource:
+    """A dataset of one task, whose episodes follow those of the sources before it.
+
+    Attributes:
+        name: its folder's name.
+        task: task id; None for an import that names none.
+        task_version: of the task's rules; None for an import.
+        instructions: every sentence that occurs in it.
+        n_episodes, n_frames: counts.
+        sha256: digest of the digests of all its files.
+        seeds: of its episodes, in their order; None for an import, whose seeds are not ours.
+        failed_seeds: at which the expert did not succeed.
+        was_replayed: whether a replay had confirmed it when it was mixed.
+    """
+
+    name: str
+    task: str | None
+    task_version: Positive | None
+    instructions: tuple[str, ...]
+    n_episodes: Positive
+    n_frames: Positive
+    sha256: str
+    seeds: tuple[Count, ...] | None
+    failed_seeds: tuple[Count, ...]
+    was_replayed: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MixtureFacts:
+    """What a dataset of several tasks is; for the rest see `Facts`.
+
+    Attributes:
+        sources: in the order of their episodes.
+        vla_eval_version: what mixed it.
+    """
+
+    complete: bool
+    state: str
+    control_mode: str
+    sources: tuple[MixtureSource, ...]
+    files: dict[str, FileDigest]
+    vla_eval_version: str
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The task ids, each once, in the order of the sources."""
+        return tuple(dict.fromkeys(one.task for one in self.sources if one.task is not None))
+
+    @property
+    def task(self) -> str | None:
+        """The task of all sources; None if they are of several, or one names none."""
+        named = {one.task for one in self.sources}
+        return self.sources[0].task if len(named) == 1 else None
+
+    @property
+    def seeds(self) -> dict[str, tuple[SeedRange, ...]] | None:
+        """Task -> the seeds of its episodes, as far as they are known; None if none are."""
+        known: dict[str, list[int]] = {}
+        for one in self.sources:
+            if one.task is not None and one.seeds is not None:
+                known.setdefault(one.task, []).extend(one.seeds)
+        return {task: seed_ranges(own) for task, own in known.items()} or None
+
+    @property
+    def shared_scenes(self) -> tuple[str, ...]:
+        """A sentence for each two sources that have seeds of one task's rules in common: the same scenes."""
+        found = []
+        for one, other in combinations(self.sources, 2):
+            if one.task is None or (one.task, one.task_version) != (other.task, other.task_version):
+                continue
+            common = sorted(set(one.seeds or ()) & set(other.seeds or ()))
+            if common:
+                found.append(
+                    f"{one.name} and {other.name} share {len(common)} seeds of {one.task}, from "
+                    f"{common[0]} to {common[-1]}: these scenes count twice."
+                )
+        return tuple(found)
+
+    @property
+    def n_frames(self) -> int:
+        """Of all sources."""
+        return sum(one.n_frames for one in self.sources)
+
+    @property
+    def was_replayed(self) -> bool:
+        """Whether a replay had confirmed every source."""
+        return all(one.was_replayed for one in self.sources)
+
+    @property
+    def is_checked(self) -> bool:
+        """Sources are checked one by one; the whole is checked when it is used."""
+        return False
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    @property
+    def kind(self) -> str:
+        """What it is, for a person."""
+        return f"a mixture of {len(self.sources)} datasets, complete"
+
+
+type Facts = DatasetFacts | ImportFacts | MixtureFacts
+"""What a dataset is. All kinds have these:
+
+    complete      written as true, after everything else
+    task          the task id of all episodes; None if there are several, or it is not known
+    tasks         all task ids that are known
+    state         which proprioception `observation.state` is
+    control_mode  what the actions are for
+    n_frames      of all episodes
+    files         path below the dataset -> digest
+    is_checked    whether the rules of `checks.rules` were applied when it was made
+    kept          what was then found and kept
+    kind          what it is, for a person
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kind:
+    """A kind of dataset.
+
+    Attributes:
+        cls: its facts.
+        file: where they are, below the dataset.
+        made: `recorded`, for messages.
+        again: what to do if it is not finished.
+        repair: what to do if its files are damaged.
+    """
+
+    cls: type[Facts]
+    file: Path
+    made: str
+    again: str
+    repair: str
+
+
+KINDS = (
+    Kind(
+        cls=DatasetFacts,
+        file=RECORDING_FILE,
+        made="recorded",
+        again="Run the command that records it again: it resumes.",
+        repair="Fetch or record the dataset again, or make it from its manifest: `mikasa-vla replay DATASET "
+        "--rebuild OUT`.",
+    ),
+    Kind(
+        cls=ImportFacts,
+        file=IMPORT_FILE,
+        made="converted",
+        again="Convert the source again.",
+        repair="Convert the source again.",
+    ),
+    Kind(
+        cls=MixtureFacts,
+        file=MIXTURE_FILE,
+        made="mixed",
+        again="Mix its sources again.",
+        repair="Mix its sources again.",
+    ),
+)
+"""In the order in which they are looked for."""
+
+
+def kind_of(facts: Facts) -> Kind:
+    """Return the kind of a dataset."""
+    return next(kind for kind in KINDS if isinstance(facts, kind.cls))
+
+
+def has_facts(root: Path) -> bool:
+    """Whether a folder has the records of a dataset of this project."""
+    return any((root / kind.file).exists() for kind in KINDS)
+
+
+def find_facts(root: Path) -> Facts | None:
+    """Return what a dataset of this project is; None if it is another one.
+
+    Raises:
+        DatasetError: its record is damaged, of another version, or the dataset was not finished.
+    """
+    for kind in KINDS:
+        if (root / kind.file).exists():
+            return _read(root, kind)
+    return None
+
+
+def read_facts(root: Path) -> DatasetFacts:
+    """Return what a recorded dataset is.
+
+    Raises:
+        DatasetError: there is no `recording.json`, it is damaged, or the dataset is not complete.
+    """
+    check_folder(root)
+    facts = _read(root, KINDS[0])
+    assert isinstance(facts, DatasetFacts)
+    return facts
+
+
+def files_sha256(files: Mapping[str, FileDigest]) -> str:
+    """Return one digest for all files of a dataset."""
+    lines = (f"{name}\0{digest.sha256}\n" for name, digest in sorted(files.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _read(root: Path, kind: Kind) -> Facts:
+    path = root / kind.file
+    facts: Facts = from_json(kind.cls, read_content(path), where=str(path))
+    for name in facts.files:
+        parts = PurePosixPath(name).parts
+        is_inside = bool(parts) and not name.startswith("/") and ".." not in parts
+        if not is_inside or not name.isprintable() or max(len(part.encode()) for part in parts) > MAX_NAME:
+            raise DatasetError(
+                f"{path}: expected names of files inside of the dataset, found {shown(name)}. {FETCH_AGAIN}"
+            )
+    if not facts.complete:
+        raise DatasetError(f"{root}: is not complete. {kind.again}")
+    return facts
