@@ -17,9 +17,10 @@ from torch import Tensor
 
 from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.models.families import family_of
 from vla_eval.testing.random_checkpoint import plain_statistics, stand_in_config
 from vla_eval.testing.training_speed import random_samples
-from vla_eval.training.cost.sample_cost import SAVED_PER_LINEAR_OF, count
+from vla_eval.training.cost.sample_cost import count
 from vla_eval.training.job import load_finetune_recipe
 
 FEW, MORE = 1, 3  # samples
@@ -72,7 +73,7 @@ def measure(name: str, changes: Mapping[str, Any]) -> str:
     handled = count(model, config).saved
     return (
         f"{name} {dict(changes)}: {numbers / 1e6:.2f} M numbers kept per sample, {handled / 1e6:.2f} M "
-        f"handled: {numbers / handled:.2f} (in use: {SAVED_PER_LINEAR_OF[config.type]})"
+        f"handled: {numbers / handled:.2f} (in use: {family_of(config.type).saved_per_linear})"
     )
 
 

@@ -11,6 +11,8 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
+from vla_eval.results.own_statistics import STEPS, SUCCESS
+from vla_eval.results.relative_statistics import CHANCE
 from vla_eval.results.report import Row, build_table
 from vla_eval.storage.run_folder import read_run
 
@@ -32,11 +34,11 @@ def main() -> None:
         places = [sizes.index(row.n_action_steps) + offset for row in own]
         style = {"color": COLORS[number % len(COLORS)], "marker": "osD^v"[number % 5], "label": policy}
         left.errorbar(places, [_rate(row) for row in own], yerr=_errors(own), capsize=3, **style)
-        steps = [(x, row.mean_success_step) for x, row in zip(places, own, strict=True)]
+        steps = [(x, row[STEPS]) for x, row in zip(places, own, strict=True)]
         known = [(x, value) for x, value in steps if value is not None]
         right.plot([x for x, _ in known], [value for _, value in known], **style)
-    if rows[0].chance is not None:
-        left.axhline(rows[0].chance, color="0.5", linestyle="--", linewidth=1)
+    if (chance := rows[0][CHANCE]) is not None:
+        left.axhline(chance.rate, color="0.5", linestyle="--", linewidth=1)
     left.set(ylabel="success once", ylim=(0, 1.05))
     right.set(ylabel="control steps until success", ylim=(0, None))
     for axes in (left, right):
@@ -46,12 +48,13 @@ def main() -> None:
 
 
 def _rate(row: Row) -> float:
-    assert row.success_once is not None  # every row of the figure has results
-    return row.success_once
+    rate = row[SUCCESS].success_once
+    assert rate is not None  # every row of the figure has results
+    return rate
 
 
 def _errors(rows: list[Row]) -> list[list[float]]:
-    pairs = [(row.ci_low, row.ci_high, _rate(row)) for row in rows]
+    pairs = [(row[SUCCESS].ci_low, row[SUCCESS].ci_high, _rate(row)) for row in rows]
     return [
         [rate - low for low, _, rate in pairs if low is not None],
         [high - rate for _, high, rate in pairs if high is not None],

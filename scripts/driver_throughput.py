@@ -19,6 +19,7 @@ from typing import Any  # Ray is optional
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.job_queue import EpisodeBatch
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.evaluation.worker import Finished
 from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.storage.run_folder import RunFolder
@@ -175,7 +176,7 @@ def measure(ray: Any, n_workers: int, seconds: float, n_records: int) -> dict[st
 
     RunFolder.append_all = timed  # type: ignore[method-assign]
     try:
-        evaluate(config, out=folder / "run", backend=backend, observer=middle)
+        evaluate(resolve(config, out=folder / "run", backend=backend), observer=middle)
     finally:
         RunFolder.append_all = append_all  # type: ignore[method-assign]
         shutil.rmtree(folder)

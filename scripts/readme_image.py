@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib.image
 from matplotlib.figure import Figure
 
+from vla_eval.results.own_statistics import EPISODES, SUCCESS
 from vla_eval.results.report import build_table
 from vla_eval.results.success_table import Row
 from vla_eval.storage.run_folder import read_run
@@ -48,15 +49,17 @@ def draw(run: Path) -> Figure:
         _bar(axes, y, rows[policy], color)
         axes.text(-0.02, y, words, ha="right", va="center", fontsize=11, color=INK)
     axes.set(xlim=(0, 1), ylim=(2.6, -0.6), yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
-    axes.set_xlabel(f"success with its 95 % interval, {rows['cue_blind'].n_episodes} episodes", fontsize=10)
+    n_episodes = rows["cue_blind"][EPISODES].n_episodes
+    axes.set_xlabel(f"success with its 95 % interval, {n_episodes} episodes", fontsize=10)
     axes.spines[["top", "right", "left"]].set_visible(False)
     return figure
 
 
 def _bar(axes, y: int, row: Row, color: str) -> None:  # type: ignore[no-untyped-def]  # matplotlib's axes
-    axes.barh(y, row.success_once, height=0.62, color=color, alpha=0.85)
-    axes.plot([row.ci_low, row.ci_high], [y, y], color=INK, linewidth=1.6)
-    axes.text(1.03, y, f"{row.success_once:.2f}", va="center", fontsize=12, color=INK)
+    success = row[SUCCESS]
+    axes.barh(y, success.success_once, height=0.62, color=color, alpha=0.85)
+    axes.plot([success.ci_low, success.ci_high], [y, y], color=INK, linewidth=1.6)
+    axes.text(1.03, y, f"{success.success_once:.2f}", va="center", fontsize=12, color=INK)
 
 
 def main() -> None:

@@ -29,7 +29,7 @@ PUBLISHED: Mapping[str, int | None] = {
     "octo_small": 136_670_604,
     "octo_base": 92_830_092 + 109_628_544,
     "smolvla": 450_046_176,
-    "openvla_oft": None,  # its head is no published network's
+    "openvla_oft": None,  # its head is not that of a published network
     "pi0_fast": PALIGEMMA + GEMMA_EMBEDDINGS,
     "spatialvla": 4_027_854_731,
     "pi0": 3_501_372_176 + GEMMA_EMBEDDINGS,

@@ -9,7 +9,7 @@ value is keyed by it. An episode is a function of (task, seed, actions) alone, w
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -41,6 +41,14 @@ class Observation:
     images: Mapping[str, ImageArray]
     state: Mapping[str, FloatArray]
     privileged: PrivilegedState | None = None
+
+    def as_declared(self, spec: PolicySpec) -> "Observation":
+        """Return what a policy has declared that it reads: observers may have asked for more.
+
+        A missing image stays missing: `check_compatible` has found each camera in the environment.
+        """
+        images = {name: image for name, image in self.images.items() if name in spec.cameras}
+        return replace(self, images=images, privileged=self.privileged if spec.privileged else None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +100,13 @@ class EpisodeStart:
     instruction: str
     horizon_steps: int
     row: int = 0
+
+    def worded(self, wording: Mapping[str, str]) -> "EpisodeStart":
+        """Return it with values in place of the words in braces of the instruction."""
+        instruction = self.instruction
+        for word, value in wording.items():
+            instruction = instruction.replace(f"{{{word}}}", value)
+        return replace(self, instruction=instruction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,15 +3,16 @@
 The world is the same: only the images in the policy's observations change. Knows nothing of simulators.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import ImageArray, Observation
-from vla_eval.errors import TaskArgumentError
+from vla_eval.core import ImageArray, Observation, ObservationWindow, SimEnv, StepResult
+from vla_eval.errors import SpecMismatchError, TaskArgumentError
+from vla_eval.specs import PolicySpec
 from vla_eval.task_state import Phase
 
 CueViewKind = Literal["as_shown", "first_frame", "hidden", "hidden_elsewhere", "hidden_later"]
@@ -67,12 +68,29 @@ class CueViewSettings:
 AS_SHOWN = CueViewSettings()
 
 
+def cue_locator(env: SimEnv, settings: CueViewSettings, cameras: Sequence[str]) -> Callable[[int], CueBoxes]:
+    """Return where the cue of a slot is in the images that a policy reads.
+
+    Raises:
+        SpecMismatchError: a view hides it, and the environment cannot locate it.
+    """
+    if not settings.hides or not cameras:
+        return lambda _slot: {}
+    if isinstance(env, CueLocator):
+        return env.cue_boxes
+    raise SpecMismatchError(
+        f"cue_view={settings.kind}: {env.spec.task}: this environment cannot tell where in its images the "
+        "cue is. Use another one, or leave this view out."
+    )
+
+
 @dataclass(slots=True, kw_only=True)
 class CueView:
-    """What one episode's policy sees; observations are given in order, each step once."""
+    """What one episode's policy is given: results are noted in order, each step once."""
 
     settings: CueViewSettings
     locate: Callable[[], CueBoxes]
+    _frames: list[Observation] = field(default_factory=list)  # since the last inference
     _first: Observation | None = None
     _boxes: list[CueBoxes] = field(default_factory=list)
     _n_delay_steps: int = 0
@@ -81,8 +99,22 @@ class CueView:
         """Return whether the images of a step are shown again at later ones."""
         return self.settings.kind == "first_frame" and step == self.settings.begins_at
 
+    def note(self, result: StepResult) -> None:
+        """Keep what the policy is given of this result until its next inference; raises as `seen`."""
+        self._frames.append(self.seen(result.observation, result.status.phase))
+
+    def forget_before(self, step: int) -> None:
+        """Drop the observations of earlier steps that the policy was not given yet."""
+        self._frames = [frame for frame in self._frames if frame.step >= step]
+
+    def take(self, slot: int, spec: PolicySpec) -> ObservationWindow:
+        """Return the observations since the last inference, or only the newest; they are given once."""
+        frames, self._frames = self._frames, []
+        read = frames if spec.reads == "every" else frames[-1:]
+        return ObservationWindow(slot=slot, frames=tuple(frame.as_declared(spec) for frame in read))
+
     def seen(self, observation: Observation, phase: Phase | None) -> Observation:
-        """Return what the policy is given in place of an observation.
+        """Return what the policy is given in place of an observation; each step once.
 
         Raises:
             TaskArgumentError: the cue takes so much of an image that as much is not there elsewhere.

@@ -34,6 +34,7 @@ class EpisodeLog:
         start: the episode.
         status: what the task said last.
         n_steps: control steps executed.
+        last_inference_step: of the policy; -1 before the first one.
         success_step: control steps executed when the success rule first held.
         tcp_start_m: where the tool centre point began; None if its pose is no state of the environment.
         tcp_reach_m: how far it ever was from there.
@@ -47,6 +48,7 @@ class EpisodeLog:
     success_step: int | None = None
     episode_return: float = 0.0
     n_inferences: int = 0
+    last_inference_step: int = -1
     n_frames: int = 0
     n_clipped_steps: int = 0
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)
@@ -61,6 +63,7 @@ class EpisodeLog:
     def note_inference(self, *, n_frames: int) -> None:
         """Count one call of the policy that was given so many observations."""
         self.n_inferences += 1
+        self.last_inference_step = self.n_steps
         self.n_frames += n_frames
 
     def note_step(self, action: FloatArray, result: StepResult, action_spec: ActionSpec) -> None:
@@ -84,6 +87,19 @@ class EpisodeLog:
         self._digest_state(result)
         if result.status.success and self.success_step is None:
             self.success_step = self.n_steps
+
+    def is_over(self, *, steps_after_success: int | None) -> bool:
+        """Whether the episode ends here.
+
+        Args:
+            steps_after_success: it ends so many steps after the first success; None: success does not end it.
+        """
+        is_won = (
+            steps_after_success is not None
+            and self.success_step is not None
+            and self.n_steps - self.success_step >= steps_after_success
+        )
+        return is_won or self.status.fail or self.n_steps >= self.start.horizon_steps
 
     def record(self, policy: str, n_action_steps: int, *, stops_at_success: bool) -> EpisodeRecord:
         """Return the record of the finished episode.
@@ -149,16 +165,18 @@ class EpisodeLog:
             self.digest.update(np.ascontiguousarray(state[name], dtype="<f4").tobytes())
 
 
-def check_instruction(episode: EpisodeStart) -> None:
-    """Raise `MissingInstructionError` if there is nothing to tell the policy."""
+def check_start(episode: EpisodeStart, chunking: ChunkingSpec) -> None:
+    """Raise unless the episode can begin.
+
+    Raises:
+        MissingInstructionError: there is no instruction for the policy.
+        SpecMismatchError: the policy would never be asked.
+    """
     if not episode.instruction.strip():
         raise MissingInstructionError(
             f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
         )
 
-
-def check_first_inference(episode: EpisodeStart, chunking: ChunkingSpec) -> None:
-    """Raise `SpecMismatchError` if the policy would never be asked."""
     if chunking.first_inference_step >= episode.horizon_steps:
         raise SpecMismatchError(
             f"{episode.task}: the episode ends after {episode.horizon_steps} steps, before the first "

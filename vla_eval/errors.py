@@ -40,6 +40,10 @@ class SimulationError(VlaEvalError):
     """The simulator gave a state or a reward that is not finite."""
 
 
+class PluginError(VlaEvalError):
+    """An installed package declares something for this one that cannot be used."""
+
+
 class MissingInstructionError(VlaEvalError):
     """A task has no language instruction where one is needed."""
 

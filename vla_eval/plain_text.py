@@ -1,7 +1,7 @@
 r"""Text without control characters: what others wrote must not move the cursor, or hide what is printed.
 
 All text that is printed goes through `PlainStream`, and all text that has to fit into one line through
-`printable`. What is no letter, sign or space is shown as its escape: `\u001b`, which is also JSON's.
+`printable`. Everything but letters, signs and spaces is shown as its escape: `\u001b`, which is also JSON's.
 
 This file runs with Python 3.8 and imports nothing else: `mikasa_vla_client` ships it, too.
 """

@@ -7,26 +7,24 @@ recorded on the way is in `episode_log.py`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import (
     BatchPolicy,
     EpisodeStart,
     FloatArray,
-    Observation,
-    ObservationWindow,
     Policy,
     SimEnv,
     Stage,
     StepObserver,
     StepResult,
 )
-from vla_eval.cue_view import AS_SHOWN, CueBoxes, CueLocator, CueView, CueViewSettings
-from vla_eval.episode_log import EpisodeLog, check_chunk, check_first_inference, check_instruction
-from vla_eval.errors import SpecMismatchError
+from vla_eval.cue_view import AS_SHOWN, CueBoxes, CueView, CueViewSettings, cue_locator
+from vla_eval.episode_log import EpisodeLog, check_chunk, check_start
 from vla_eval.records import EpisodeRecord
-from vla_eval.specs import PolicySpec, check_compatible
+from vla_eval.specs import check_compatible
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,36 +50,12 @@ class RolloutSettings:
     cue_view: CueViewSettings = AS_SHOWN
 
 
-@dataclass(slots=True, kw_only=True)
-class _Running:
-    """One running episode: what the policy has not been given yet, its chunks, its log."""
+class _Running(NamedTuple):
+    """One running episode: what it has come to, what the policy has not been given yet, its chunks."""
 
     log: EpisodeLog
     view: CueView
     executor: ChunkExecutor
-    window: list[Observation]
-    reset_policy_at_step: int | None
-    done: bool = False
-
-    @property
-    def start(self) -> EpisodeStart:
-        return self.log.start
-
-    @property
-    def step(self) -> int:
-        return self.log.n_steps
-
-
-def _worded(episode: EpisodeStart, reset: StepResult) -> EpisodeStart:
-    """Return the episode with the words in its instruction that differ per episode."""
-    instruction = episode.instruction
-    for word, value in reset.wording.items():
-        instruction = instruction.replace(f"{{{word}}}", value)
-    return episode if instruction == episode.instruction else replace(episode, instruction=instruction)
-
-
-def _ignore(_stage: Stage) -> None:
-    """Stand in for a heartbeat that nobody listens to."""
 
 
 def rollout(
@@ -91,7 +65,7 @@ def rollout(
     settings: RolloutSettings,
     *,
     observers: Sequence[StepObserver] = (),
-    heartbeat: Callable[[Stage], None] = _ignore,
+    heartbeat: Callable[[Stage], None] = lambda _stage: None,
 ) -> list[EpisodeRecord]:
     """Run the episodes side by side, one per slot, and return their records in the same order.
 
@@ -113,24 +87,20 @@ def rollout(
     check_compatible(policy.spec, env.spec)
     settings.chunking.check_chunk_size(policy.spec.chunk_size, policy=policy.spec.name)
     for episode in episodes:
-        check_instruction(episode)
-        check_first_inference(episode, settings.chunking)
-    if settings.cue_view.hides and policy.spec.cameras and not isinstance(env, CueLocator):
-        raise SpecMismatchError(
-            f"cue_view={settings.cue_view.kind}: {env.spec.task}: this environment cannot tell where in its "
-            "images the cue is. Use another one, or leave this view out."
-        )
-    loop = _Loop(env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat)
-    running = loop.begin(episodes)
-    while active := [episode for episode in running if not episode.done]:
+        check_start(episode, settings.chunking)
+    boxes = cue_locator(env, settings.cue_view, policy.spec.cameras)
+    loop = _Loop(
+        env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat, cue_boxes=boxes
+    )
+    running = active = loop.begin(episodes)
+    stop = settings.stop_at_success
+    while active:
         loop.infer(active)
         loop.step(active)
-    return [
-        episode.log.record(
-            policy.spec.name, settings.chunking.n_action_steps, stops_at_success=settings.stop_at_success
-        )
-        for episode in running
-    ]
+        after = settings.steps_after_success if stop else None
+        active = [episode for episode in active if not episode.log.is_over(steps_after_success=after)]
+    n_action_steps = settings.chunking.n_action_steps
+    return [one.log.record(policy.spec.name, n_action_steps, stops_at_success=stop) for one in running]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,124 +112,69 @@ class _Loop:
     settings: RolloutSettings
     observers: Sequence[StepObserver]
     heartbeat: Callable[[Stage], None]
+    cue_boxes: Callable[[int], CueBoxes]
 
     def begin(self, episodes: Sequence[EpisodeStart]) -> list[_Running]:
         """Reset environment and policy."""
         self.heartbeat("reset")
         render = bool(self.policy.spec.cameras) or any(o.wants_images(0) for o in self.observers)
         results = self.env.reset({e.slot: e.seed for e in episodes}, render=render)
-        episodes = [_worded(episode, results[episode.slot]) for episode in episodes]
-        self.policy.reset(episodes)
-        for start in episodes:
+        starts = [episode.worded(results[episode.slot].wording) for episode in episodes]
+        self.policy.reset(starts)
+        for start in starts:
             for observer in self.observers:
                 observer.on_reset(start, results[start.slot])
-        return [self._begun(start, results[start.slot]) for start in episodes]
+        return [self._begun(start, results[start.slot]) for start in starts]
 
     def _begun(self, start: EpisodeStart, result: StepResult) -> _Running:
-        view = CueView(settings=self.settings.cue_view, locate=lambda: self._cue_boxes(start.slot))
-        return _Running(
-            log=EpisodeLog.begin(start, result),
-            view=view,
-            executor=ChunkExecutor(self.settings.chunking),
-            window=[view.seen(result.observation, result.status.phase)],
-            reset_policy_at_step=self.settings.reset_policy_at_step,
-        )
-
-    def _cue_boxes(self, slot: int) -> CueBoxes:
-        if isinstance(self.env, CueLocator) and self.policy.spec.cameras:
-            return self.env.cue_boxes(slot)
-        return {}
+        view = CueView(settings=self.settings.cue_view, locate=lambda: self.cue_boxes(start.slot))
+        view.note(result)
+        log = EpisodeLog.begin(start, result)
+        return _Running(log=log, view=view, executor=ChunkExecutor(self.settings.chunking))
 
     def infer(self, active: Sequence[_Running]) -> None:
         """Ask the policy for a chunk for each episode that is due."""
-        due = [episode for episode in active if episode.executor.infers_at(episode.step)]
+        due = [episode for episode in active if episode.executor.infers_at(episode.log.n_steps)]
         if not due:
             return
-        policy, spec = self.policy, self.policy.spec
+        first_step = self.settings.reset_policy_at_step
         for episode in due:
-            self._reset_in_mid_episode(episode)
-        windows = [_window(episode, spec) for episode in due]
+            if first_step is not None and episode.log.last_inference_step < first_step <= episode.log.n_steps:
+                self.policy.reset([episode.log.start])
+                episode.view.forget_before(first_step)
+        windows = [episode.view.take(episode.log.start.slot, self.policy.spec) for episode in due]
         self.heartbeat("inference")
-        if isinstance(policy, BatchPolicy):
-            chunks = policy.act_batch(windows)
+        if isinstance(self.policy, BatchPolicy):
+            chunks = self.policy.act_batch(windows)
         else:
-            chunks = [policy.act(window) for window in windows]
+            chunks = [self.policy.act(window) for window in windows]
         for episode, window, chunk in zip(due, windows, chunks, strict=True):
-            check_chunk(chunk, spec, self.env.spec.action, episode.log)
-            episode.executor.submit(episode.step, chunk)
+            check_chunk(chunk, self.policy.spec, self.env.spec.action, episode.log)
+            episode.executor.submit(episode.log.n_steps, chunk)
             episode.log.note_inference(n_frames=len(window.frames))
-            episode.window.clear()
             for observer in self.observers:
-                observer.on_inference(episode.start, episode.step, chunk)
-
-    def _reset_in_mid_episode(self, episode: _Running) -> None:
-        """Let the policy forget what was before a step, once, if the settings ask for it."""
-        first_step = episode.reset_policy_at_step
-        if first_step is None or episode.step < first_step:
-            return
-        self.policy.reset([episode.start])
-        episode.window = [frame for frame in episode.window if frame.step >= first_step]
-        episode.reset_policy_at_step = None
+                observer.on_inference(episode.log.start, episode.log.n_steps, chunk)
 
     def step(self, active: Sequence[_Running]) -> None:
         """Execute one control step in each running episode."""
         actions: dict[int, FloatArray] = {}
         for episode in active:
-            action = episode.executor.action(episode.step)
-            slot = episode.start.slot
+            action, slot = episode.executor.action(episode.log.n_steps), episode.log.start.slot
             actions[slot] = self.env.hold_action(slot) if action is None else action
-        render = frozenset(episode.start.slot for episode in active if self._needs_images(episode))
+        render = frozenset(episode.log.start.slot for episode in active if self._renders_next(episode))
         self.heartbeat("step")
         results = self.env.step(actions, render=render)
         for episode in active:
-            slot = episode.start.slot
-            episode.log.note_step(actions[slot], results[slot], self.env.spec.action)
-            episode.window.append(episode.view.seen(results[slot].observation, results[slot].status.phase))
-            episode.done = _is_done(episode, results[slot], self.settings)
+            action, result = actions[episode.log.start.slot], results[episode.log.start.slot]
+            episode.log.note_step(action, result, self.env.spec.action)
+            episode.view.note(result)
             for observer in self.observers:
-                observer.on_step(episode.start, actions[slot], results[slot])
+                observer.on_step(episode.log.start, action, result)
 
-    def _needs_images(self, episode: _Running) -> bool:
-        """Whether the observation after the coming step must hold images."""
-        step, spec = episode.step + 1, self.policy.spec
-        is_last = step >= episode.start.horizon_steps
-        is_given = not is_last and _is_given(episode, spec, step)
-        for_policy = self.settings.eager_rendering or is_given or episode.view.needs_images(step)
+    def _renders_next(self, episode: _Running) -> bool:
+        """Whether somebody will use the images of the coming step."""
+        spec, step = self.policy.spec, episode.log.n_steps + 1
+        inference_step, horizon_steps = episode.executor.next_inference_step, episode.log.start.horizon_steps
+        is_given = spec.is_given(step, inference_step, horizon_steps=horizon_steps)
+        for_policy = is_given or episode.view.needs_images(step) or self.settings.eager_rendering
         return (bool(spec.cameras) and for_policy) or any(o.wants_images(step) for o in self.observers)
-
-
-def _is_given(episode: _Running, spec: PolicySpec, step: int) -> bool:
-    """Whether the policy will be given the observation at `step`."""
-    inference_step = episode.executor.next_inference_step
-    if spec.reads == "every":
-        return inference_step < episode.start.horizon_steps  # nothing after the last inference is given
-    return step == inference_step
-
-
-def _window(episode: _Running, spec: PolicySpec) -> ObservationWindow:
-    frames = episode.window if spec.reads == "every" else episode.window[-1:]
-    return ObservationWindow(
-        slot=episode.start.slot, frames=tuple(_as_declared(frame, spec) for frame in frames)
-    )
-
-
-def _as_declared(observation: Observation, spec: PolicySpec) -> Observation:
-    """Return what the policy has declared that it reads: observers may have asked for more.
-
-    A missing image stays missing: `check_compatible` has found each camera in the environment.
-    """
-    return replace(
-        observation,
-        images={name: image for name, image in observation.images.items() if name in spec.cameras},
-        privileged=observation.privileged if spec.privileged else None,
-    )
-
-
-def _is_done(episode: _Running, result: StepResult, settings: RolloutSettings) -> bool:
-    success_step = episode.log.success_step
-    stops = settings.stop_at_success and success_step is not None
-    return (
-        episode.step >= episode.start.horizon_steps
-        or result.status.fail
-        or (stops and episode.step - (success_step or 0) >= settings.steps_after_success)
-    )

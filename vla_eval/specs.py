@@ -81,6 +81,12 @@ class PolicySpec:
     chunk_size: int
     privileged: bool = False
 
+    def is_given(self, step: int, next_inference_step: int, *, horizon_steps: int) -> bool:
+        """Whether the policy will be given the observation at `step`: nothing after the last inference is."""
+        if self.reads == "every":
+            return max(step, next_inference_step) < horizon_steps
+        return step == next_inference_step < horizon_steps
+
 
 def check_compatible(policy: PolicySpec, env: EnvSpec) -> None:
     """Raise `SpecMismatchError` unless the environment provides all that the policy needs."""

@@ -5,13 +5,15 @@ Knows nothing of simulators. A learned policy is given none of it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 Phase = Literal["cue", "delay", "response"]
 """Part of an episode: the cue is shown; nothing to remember it by is in view; the answer is due."""
+PHASES: tuple[Phase, ...] = get_args(Phase)
+"""In their order: index of a phase in tensors -> its name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,11 +40,11 @@ class TaskStatus:
 
     phase: Phase | None
     success: bool
-    fail: bool
-    target: int | None
-    n_candidates: int
-    first_choice: int | None
-    n_wrong_choices: int
+    fail: bool = False
+    target: int | None = None
+    n_candidates: int = 0
+    first_choice: int | None = None
+    n_wrong_choices: int = 0
     right_first_choices: tuple[int, ...] = ()
     chance_success: float | None = None
     candidate_places: tuple[int, ...] = ()
@@ -94,3 +96,8 @@ class BodyState:
     position_m: NDArray[np.float64]
     velocity_m_s: NDArray[np.float64]
     yaw_rad: float = 0.0
+
+
+def only_one(right_candidates: tuple[int, ...]) -> int | None:
+    """Return the right candidate if there is only one."""
+    return right_candidates[0] if len(right_candidates) == 1 else None

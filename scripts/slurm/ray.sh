@@ -24,7 +24,7 @@ nodes="${SLURM_JOB_NUM_NODES:?expected an allocation: sbatch --nodes=2 ray.sh â€
 head="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)"
 address="$(srun --nodes=1 --ntasks=1 --nodelist="$head" hostname --ip-address | cut -d' ' -f1)"
 
-# Whoever reaches Ray's ports can run code: only processes of this job know the token.
+# Anyone who reaches Ray's ports can run code: only processes of this job know the token.
 RAY_AUTH_TOKEN="$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')"
 export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
 

@@ -26,7 +26,7 @@ from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.testing.tiny_models import (
     TINY_POLICY,
-    make_tiny_pi0,
+    make_tiny,
     tiny_paligemma,
     tiny_resnet,
     write_tiny_tokenizer,
@@ -143,7 +143,7 @@ def pi0(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = with_features(PI0Config(device="cpu", push_to_hub=False, **fields))
     processing: Any = importlib.import_module("lerobot.policies.pi0.processor_pi0")
     step = processing.TokenizerProcessorStep
-    with pytest.MonkeyPatch.context() as patch, tiny_paligemma():
+    with pytest.MonkeyPatch.context() as patch, tiny_paligemma("pi0"):
         # Where a full run has the gated tokenizer in the cache, a test has a folder.
         patch.setattr(
             processing,
@@ -156,7 +156,7 @@ def pi0(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=["act", "pi0"])
 def make(request: pytest.FixtureRequest, env: EnvSpec) -> Callable[..., LeRobotPolicy]:
     folder = request.getfixturevalue(request.param)
-    maker: Any = make_lerobot if request.param == "act" else make_tiny_pi0
+    maker: Any = make_lerobot if request.param == "act" else make_tiny
     return lambda **args: maker(context_for(env), **{"checkpoint": str(folder), **args})
 
 

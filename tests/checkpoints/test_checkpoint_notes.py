@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from tests.evaluation.resolved import make_plan
 from vla_eval.checkpoints.files import TrainingFacts, write_facts
 from vla_eval.checkpoints.notes import normalization_notes
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.errors import CheckpointError, TaskArgumentError
-from vla_eval.evaluation.plan import Plan, make_plan
+from vla_eval.evaluation.plan import Plan
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.run_file import RunDescription, RunFile, Session
 from vla_eval.strict.decoding import decode

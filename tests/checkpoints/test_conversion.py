@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.checkpoints.conversion.writing import folder_when_whole
+from vla_eval.checkpoints.conversion import folder_when_whole
 from vla_eval.errors import CheckpointError
 
 

@@ -17,22 +17,25 @@ from lerobot.configs import PreTrainedConfig
 
 from tests.checkpoints import small_checkpoints
 from tests.checkpoints.small_checkpoints import act_config, context_for, copied
+from tests.evaluation.resolved import make_plan
 from tests.training.lerobot_tiny import lerobots_types
 from vla_eval.checkpoints.execution_fields import EXECUTION_FIELDS, ignored_fields, without_execution
 from vla_eval.checkpoints.files import CONFIG_FILE
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED, CUT_THEIR_CHUNK, chunk_size
+from vla_eval.checkpoints.policy_types import chunk_size
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.evaluation.plan import make_plan
+from vla_eval.models.families import FAMILIES
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.specs import EnvSpec
 
 KNOWN_FIELDS = Path(__file__).with_name("lerobot_fields.txt")
 LOOP = ("select_action", "reset")
-WITHOUT_CHUNKS = {*ASKED_FOR_STEPS, *CANNOT_BE_ASKED}
+ASKED_FOR_STEPS = {kind: family.queues for kind, family in FAMILIES.items() if family.queues}
+WITHOUT_CHUNKS = {*ASKED_FOR_STEPS, *(kind for kind, family in FAMILIES.items() if family.why_not)}
+CUT_THEIR_CHUNK = {kind for kind, family in FAMILIES.items() if family.cuts_chunk}
 backbone, env, act = small_checkpoints.backbone, small_checkpoints.env, small_checkpoints.act
 
 

@@ -20,15 +20,16 @@ from tests.checkpoints.small_checkpoints import pi0  # noqa: F401  a fixture
 from tests.models.openvla import openvla_golden as golden
 from vla_eval.checkpoints import fetching
 from vla_eval.checkpoints.backbones import fetched_backbones
-from vla_eval.checkpoints.bases import BASES, OF_RECIPES, Base, Source, find_base
-from vla_eval.checkpoints.conversion import published
-from vla_eval.checkpoints.conversion.openvla import ConvertOptions, convert_openvla
+from vla_eval.checkpoints.bases import base_of_recipe, find_base
 from vla_eval.checkpoints.files import BASE_FILE, checkpoint_sha256, find_checkpoint
 from vla_eval.checkpoints.loading import LoadOptions
 from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.cli.main import main
+from vla_eval.config.files import list_recipes
 from vla_eval.config.policy import load_policy
 from vla_eval.errors import CheckpointError, UnknownNameError
+from vla_eval.models.families import bases
+from vla_eval.models.family import Base, Source
 from vla_eval.testing.tiny_models import tiny_paligemma
 
 WEIGHTS_FILE = "model.safetensors"
@@ -62,7 +63,7 @@ def hub(pi0: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 def fetch(hub: Hub, out: Path, base: Base = BASE, **options: Any) -> list[str]:
     """Fetch, and return the lines for a person."""
     lines: list[str] = []
-    with tiny_paligemma():
+    with tiny_paligemma("pi0"):
         api = HfApi(endpoint=hub.endpoint, token=False)
         fetching.fetch_base(base, out, api=api, say=lines.append, **options)
     return lines
@@ -82,7 +83,7 @@ def test_a_base_is_complete_checked_and_says_where_it_came_from(
     assert not (out / "run_me.py").exists() and not (out.parent / fetching.DOWNLOADS / "pi0_base").exists()
     noted = json.loads((out / BASE_FILE).read_text())
     assert [part["commit"] for part in noted["parts"]] == [COMMIT, COMMIT]
-    with tiny_paligemma():  # it acts, with the tokenizer that was fetched beside it
+    with tiny_paligemma("pi0"):  # it acts, with the tokenizer that was fetched beside it
         verify_checkpoint(out, LoadOptions(device="cpu"))
     digest = checkpoint_sha256(out)
     (out / BASE_FILE).unlink()
@@ -112,7 +113,7 @@ def resnet_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]
     save_file(thin_resnet().state_dict(), repository / WEIGHTS_FILE)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
     monkeypatch.chdir(tmp_path)
-    with serving(Hub({BASES["resnet18"].weights.repo_id: repository})) as served:
+    with serving(Hub({bases()["resnet18"].weights.repo_id: repository})) as served:
         yield served
 
 
@@ -135,9 +136,9 @@ def test_a_backbone_is_fetched_by_the_same_door_and_only_then_a_policy_starts_fr
         ),
     ):
         torchvision.models.resnet18(weights=weights)
-    fetch(resnet_hub, Path("elsewhere"), BASES["resnet18"])  # the folder's name says nothing
+    fetch(resnet_hub, Path("elsewhere"), bases()["resnet18"])  # the folder's name says nothing
     out = Path("checkpoints") / "resnet18"
-    lines = fetch(resnet_hub, out, BASES["resnet18"])
+    lines = fetch(resnet_hub, out, bases()["resnet18"])
     assert "names and shapes of torchvision's network" in lines[-1]
     published = load_file(tmp_path / "timm" / WEIGHTS_FILE)
     with fetched_backbones():
@@ -146,7 +147,7 @@ def test_a_backbone_is_fetched_by_the_same_door_and_only_then_a_policy_starts_fr
     published.pop("layer1.0.conv1.weight")
     save_file(published, out / WEIGHTS_FILE)
     with pytest.raises(CheckpointError, match=r"found others: layer1\.0\.conv1\.weight\."):
-        fetch(resnet_hub, out, BASES["resnet18"])
+        fetch(resnet_hub, out, bases()["resnet18"])
 
 
 def test_a_connection_that_is_cut_resumes_where_it_was(hub: Hub, tmp_path: Path) -> None:
@@ -179,7 +180,7 @@ def test_a_fetch_that_ended_early_leaves_no_folder_and_the_next_one_resumes(
     fetch(hub, out)
     (resumed,) = hub.content_of(WEIGHTS_FILE)
     assert resumed is not None and int(resumed.removeprefix("bytes=").rstrip("-")) > 0
-    with tiny_paligemma():
+    with tiny_paligemma("pi0"):
         verify_checkpoint(out, LoadOptions(device="cpu"))
 
 
@@ -218,25 +219,22 @@ def test_without_a_network_the_error_names_the_folder_to_fill(
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     assert main(["checkpoint", "fetch", "pi0", "--out", str(tmp_path / "pi0_base")]) == 1
     message = capsys.readouterr().err
-    revision = BASES["pi0_base"].weights.revision
+    revision = bases()["pi0_base"].weights.revision
     assert f"hf download lerobot/pi0_base --revision {revision}" in message
     assert f"--local-dir {tmp_path / 'pi0_base'}" in message
     assert main(["checkpoint", "fetch", "octo_small", "--out", str(tmp_path / "octo_small")]) == 1
     assert f"convert-octo {tmp_path / 'octo_small'}-original --size small" in capsys.readouterr().err
 
 
-def test_a_sharded_checkpoint_is_converted(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sharded_checkpoint_is_converted(hub: Hub, tmp_path: Path) -> None:
     repository = tmp_path / "repositories" / "openvla"
     repository.mkdir()
     golden.write_published(repository)
     assert len(list(repository.glob("*.safetensors"))) == 2
     hub.repositories["somebody/openvla"] = repository
     source = Source(repo_id="somebody/openvla", revision=None, patterns=("*.json", "*.safetensors"))
-    base = dataclasses.replace(BASE, name="openvla_7b", parts=(source,), converter="openvla")
-    options = ConvertOptions(head="tokens", gripper="unit_open", image_augmentation=False, sizes=golden.SMALL)
-    monkeypatch.setattr(
-        published, "convert_published", lambda _, folder, out: convert_openvla(folder, out, options)
-    )
+    options = {**(bases()["openvla_7b"].options or {}), "sizes": golden.SMALL}
+    base = dataclasses.replace(BASE, name="openvla_7b", parts=(source,), options=options)
     out = tmp_path / "openvla_7b"
     fetch(hub, out, base)
     assert find_checkpoint(out) == out and (out / BASE_FILE).is_file()
@@ -244,10 +242,15 @@ def test_a_sharded_checkpoint_is_converted(hub: Hub, tmp_path: Path, monkeypatch
 
 
 def test_every_shipped_recipe_with_a_base_has_a_command_that_fetches_it() -> None:
-    for recipe, base in OF_RECIPES.items():
+    started = set()
+    for recipe in list_recipes("policies"):
         section = load_policy(recipe).value.finetune
-        assert section is not None and section.base_checkpoint == f"checkpoints/{base}"
-        assert find_base(recipe) is BASES[base]
+        if section is not None and str(section.base_checkpoint).startswith("checkpoints/"):
+            base = base_of_recipe(recipe)
+            assert section.base_checkpoint == f"checkpoints/{base}"
+            assert find_base(recipe) is bases()[str(base)]
+            started.add(base)
+    assert started == {name for name, base in bases().items() if not base.is_backbone}
     with pytest.raises(UnknownNameError, match="pi0_base"):
         find_base("pi0_bas")
 

@@ -19,14 +19,15 @@ from transformers import AutoConfig, AutoImageProcessor, AutoProcessor, AutoToke
 from tests.training import tiny_trainings
 from tests.training.tiny_trainings import TASK, act, context
 from vla_eval.checkpoints.adapter_config import read_adapter_config
-from vla_eval.checkpoints.conversion.octo_original import read_parameters
-from vla_eval.checkpoints.conversion.openvla import ConvertOptions, read_original
-from vla_eval.checkpoints.conversion.writing import check_free
+from vla_eval.checkpoints.conversion import check_free
 from vla_eval.checkpoints.foreign_code import no_foreign_code
 from vla_eval.checkpoints.loading import LoadOptions, read_config
 from vla_eval.cli.main import main
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import CheckpointError, DatasetError, TrainingError
+from vla_eval.models.octo.original import read_parameters
+from vla_eval.models.openvla.conversion import read_weights
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.models.openvla.sizes import NetworkSizes
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.training.finetune import finetune
@@ -201,12 +202,12 @@ class TestPickles:
     def test_a_head_of_openvla_holds_tensors_only(self, tmp_path: Path, trace: Path) -> None:
         save_file({"x": torch.zeros(1)}, tmp_path / "model.safetensors")
         torch.save({"a": WritesWhenUnpickled(trace)}, tmp_path / "action_head--5_checkpoint.pt")
-        options = ConvertOptions(head="l1", allow_pickled=True)
+        options = OpenVLAOptions(head="l1", allow_pickled=True)
         with pytest.raises(CheckpointError, match="expected pickled tensors and nothing else"):
-            read_original(tmp_path, options, NetworkSizes())
+            read_weights(tmp_path, options, NetworkSizes())
         torch.save([torch.zeros(1)], tmp_path / "action_head--5_checkpoint.pt")
         with pytest.raises(CheckpointError, match="expected tensors by name, found list"):
-            read_original(tmp_path, options, NetworkSizes())
+            read_weights(tmp_path, options, NetworkSizes())
         assert not trace.exists()
 
     def test_a_pickle_in_the_place_of_octos_parameters_is_not_read(self, tmp_path: Path, trace: Path) -> None:

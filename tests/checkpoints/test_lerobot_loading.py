@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.checkpoints import small_checkpoints
 from tests.checkpoints.small_checkpoints import FACTS, TASK, context_for, copied
+from tests.evaluation.resolved import plan_shard
 from vla_eval.checkpoints import loading as lerobot_loading
 from vla_eval.checkpoints.files import checkpoint_name, checkpoint_sha256, find_checkpoint, write_facts
 from vla_eval.checkpoints.loading import (
@@ -23,17 +24,16 @@ from vla_eval.checkpoints.loading import (
     make_empty_policy,
     read_config,
 )
-from vla_eval.checkpoints.policy_types import CANNOT_BE_ASKED
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.evaluation.sharding import plan_shard
+from vla_eval.models.families import FAMILIES
 from vla_eval.policies.entries import load_policy_entries
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
-from vla_eval.testing.tiny_models import make_tiny_pi0, tiny_paligemma, tiny_worker_main
+from vla_eval.testing.tiny_models import make_tiny, tiny_paligemma, tiny_worker_main
 
 pytestmark = pytest.mark.usefixtures("no_network")
 backbone, env = small_checkpoints.backbone, small_checkpoints.env
@@ -115,7 +115,7 @@ class TestStrictLoading:
         from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
         config = read_config(pi0, LoadOptions(device="cpu"))
-        with tiny_paligemma():
+        with tiny_paligemma("pi0"):
             loaded = load_weights(pi0, config, LoadOptions(device="cpu"))
             random = PI0Policy.from_pretrained(tmp_path / "nothing", config=config)
         assert "Returning model without loading pretrained weights" in capsys.readouterr().out
@@ -152,11 +152,11 @@ class TestProcessors:
         file = tmp_path / "policy_preprocessor.json"
         file.write_text(file.read_text().replace(str(pi0 / "tokenizer"), "google/paligemma-3b-pt-224"))
         with pytest.raises(CheckpointError, match=r"Name a local folder with `tokenizer`"):
-            make_tiny_pi0(context_for(env), checkpoint=str(tmp_path))
+            make_tiny(context_for(env), checkpoint=str(tmp_path))
 
 
 class TestTypesThatHideFrames:
-    @pytest.mark.parametrize("kind", sorted(CANNOT_BE_ASKED))
+    @pytest.mark.parametrize("kind", sorted(kind for kind, family in FAMILIES.items() if family.why_not))
     def test_they_are_refused_before_anything_is_loaded(
         self, act: Path, tmp_path: Path, env: EnvSpec, kind: str
     ) -> None:

@@ -17,13 +17,13 @@ from safetensors.torch import load_file, save_file
 
 from tests.checkpoints import small_checkpoints
 from tests.checkpoints.small_checkpoints import copied
+from tests.evaluation.resolved import make_plan
 from vla_eval.checkpoints.files import POSTPROCESSOR_FILE, PREPROCESSOR_FILE, WEIGHTS_FILE
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
 from vla_eval.checkpoints.saved_processor import BUILT_IN, refuse_built_in_normalization
 from vla_eval.checkpoints.verify import random_batch, verify_checkpoint
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import CheckpointError
-from vla_eval.evaluation.plan import make_plan
 
 pytestmark = pytest.mark.usefixtures("no_network")
 backbone, env, act = small_checkpoints.backbone, small_checkpoints.env, small_checkpoints.act

@@ -21,8 +21,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.testing.tiny_models import (
     TINY_POLICY,
     VOCABULARY,
-    Family,
-    make_tiny_pi0,
+    make_tiny,
     tiny_paligemma,
     write_tiny_fast_tokenizer,
 )
@@ -117,7 +116,7 @@ def test_code_that_comes_with_a_tokenizer_is_not_run(tmp_path: Path) -> None:
     ],
 )
 def test_a_training_without_a_tokenizer_says_which_one_is_missing(
-    recorded: Path, tmp_path: Path, tokenizer: Path, family: Family, missing: str, message: str
+    recorded: Path, tmp_path: Path, tokenizer: Path, family: str, missing: str, message: str
 ) -> None:
     config = tiny(recorded, tmp_path, tokenizer, family)
     section = dict(config.finetune)
@@ -127,7 +126,7 @@ def test_a_training_without_a_tokenizer_says_which_one_is_missing(
         finetune(replace(config, finetune=section))
 
 
-def tiny(recorded: Path, folder: Path, tokenizer: Path, family: Family) -> FinetuneConfig:
+def tiny(recorded: Path, folder: Path, tokenizer: Path, family: str) -> FinetuneConfig:
     """Return a training of four steps, with both tokenizers."""
     recipe = folder / f"tiny_{family}.yaml"
     recipe.write_text(f"version: 1\ndescription: tiny\nadapter: lerobot\nfinetune: {{type: {family}}}\n")
@@ -163,13 +162,13 @@ class TestTraining:
         return tmp_path / "run"
 
     def test_a_tiny_one_goes_the_whole_way(self, run: Path) -> None:
-        assert run_an_episode(make_tiny_pi0(context(), family="pi0_fast", checkpoint=str(run))) == 3
+        assert run_an_episode(make_tiny(context(), checkpoint=str(run))) == 3
 
     def test_it_reads_tokens_as_those_of_the_whole_chunk(self, run: Path) -> None:
         """lerobot reads them as those of `n_action_steps`: of a shorter chunk, with other coefficients."""
         file = find_checkpoint(run) / "config.json"
         file.write_text(json.dumps({**json.loads(file.read_text()), "n_action_steps": 2}))
-        policy = make_tiny_pi0(context(), family="pi0_fast", checkpoint=str(run))
+        policy = make_tiny(context(), checkpoint=str(run))
         inner: Any = policy._loaded.policy
         chunk = np.linspace(-1, 1, CHUNK * 7).reshape(1, CHUNK, 7)
         tokens = torch.tensor(inner.action_tokenizer(chunk)[0])

@@ -10,6 +10,7 @@ from vla_eval.cli.shared import evaluations
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import FolderInUseError
 from vla_eval.evaluation.evaluate import EvaluationSummary
+from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.workers.local import LOCAL
 
 CONFIG = EvalConfig(name="one", tasks=("RememberColor3-v0",), policies=("oracle",))
@@ -20,7 +21,8 @@ def in_use(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     """Folder -> how often it will be found in use; written folders are at the end, in their order."""
     tries: dict[str, int] = {}
 
-    def evaluate_one(config: EvalConfig, out: Path, *_: Any, **__: Any) -> EvaluationSummary:
+    def evaluate_one(resolved: ResolvedEvaluation, *_: Any, **__: Any) -> EvaluationSummary:
+        out = resolved.out
         if tries.get(out.name, 0) > 0:
             tries[out.name] -= 1
             raise FolderInUseError(f"{out}: another process (pid 1) is writing into this run folder.")
@@ -33,7 +35,9 @@ def in_use(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 
 def run(*names: str) -> None:
-    evaluations.evaluate_each([(Path(name), CONFIG) for name in names], argparse.Namespace(), backend=LOCAL)
+    evaluations.evaluate_each(
+        [(Path(name), CONFIG) for name in names], argparse.Namespace(shard=None), backend=LOCAL
+    )
 
 
 def test_a_folder_that_another_process_writes_comes_after_all_others(

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 
 from tests.config.eval_configs import MINIMAL, config
+from tests.evaluation.resolved import make_plan
 from vla_eval.config import shipped
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, digest_of, find_recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, UnknownNameError, VlaEvalError
 from vla_eval.evaluation.model_table import is_model_table, load_model_table
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.strict.decoding import decode, load_yaml
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from vla_eval.core import EpisodeStart
 from vla_eval.data.frames.remembered_frames import RememberedFramesDataset
 from vla_eval.models.episodes.running import Episode
-from vla_eval.models.vla_memory.fields import (
+from vla_eval.models.shared.earlier_frames import (
     SEGMENT_PADDING_KEY,
     FrameMemory,
     SampleMemory,
@@ -20,7 +20,7 @@ from vla_eval.models.vla_memory.fields import (
     place_field,
     place_fields,
 )
-from vla_eval.models.vla_memory.frame_choice import FrameChoice
+from vla_eval.models.shared.frame_choice import FrameChoice
 from vla_eval.testing.synthetic import write_synthetic_dataset
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from tests.evaluation.resolved import evaluate
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
+from vla_eval.evaluation.evaluate import EvaluationSummary
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
 from vla_eval.strict.decoding import decode

@@ -8,12 +8,15 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.evaluation.resolved import evaluate, evaluation_effort
 from tests.wire.small_servers import SmallServer, serving
 from vla_eval.cli.main import main
 from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.evaluation.dry_run import AssumedRates, evaluation_effort
-from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.errors import VlaEvalError
+from vla_eval.evaluation import evaluate as evaluating
+from vla_eval.evaluation.dry_run import AssumedRates
+from vla_eval.policies import entries
 
 
 def config() -> EvalConfig:
@@ -103,3 +106,78 @@ def test_the_command_prints_what_would_run(
     assert "5 to run, 0 of 5 have a result" in printed
     assert "300 control steps, 75 inferences, 0 frames" in printed and "assumptions:" in printed
     assert list(tmp_path.iterdir()) == []
+
+
+class TestRefusals:
+    """Whatever `evaluate` refuses before its first episode, the dry run refuses in the same words."""
+
+    CHANGES: tuple[dict[str, Any], ...] = (
+        {"seed_start": 7},
+        {"episodes": 1},
+        {"env": {"horizon_steps": 9}},
+        {"cue_view": "first_frame"},
+        {"runs": 1, "n_action_steps": (1,)},
+    )
+
+    @pytest.mark.parametrize("changes", CHANGES, ids=lambda changes: next(iter(changes)))
+    def test_a_folder_of_another_configuration(self, tmp_path: Path, changes: dict[str, Any]) -> None:
+        evaluate(config(), out=tmp_path / "run")
+        other = dataclasses.replace(config(), **changes)
+        assert _refused(other, tmp_path / "run") == _refused(other, tmp_path / "run", dry=False)
+
+    @pytest.mark.parametrize(
+        "content", ["file", "other files", "episodes alone", "damaged", "a line too many"]
+    )
+    def test_a_folder_that_no_run_can_go_into(self, tmp_path: Path, content: str) -> None:
+        out = tmp_path / "run"
+        if content == "file":
+            out.write_text("")
+        elif content in ("other files", "episodes alone"):
+            out.mkdir()
+            (out / ("notes.txt" if content == "other files" else "episodes.jsonl")).write_text("")
+        else:
+            evaluate(config(), out=out)
+            if content == "damaged":
+                (out / "run.json").write_text("{")
+            else:
+                lines = (out / "episodes.jsonl").read_text()
+                (out / "episodes.jsonl").write_text(lines + lines.splitlines()[0] + "\n")
+        assert _refused(config(), out) == _refused(config(), out, dry=False)
+
+    def test_another_environment_unless_it_is_allowed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        evaluate(config(), out=tmp_path / "run")
+        monkeypatch.setattr(evaluating, "collect_environment", lambda: {"python": "another"})
+        assert _refused(config(), tmp_path / "run") == _refused(config(), tmp_path / "run", dry=False)
+        effort = evaluation_effort(config(), out=tmp_path / "run", allow_environment_change=True)
+        assert effort.n_finished == 8
+
+
+def _refused(asked: EvalConfig, out: Path, *, dry: bool = True) -> str:
+    """Return the message of the error."""
+    with pytest.raises(VlaEvalError) as refused:
+        if dry:
+            evaluation_effort(asked, out=out)
+        else:
+            evaluate(asked, out=out)
+    return str(refused.value)
+
+
+def test_each_policy_is_read_once_and_a_server_asked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read: list[str] = []
+    load = entries.load_policy_recipe
+
+    def counted(name: str) -> Any:
+        read.append(name)
+        return load(name)
+
+    monkeypatch.setattr(entries, "load_policy_recipe", counted)
+    arguments = ["--task", "RememberColor3-v0", "--policy", "memory_color3", "random", "--episodes", "1"]
+    arguments += ["--set", "simulator=fake", "--set", "env.horizon_steps=4", "--out", str(tmp_path / "out")]
+    for more in (["--dry-run"], ["--workers", "1"]):
+        read.clear()
+        assert main(["eval", *arguments, *more]) == 0
+        assert read == ["memory_color3", "random"]

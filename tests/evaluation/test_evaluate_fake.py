@@ -8,10 +8,10 @@ import pytest
 
 from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
+from tests.evaluation.resolved import default_run_folder, evaluate
 from vla_eval.cli.main import main
 from vla_eval.errors import RunChangedError
 from vla_eval.evaluation import evaluate as evaluate_module
-from vla_eval.evaluation.evaluate import default_run_folder, evaluate
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load

@@ -11,11 +11,12 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.evaluation.resolved import evaluate
 from tests.evaluation.test_shared_inference import NETWORK_MODULE
 from tests.waiting import wait_until
 from tests.workers.three_machines import After, ThreeMachines, kill_actors, pids_of
 from tests.workers.three_machines import three_machines as three_machines
-from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
+from vla_eval.evaluation.evaluate import EvaluationSummary
 from vla_eval.workers.cluster.backend import ClusterBackend
 
 N_EPISODES = 45

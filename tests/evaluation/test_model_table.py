@@ -258,7 +258,7 @@ def test_processes_share_a_table_and_leave_each_other_alone(
         if name == "second":
             raise FolderInUseError(f"{folder}: another process")
         monkeypatch.setattr(  # the other process comes to an end with the third meanwhile
-            "vla_eval.cli.shared.model_table._is_finished", lambda one: one.row.name in (*begun, "third")
+            "vla_eval.studies.study.is_finished", lambda one: one.row.name in (*begun, "third")
         )
         return FinetuneSummary(out=folder, step=5, is_finished=True)
 

@@ -6,12 +6,11 @@ from pathlib import Path
 import pytest
 
 from tests.config.eval_configs import config
+from tests.evaluation.resolved import fingerprint, make_plan, results_config
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
 from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
-from vla_eval.evaluation.fingerprint import fingerprint, results_config
 from vla_eval.evaluation.job_queue import JobQueue
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import TASKS
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.evaluation.resolved import make_plan
 from tests.wire.small_servers import SmallServer, serving
 from vla_eval.cli.main import main
 from vla_eval.errors import (
@@ -18,7 +19,6 @@ from vla_eval.errors import (
     RunChangedError,
     TooManyErrorsError,
 )
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.results.report import build_table
 from vla_eval.storage.run_folder import read_run
 

@@ -8,10 +8,9 @@ import pytest
 
 from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
+from tests.evaluation.resolved import evaluate, evaluation_effort
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, RunChangedError
-from vla_eval.evaluation.dry_run import evaluation_effort
-from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.results.report import build_table
 from vla_eval.storage.merging import merge_runs, write_merged
 from vla_eval.storage.run_folder import read_run

@@ -13,12 +13,11 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.evaluation.resolved import evaluate, make_plan, results_config
 from tests.waiting import is_alive, wait_until
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
-from vla_eval.evaluation.evaluate import evaluate
-from vla_eval.evaluation.fingerprint import results_config
-from vla_eval.evaluation.inference_choice import chosen_inference
-from vla_eval.evaluation.plan import Plan, make_plan
+from vla_eval.evaluation.plan import Plan
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
 from vla_eval.workers import local
 from vla_eval.workers.load import Load
@@ -203,7 +202,7 @@ class TestTheChoice:
         self, network: Bench, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(local, "visible_gpus", lambda: ())
-        assert chosen_inference(network.config(workers=4)) == "in_process"
+        assert resolve(network.config(workers=4)).config.inference == "in_process"
 
     @pytest.mark.parametrize(
         ("workers", "policy", "expected"),
@@ -214,7 +213,7 @@ class TestTheChoice:
     ) -> None:
         monkeypatch.setattr(local, "visible_gpus", lambda: ("0",))
         name = str(network.folder / policy) if policy.endswith(".yaml") else policy
-        assert chosen_inference(network.config(workers=workers, policies=[name])) == expected
+        assert resolve(network.config(workers=workers, policies=[name])).config.inference == expected
 
     def test_in_the_workers_it_is_not_recorded_as_before_there_was_a_choice(self, network: Bench) -> None:
         assert not {"inference", "inference_max_batch"} & set(results_config(network.config()))

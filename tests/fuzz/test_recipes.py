@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.evaluation.resolved import fingerprint, make_plan
 from tests.fuzz.recipe_cases import changed_recipe, damaged_text, outcome, shipped, yaml_text
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
@@ -17,9 +18,7 @@ from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe
 from vla_eval.data.recording.plan import plan_recording
-from vla_eval.evaluation.fingerprint import fingerprint
 from vla_eval.evaluation.model_table import ModelTable, finetunings, is_model_table
-from vla_eval.evaluation.plan import make_plan
 from vla_eval.strict.decoding import decode, load_yaml
 
 TASK = "RememberColor3-v0"

@@ -1,5 +1,6 @@
 """A model that is built without memory for its weights and then filled is the model that was saved."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,13 +9,17 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from tests.checkpoints.small_checkpoints import pi0  # noqa: F401  a fixture
-from vla_eval.checkpoints import loading as lerobot_loading
 from vla_eval.checkpoints.loading import LoadOptions, load_weights, read_config
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.empty_weights import empty_weights, has_empty_weights
+from vla_eval.models.families import FAMILIES
+from vla_eval.models.shared.empty_weights import empty_weights
 from vla_eval.models.shared.weight_file import WeightFile
 from vla_eval.models.shared.weights import put_weights
 from vla_eval.testing.tiny_models import tiny_paligemma
+
+
+def has_empty(module: nn.Module) -> bool:
+    return any(parameter.is_meta for parameter in module.parameters())
 
 
 class Tied(nn.Module):
@@ -35,9 +40,9 @@ def empty() -> Tied:
 
 def test_weights_have_no_memory_and_buffers_have_their_values() -> None:
     model = empty()
-    assert has_empty_weights(model) and all(parameter.is_meta for parameter in model.parameters())
+    assert has_empty(model) and all(parameter.is_meta for parameter in model.parameters())
     assert model.scale.item() == 2.0
-    assert not has_empty_weights(Tied())  # outside the context, torch is as it was
+    assert not has_empty(Tied())  # outside the context, torch is as it was
 
 
 def test_a_shared_weight_stays_shared_through_moving_and_filling(tmp_path: Path) -> None:
@@ -81,9 +86,9 @@ def test_a_checkpoint_loads_to_the_same_bits_with_and_without_memory_beforehand(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     options = LoadOptions(device="cpu")
-    with tiny_paligemma():
+    with tiny_paligemma("pi0"):
         filled = load_weights(pi0, read_config(pi0, options), options)
-        monkeypatch.setattr(lerobot_loading, "BUILT_EMPTY", frozenset())
+        monkeypatch.setitem(FAMILIES, "pi0", replace(FAMILIES["pi0"], is_built_empty=False))
         built = load_weights(pi0, read_config(pi0, options), options)
     expected = load_file(pi0 / "model.safetensors")
     for policy in (filled, built):
@@ -91,4 +96,4 @@ def test_a_checkpoint_loads_to_the_same_bits_with_and_without_memory_beforehand(
         assert all(torch.equal(state[name], tensor) for name, tensor in expected.items())
     first, second = dict(filled.named_buffers()), dict(built.named_buffers())
     assert first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
-    assert not has_empty_weights(filled)
+    assert not has_empty(filled)

@@ -11,7 +11,7 @@ from transformers import ByT5Tokenizer, PreTrainedTokenizerBase
 from vla_eval.config.prompts import instruction_for
 from vla_eval.errors import RemoteReplyError
 from vla_eval.models.episodes.sentence import SentenceEncoder
-from vla_eval.models.shared.byte_tokenizer import byte_tokenizer
+from vla_eval.models.shared.language_processors import byte_tokenizer
 from vla_eval.models.shared.sentence_reading import SentenceReading, SentenceWatch, from_wire
 from vla_eval.models.shared.tokens_read import MAX_SENTENCES, Readings
 from vla_eval.tasks.catalog import task_spec

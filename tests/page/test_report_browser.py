@@ -120,7 +120,7 @@ def test_the_page_is_shown_without_complaint_and_without_a_request(browser: Brow
     page = write_page([run], tmp_path / "page")
     browser.open(page)
     read = Page(browser.ask("document.documentElement.outerHTML"))  # the browser's own reading of the page
-    assert read.rows[1:] == [list(row) for row in lay_out(build_table([run])).cells]
+    assert read.rows[1:] == [list(row) for row in lay_out(build_table([run])).rows]
     assert browser.ask("document.querySelectorAll('svg[role=img]').length") >= 4
     assert browser.complaints == []
     assert [url for url in browser.requests if not url.startswith("data:")] == [page.as_uri()]

@@ -133,7 +133,7 @@ def test_the_table_of_the_page_is_the_json_report() -> None:
     page, table = Page(full_page()), build_table([run])
     assert page.data == json.loads(render(table, "json"))["rows"]
     layout = lay_out(table)
-    assert page.rows == [[column.title for column in layout.columns], *map(list, layout.cells)]
+    assert page.rows == [layout.titles, *map(list, layout.rows)]
 
 
 def test_the_json_report_is_in_the_page_for_programs() -> None:

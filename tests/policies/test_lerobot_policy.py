@@ -28,7 +28,7 @@ from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import EnvSpec
 from vla_eval.testing import check_policy
-from vla_eval.testing.tiny_models import make_tiny_pi0
+from vla_eval.testing.tiny_models import make_tiny
 
 pytestmark = pytest.mark.usefixtures("no_network")
 backbone, env = small_checkpoints.backbone, small_checkpoints.env
@@ -70,7 +70,7 @@ class TestContract:
     def test_in_one_pass_an_episodes_bits_are_its_own_whoever_is_beside_it(
         self, request: pytest.FixtureRequest, env: EnvSpec, family: str
     ) -> None:
-        maker: Any = make_tiny_pi0 if family == "pi0" else make_lerobot
+        maker: Any = make_tiny if family == "pi0" else make_lerobot
         checkpoint = str(request.getfixturevalue(family))
         policy = maker(dataclasses.replace(context_for(env), n_slots=3), checkpoint=checkpoint)
         passes = _count_passes(policy)
@@ -96,7 +96,7 @@ class TestContract:
         assert record.n_inferences == 3  # 9 steps, 3 actions each
 
     def test_the_noise_is_the_episodes_own(self, pi0: Path, env: EnvSpec) -> None:
-        policy = make_tiny_pi0(context_for(env), checkpoint=str(pi0))
+        policy = make_tiny(context_for(env), checkpoint=str(pi0))
 
         def actions(seed: int, run: int, step: int) -> bytes:
             policy.reset([start(seed=seed, run=run)])
@@ -109,7 +109,7 @@ class TestContract:
         assert len({once, actions(2, 0, 0), actions(1, 1, 0), actions(1, 0, 4)}) == 4
 
     def test_drawing_leaves_the_global_generator_alone(self, pi0: Path, env: EnvSpec) -> None:
-        policy = make_tiny_pi0(context_for(env), checkpoint=str(pi0))
+        policy = make_tiny(context_for(env), checkpoint=str(pi0))
         policy.reset([start()])
         torch.manual_seed(7)
         expected = torch.rand(1)

@@ -1,9 +1,10 @@
 """Stored runs made of letters, for the tests of tables: `+` success, `-` failure, `e` error."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 from vla_eval.records import EpisodeError, EpisodeRecord
-from vla_eval.results.report import Row, Table
+from vla_eval.results.report import Table
 from vla_eval.storage.run_folder import RunDescription, StoredRun
 
 COLOR, INTERCEPT = "RememberColor3-v0", "InterceptMedium-v0"
@@ -40,10 +41,15 @@ def stored(*groups: list[EpisodeRecord], path: str = "runs/a", **config: object)
     return StoredRun(path=Path(path), description=description, records=tuple(r for g in groups for r in g))
 
 
-def only_row(table: Table, policy: str, **values: object) -> Row:
+def cells_of(table: Table) -> list[SimpleNamespace]:
+    """The rows by the names of the columns of CSV and JSON."""
+    return [SimpleNamespace(**row.to_dict()) for row in table.rows]
+
+
+def only_row(table: Table, policy: str, **values: object) -> SimpleNamespace:
     (row,) = (
         row
-        for row in table.rows
+        for row in cells_of(table)
         if row.policy == policy and all(getattr(row, name) == value for name, value in values.items())
     )
     return row

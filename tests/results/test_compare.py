@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.evaluation.resolved import evaluate
 from tests.results.stored_runs import stored
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
-from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.power import discordance_of_independent, episodes_to_settle
@@ -52,13 +52,13 @@ def row(sweep: Sweep, policy: str, k: int) -> SweepRow:
 
 def test_each_k_is_compared_with_the_smallest_on_the_same_seeds() -> None:
     sweep = compare_runs([stored(episodes("p", 4, "++--"), episodes("p", 1, "+++-"), episodes("q", 8, "+"))])
-    test = row(sweep, "p", 4).test
-    assert test is not None
-    assert row(sweep, "p", 4).reference == RowKey(TASK, "p", 1, None)
+    found = row(sweep, "p", 4).comparison
+    assert found is not None and found.baseline == RowKey(TASK, "p", 1, None)
+    test = found.test
     assert (test.difference, test.n_pairs) == (-0.25, 4)
     assert test.p_value == 1.0  # one differing pair: two-sided binomial of 0 in 1
-    assert row(sweep, "p", 1).test is None
-    assert row(sweep, "q", 8).test is None  # nothing of its own to compare with
+    assert row(sweep, "p", 1).comparison is None
+    assert row(sweep, "q", 8).comparison is None  # nothing of its own to compare with
     assert sweep.n_comparisons == 1
 
 
@@ -67,9 +67,9 @@ def test_policies_are_compared_at_the_same_k_and_p_is_corrected_for_all() -> Non
     groups = [episodes("good", k, won) for k in (1, 4)] + [episodes("bad", k, lost) for k in (1, 4)]
     sweep = compare_runs([stored(*groups)], by="policy", reference="bad")
     for k in (1, 4):
-        found = row(sweep, "good", k)
-        assert found.reference == RowKey(TASK, "bad", k, None)
-        assert found.test is not None and found.test.p_value == pytest.approx(2 * 0.5**8)
+        found = row(sweep, "good", k).comparison
+        assert found is not None and found.baseline == RowKey(TASK, "bad", k, None)
+        assert found.test.p_value == pytest.approx(2 * 0.5**8)
         assert found.corrected_p == pytest.approx(2 * 2 * 0.5**8)  # two comparisons
 
 

@@ -39,7 +39,7 @@ def test_a_stated_mean_agrees_with_its_rates() -> None:
 def test_unknown_values_are_dashes_and_contested_ones_are_marked() -> None:
     rates, how = published_side_tables(BOARD)
     rows = {(row[0], row[1]): row for row in rates.rows}
-    assert rows["Chameleon", "—"][2:7] == ["—"] * 5
+    assert list(rows["Chameleon", "—"][2:7]) == ["—"] * 5
     assert rows["RATE", "—"][3] == "0.32 ± 0.02 ‡"
     assert any("0.09 ± 0.03 in the appendix" in note for note in rates.notes)
     assert {row[0] for row in how.rows} == {row[0] for row in rates.rows}

@@ -3,10 +3,20 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from tests.results.stored_runs import COLOR, INTERCEPT, episode, episodes, has_note, only_row, stored
+from tests.results.stored_runs import (
+    COLOR,
+    INTERCEPT,
+    cells_of,
+    episode,
+    episodes,
+    has_note,
+    only_row,
+    stored,
+)
 from vla_eval.errors import ReportError
 from vla_eval.results.report import build_table, render
 from vla_eval.storage.run_file import Change, JsonValue
@@ -25,7 +35,7 @@ def test_a_row_of_errors_only_is_undefined_everywhere() -> None:
     table = build_table([stored(episodes("p", "ee"))])
     row = only_row(table, "p")
     assert (row.n_episodes, row.n_errors, row.n_runs) == (0, 2, 0)
-    defined = {name for name, value in row.to_dict().items() if value is not None}
+    defined = {name for name, value in vars(row).items() if value is not None}
     # What is counted, what it is, and what chance is on this task, which no episode is needed for.
     assert defined == {
         *("task", "policy", "n_action_steps", "n_episodes", "n_errors", "n_runs"),
@@ -62,9 +72,10 @@ def test_the_runs_of_a_row_are_rows_of_the_wide_table_and_none_of_the_other() ->
     records = [*episodes("p", "++++"), *episodes("p", "+-+-", run=1), *episodes("random", "----")]
     table = build_table([stored(records)])
 
-    assert [(row.policy, row.success_once) for row in table.rows] == [("p", 0.75), ("random", 0.0)]
-    assert [(row.run, row.n_episodes, row.success_once) for row in table.run_rows] == [(0, 4, 1), (1, 4, 0.5)]
-    assert all(row.paired_difference is None for row in table.run_rows)
+    assert [(row.policy, row.success_once) for row in cells_of(table)] == [("p", 0.75), ("random", 0.0)]
+    runs = [SimpleNamespace(**row.to_dict()) for row in table.run_rows]
+    assert [(row.run, row.n_episodes, row.success_once) for row in runs] == [(0, 4, 1), (1, 4, 0.5)]
+    assert all(row.paired_difference is None for row in runs)
     first_column = [
         line.split("|")[2].strip()
         for line in render(table, "markdown", wide=True).splitlines()
@@ -270,7 +281,7 @@ def test_runs_with_other_settings_are_never_put_together(changed: dict[str, obje
             stored(episodes("p", "--"), path="runs/b", **{"task_versions": {COLOR: 1}, **changed}),
         ]
     )
-    assert [row.n_episodes for row in table.rows] == [2, 2]
+    assert [row.n_episodes for row in cells_of(table)] == [2, 2]
     assert len({row.variant for row in table.rows}) == 2 and None not in {row.variant for row in table.rows}
     assert "| variant" in render(table, "markdown")
 

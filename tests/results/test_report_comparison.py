@@ -2,7 +2,16 @@
 
 import pytest
 
-from tests.results.stored_runs import COLOR, INTERCEPT, episode, episodes, has_note, only_row, stored
+from tests.results.stored_runs import (
+    COLOR,
+    INTERCEPT,
+    cells_of,
+    episode,
+    episodes,
+    has_note,
+    only_row,
+    stored,
+)
 from vla_eval.errors import UnknownNameError
 from vla_eval.results.report import build_table, render
 
@@ -124,8 +133,9 @@ def test_without_a_baseline_no_column_is_empty() -> None:
 
 def test_without_random_there_is_no_comparison_and_no_complaint() -> None:
     table = build_table([stored(episodes("p", "+"))])
-    assert table.baselines == () and table.rows[0].baseline is None
-    assert table.rows[0].paired_difference is None
+    (row,) = cells_of(table)
+    assert table.baselines == () and row.baseline is None
+    assert row.paired_difference is None
 
 
 # ------------------------------------------------------------------------------- chance and ceiling
@@ -154,7 +164,8 @@ def test_chance_follows_the_number_of_candidates_that_the_episodes_had() -> None
 def test_chance_is_not_guessed_where_there_is_nothing_to_choose_from() -> None:
     records = episodes("p", "+-", task=INTERCEPT, n_candidates=None, first_choice_success=None)
     table = build_table([stored(records)])
-    assert (table.rows[0].chance, table.rows[0].chance_source) == (None, None)
+    (row,) = cells_of(table)
+    assert (row.chance, row.chance_source) == (None, None)
     assert has_note(table, "chance is unknown for InterceptMedium-v0 K=1", "run `cue_blind`")
 
 

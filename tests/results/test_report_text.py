@@ -13,10 +13,8 @@ import pytest
 
 from tests.results.stored_runs import episode, episodes, stored
 from vla_eval.cli import report as report_verb
-from vla_eval.cli.shared import output
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.results.report import FORMATS, Format, Table, build_table, render
-from vla_eval.results.table_formats import PRESETS
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import RunFolder
 
@@ -211,10 +209,6 @@ def test_the_baseline_random_is_an_error_only_if_it_was_asked_for(tmp_path: Path
     assert report_verb.run(arguments(str(tmp_path / "demo"))) == 0
     with pytest.raises(UnknownNameError, match="there is no policy 'random'"):
         report_verb.run(arguments(str(tmp_path / "demo"), "--baseline", "random"))
-
-
-def test_report_offers_the_formats_that_there_are() -> None:
-    assert (output.FORMATS, output.PRESETS) == (FORMATS, PRESETS)
 
 
 def test_help_does_not_wait_for_scipy_and_a_report_needs_no_torch(run_folder: Path) -> None:

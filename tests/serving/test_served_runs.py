@@ -7,9 +7,9 @@ import pytest
 
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
+from tests.evaluation.resolved import evaluate
 from tests.serving.served_policies import CountingPolicy, serving
 from vla_eval.errors import TooManyErrorsError
-from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeRecord
 from vla_eval.workers.load import Load

@@ -19,12 +19,17 @@ from torch import Tensor
 
 from tests.models.octo.tiny_octo import GOLDEN as GOLDEN_OCTO
 from tests.models.original_names import openvla_names, spatialvla_names
-from vla_eval.checkpoints.conversion import octo, openvla, spatialvla
-from vla_eval.checkpoints.conversion import spatialvla_described as spatialvla_files
 from vla_eval.checkpoints.loading import make_unfilled_policy
+from vla_eval.models.families import bases
+from vla_eval.models.octo import conversion as octo
 from vla_eval.models.octo import flax_names
+from vla_eval.models.openvla import conversion as openvla
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.models.shared.weight_file import write_weights
+from vla_eval.models.spatialvla import conversion as spatialvla
+from vla_eval.models.spatialvla import described as spatialvla_files
 from vla_eval.models.spatialvla.action_grid import AXES, uniform_grid
+from vla_eval.models.spatialvla.conversion_options import SpatialVLAOptions
 from vla_eval.models.spatialvla.sizes import NetworkSizes
 from vla_eval.testing.random_checkpoint import random_parts
 
@@ -46,7 +51,7 @@ WORDS = (
 
 def write_openvla(folder: Path) -> None:
     """Write an OpenVLA of 7.5 billion parameters in shards."""
-    config = openvla._config(folder, openvla.ConvertOptions(gripper="unit_open", image_augmentation=False))
+    config = openvla._config(folder, OpenVLAOptions(gripper="unit_open", image_augmentation=False))
     policy = make_unfilled_policy(config)
     _write_shards(folder, openvla_names(_own(policy)))
     _write_json(
@@ -92,16 +97,16 @@ def write_spatialvla(folder: Path) -> None:
     _write_json(folder / spatialvla_files.PROCESSOR_FILE, processor)
     _write_json(folder / spatialvla_files.IMAGES_FILE, _stated(spatialvla_files._images(sizes)))
     policy = make_unfilled_policy(
-        spatialvla._config(folder, processor, spatialvla.ConvertOptions(), has_own_head=False)
+        spatialvla._config(folder, processor, SpatialVLAOptions(), has_own_head=False)
     )
     _write_shards(folder, spatialvla_names(_own(policy)))
     words = {"<pad>": 0, "<eos>": 1, "<bos>": 2, "<unk>": 3, "\n": NEWLINE}
     _write_words(folder, words, bos="<bos>", eos="<eos>", pad="<pad>")
 
 
-def write_octo(size: octo.Size, folder: Path) -> None:
+def write_octo(size: str, folder: Path) -> None:
     """Write an Octo in flax's msgpack; its configuration is known by its size."""
-    fields = {**octo.SIZES[size], "tokenizer_name": "bytes", "gripper_encoding": "unit_open"}
+    fields = {**bases()[f"octo_{size}"].fields, "tokenizer_name": "bytes", "gripper_encoding": "unit_open"}
     config = octo.octo_config(fields)
     ours: dict[str, Tensor] = make_unfilled_policy(config).state_dict()
     statistics = {"action": {"mean": [0.0] * 7, "std": [1.0] * 7, "max": [1.0] * 7}}
@@ -109,7 +114,7 @@ def write_octo(size: octo.Size, folder: Path) -> None:
     keys = {
         key
         for key in _octo_keys(max(config.layers, config.t5_sizes.layers))
-        if flax_names.our_name(key) in ours
+        if (rule := flax_names._rule(key)) is not None and rule.name in ours
     }
     with (folder / "checkpoint").open("wb") as file:
         _pack_map(file.write, _tree(keys), lambda key: _of_flax(key, ours, config.heads))

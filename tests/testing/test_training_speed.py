@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import torch
 
 from vla_eval.features import ACTION_KEY
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
 from vla_eval.testing.training_speed import in_segments, measure_steps
 
 

@@ -60,13 +60,34 @@ class Tiny:
     built: Callable[[], AbstractContextManager[None]] = nullcontext
 
 
+def write_tiny_clip(folder: Path) -> Path:
+    """Save a tiny CLIP with random weights, and its tokenizer, for the multi-task DiT; return its folder."""
+    from transformers import CLIPConfig, CLIPModel
+
+    tiny_models.write_tiny_tokenizer(folder)
+    sizes = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config: Any = CLIPConfig
+    model: Any = CLIPModel
+    made = config(
+        text_config={
+            **sizes,
+            "vocab_size": tiny_models.VOCABULARY,
+            "eos_token_id": tiny_models.SPECIAL_TOKENS.index("<eos>"),
+        },
+        vision_config={**sizes, "image_size": 32, "patch_size": 16},
+        projection_dim=16,
+    )
+    model(made).save_pretrained(str(folder))
+    return folder
+
+
 def clip(folder: Path) -> Mapping[str, Any]:
     """Write a tiny CLIP, and return the fields of a multi-task DiT that name it."""
-    name = str(tiny_models.write_tiny_clip(folder / "clip"))
+    name = str(write_tiny_clip(folder / "clip"))
     return {"vision_encoder_name": name, "text_encoder_name": name}
 
 
-def paligemma(family: tiny_models.Family) -> Tiny:
+def paligemma(family: str) -> Tiny:
     return Tiny(fields=PALIGEMMA, tokenizer=True, built=lambda: tiny_models.tiny_paligemma(family))
 
 

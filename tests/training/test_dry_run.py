@@ -11,9 +11,10 @@ from torch import nn
 from tests.training import tiny_trainings
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe
+from vla_eval.models.families import family_of
 from vla_eval.training import dry_run
 from vla_eval.training.cost.estimate import ASSUMED_STEPS, RateWatch, estimate, unfilled_model
-from vla_eval.training.cost.sample_cost import SAVED_PER_LINEAR, count, sample_cost
+from vla_eval.training.cost.sample_cost import count, sample_cost
 from vla_eval.training.dry_run import DryRunOptions, assumed_config, describe_finetuning
 from vla_eval.training.finetune import finetune
 from vla_eval.training.request import load_finetune_recipe
@@ -71,7 +72,7 @@ def test_operations_and_activations_are_those_of_the_layers_that_gradients_reach
     trunk, head = 2 * 10 * 20 * tokens, 2 * (20 * 30 + 30 * 7) * 2
     assert cost.inference_operations == trunk + head
     assert cost.step_operations == trunk + 3 * head  # forward; by weights and by inputs for the head alone
-    kept, working = SAVED_PER_LINEAR * 2 * (20 + 30 + 30 + 7), tokens * (10 + 20)
+    kept, working = family_of(config.type).saved_per_linear * 2 * (20 + 30 + 30 + 7), tokens * (10 + 20)
     assert cost.saved_bytes == pytest.approx(4 * (kept + working))
     assert cost.inference_bytes == 4 * tokens * (10 + 20)  # no layer has more than one of these matrices
     assert sample_cost(Network(), SimpleNamespace(type="groot")) is None

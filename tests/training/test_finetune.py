@@ -32,7 +32,7 @@ from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import SeedRange
-from vla_eval.testing.tiny_models import Family, make_tiny_pi0, tiny_paligemma, write_tiny_smolvlm
+from vla_eval.testing.tiny_models import make_tiny, tiny_paligemma, write_tiny_smolvlm
 from vla_eval.training.finetune import finetune
 
 pytestmark = pytest.mark.usefixtures("small_act")
@@ -153,7 +153,7 @@ class TestRuns:
     ) -> None:
         straight, broken = tmp_path / "straight", tmp_path / "broken"
         lines: list[str] = []
-        with tiny_paligemma():
+        with tiny_paligemma("pi0"):
             finetune(pi0(recorded, straight, tokenizer), say=lines.append)
             with killed_at(3):
                 finetune(pi0(recorded, broken, tokenizer))
@@ -164,7 +164,7 @@ class TestRuns:
         # 55 frames in 4 episodes; chunks of 4 must end within: the last 3 frames of each begin none.
         assert any("43 of 55 frames" in line for line in lines)
         tokenizer.rename(tmp_path / "gone")  # the checkpoint has its own
-        assert run_an_episode(make_tiny_pi0(context(), checkpoint=str(straight))) == 3
+        assert run_an_episode(make_tiny(context(), checkpoint=str(straight))) == 3
 
     def test_lora_trains_adapters_on_a_base_and_is_evaluated_with_it(
         self, recorded: Path, tmp_path: Path, tokenizer: Path, killed_at: KilledAt
@@ -172,7 +172,7 @@ class TestRuns:
         base, lora = tmp_path / "base", tmp_path / "lora"
         changes: dict[str, Any] = {"base_checkpoint": str(base), "lora": {"rank": 4}}
         lines: list[str] = []
-        with tiny_paligemma():
+        with tiny_paligemma("pi0"):
             finetune(pi0(recorded, base, tokenizer, steps=2))
             facts = read_facts(find_checkpoint(base))
             assert facts is not None
@@ -194,11 +194,11 @@ class TestRuns:
         trained = next(line for line in lines if line.startswith("trained:"))
         n_trained, n_all = (int(word.replace(",", "")) for word in trained.split() if word[0].isdigit())
         assert 0 < n_trained < n_all / 4
-        assert run_an_episode(make_tiny_pi0(context(), checkpoint=str(lora))) == 3
+        assert run_an_episode(make_tiny(context(), checkpoint=str(lora))) == 3
 
         (base / "train").rename(base / "moved")
         with pytest.raises(CheckpointError, match=r"Name its folder with `base_checkpoint`"):
-            make_tiny_pi0(context(), checkpoint=str(lora))
+            make_tiny(context(), checkpoint=str(lora))
 
     @pytest.mark.parametrize(
         ("family", "projections"),
@@ -208,7 +208,7 @@ class TestRuns:
         ],
     )
     def test_lora_reaches_the_experts_attention_and_all_its_projections(
-        self, recorded: Path, tmp_path: Path, tokenizer: Path, family: Family, projections: set[str]
+        self, recorded: Path, tmp_path: Path, tokenizer: Path, family: str, projections: set[str]
     ) -> None:
         """lerobot 0.6.1 looks for π0.5's projections of time under π0's names, and leaves them frozen."""
         recipe = recorded.parent / "tiny_pi0.yaml"
@@ -227,7 +227,7 @@ class TestRuns:
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:
         base, trace = tmp_path / "base", tmp_path / "it-ran"
-        with tiny_paligemma():
+        with tiny_paligemma("pi0"):
             finetune(pi0(recorded, base, tokenizer, steps=2))
             file = find_checkpoint(base) / "policy_preprocessor.json"
             data = json.loads(file.read_text())
@@ -263,7 +263,7 @@ class TestRuns:
         self, recorded: Path, tmp_path: Path, tokenizer: Path
     ) -> None:
         base = tmp_path / "base"
-        with tiny_paligemma():
+        with tiny_paligemma("pi0"):
             finetune(pi0(recorded, base, tokenizer, steps=2))
             file = find_checkpoint(base) / "model.safetensors"
             tensors = load_file(file)
@@ -278,7 +278,7 @@ class TestRuns:
         run = tmp_path / "run"
         with tiny_paligemma("pi05"):
             finetune(pi0(recorded, run, tokenizer, steps=2))
-        policy = make_tiny_pi0(context(), family="pi05", checkpoint=str(run))
+        policy = make_tiny(context(), checkpoint=str(run))
         assert run_an_episode(policy) == 3
 
     def test_a_tiny_smolvla_goes_the_whole_way(self, recorded: Path, tmp_path: Path) -> None:

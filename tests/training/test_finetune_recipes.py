@@ -19,7 +19,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, manifest_sha256, write_entry
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot.policy import make_lerobot
-from vla_eval.testing.tiny_models import TINY_POLICY, Family, tiny_paligemma
+from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma
 from vla_eval.training.cost.description import describe_model
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
@@ -196,7 +196,7 @@ def test_every_shipped_recipe_is_one_that_lerobot_accepts(recorded: Path, tmp_pa
 
 
 @pytest.mark.parametrize("family", ["pi0", "pi05"])
-def test_the_expert_alone_is_trained_and_the_language_model_is_not(recorded: Path, family: Family) -> None:
+def test_the_expert_alone_is_trained_and_the_language_model_is_not(recorded: Path, family: str) -> None:
     changes = {"base_checkpoint": None, "rename_cameras": {}, "policy": TINY_POLICY}
     config = FinetuneConfig(policy=f"{family}_expert", dataset=str(recorded), finetune=changes)
     dataset = training_dataset(recorded, allow_unreplayed=True)

@@ -18,7 +18,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
 from vla_eval.errors import MissingDependencyError, RecipeError, UnknownNameError
-from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.storage.run_folder import read_run
 from vla_eval.training import held_out as held_out_module
 from vla_eval.training.dataset import training_dataset
@@ -78,9 +78,9 @@ def quick_evaluation(monkeypatch: pytest.MonkeyPatch) -> list[EvalConfig]:
 
     def quick(config: EvalConfig, **options: Any) -> Any:
         seen.append(config)
-        return evaluate(dataclasses.replace(config, policies=("random",)), **options)
+        return resolve(dataclasses.replace(config, policies=("random",)), **options)
 
-    monkeypatch.setattr(held_out_module, "evaluate", quick)
+    monkeypatch.setattr(held_out_module, "resolve", quick)
     return seen
 
 

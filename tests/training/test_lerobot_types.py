@@ -27,12 +27,12 @@ from tests.checkpoints.small_checkpoints import (
 )
 from tests.training.lerobot_tiny import TINY, Tiny, lerobots_types
 from vla_eval.checkpoints.loading import LoadOptions, make_empty_policy
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, CANNOT_BE_ASKED
 from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, MissingDependencyError, SpecMismatchError, VlaEvalError
+from vla_eval.models.families import FAMILIES, family_of
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.rollout import RolloutSettings, rollout
@@ -132,9 +132,10 @@ def refusal(kind: str, exc: VlaEvalError) -> str:
     if isinstance(exc, MissingDependencyError):
         (package,) = re.findall(r"'(\S+)' is required but not installed", str(exc))
         return f"needs the package {package}"
-    if kind in CANNOT_BE_ASKED:
-        assert CANNOT_BE_ASKED[kind] in str(exc)
-        return f"no: {CANNOT_BE_ASKED[kind]}"
+    why_not = family_of(kind).why_not
+    if why_not:
+        assert why_not in str(exc)
+        return f"no: {why_not}"
     assert isinstance(exc, CheckpointError)
     (named,) = re.findall(r"its configuration names (.+?)\. Give", str(exc))
     return f"needs {named}"
@@ -168,7 +169,7 @@ def test_the_table_says_what_becomes_of_each_type(
     assert table()[kind] == Outcome(found.trained, found.evaluated or "the same")
 
 
-@pytest.fixture(params=sorted(ASKED_FOR_STEPS))
+@pytest.fixture(params=sorted(kind for kind, family in FAMILIES.items() if family.queues))
 def by_step(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
     with built(request.param) as tiny:
         yield saved_by_lerobot(request.param, tiny, tmp_path / "model")

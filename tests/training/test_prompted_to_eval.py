@@ -20,7 +20,7 @@ from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, SpecMismatchError
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.lerobot.openvla_paper import make_openvla
+from vla_eval.policies.lerobot.paper_compat import make_paper_compat
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune
@@ -54,7 +54,7 @@ def run(ported: Ported, checkpoint: Path, n_action_steps: int, **args: Any) -> A
     env: Any = make_env(EnvSettings(task=TASK, simulator="fake", cameras=("base_camera", "hand_camera")))
     chunking = ChunkingSpec(n_action_steps=n_action_steps)
     context = PolicyContext(name="p", env=env.spec, chunking=chunking, n_candidates=3, n_slots=1)
-    make: Any = make_openvla if ported is OPENVLA else make_lerobot
+    make: Any = make_paper_compat if ported is OPENVLA else make_lerobot
     policy = make(context, checkpoint=str(checkpoint), device="cpu", **args)
     start = EpisodeStart(slot=0, task=TASK, seed=1, run=0, instruction="touch it", horizon_steps=8)
     (record,) = rollout(env, policy, [start], RolloutSettings(chunking=chunking))

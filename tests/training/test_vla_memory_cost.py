@@ -8,7 +8,9 @@ import torch
 
 from tests.models.vla_memory.tiny_vlas import FAMILIES, batch_of, made
 from tests.testing.script_files import load_script
-from vla_eval.training.cost.network_stages import EPISODE_STEPS, STAGES, stage_of
+from vla_eval.models.families import family_of
+from vla_eval.models.family import imported
+from vla_eval.models.shared.stages import EPISODE_STEPS, stage_of
 from vla_eval.training.cost.sample_cost import count, sample_cost
 
 TOKENS = {"memory_tokens": 3, "token_stride": 4, "token_segments": 2}
@@ -16,7 +18,7 @@ TOKENS = {"memory_tokens": 3, "token_stride": 4, "token_segments": 2}
 
 def tokens_of(policy: object, name: str) -> int:
     config = policy.config  # type: ignore[attr-defined]
-    return stage_of(STAGES[config.type](config), name).tokens
+    return stage_of(imported(family_of(config.type).stages)(config), name).tokens
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from rerun.experimental import RrdReader
 
+from tests.evaluation.resolved import evaluate, fingerprint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
@@ -19,8 +20,6 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, VlaEvalError
-from vla_eval.evaluation.evaluate import evaluate
-from vla_eval.evaluation.fingerprint import fingerprint
 from vla_eval.page.filmstrip import write_filmstrips
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout

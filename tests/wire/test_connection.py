@@ -164,8 +164,8 @@ def test_the_api_key_goes_into_a_header_and_a_missing_one_is_named() -> None:
         "",
     ],
 )
-def test_what_is_no_address_is_refused(url: str) -> None:
-    with pytest.raises(RecipeError, match="no address of a policy server"):
+def test_what_is_not_an_address_is_refused(url: str) -> None:
+    with pytest.raises(RecipeError, match="is not the address of a policy server"):
         split_urls(f"ws://good:1,{url}")
 
 

@@ -10,12 +10,13 @@ import pytest
 
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.cluster import pool as pool_module
-from vla_eval.workers.cluster.actor import Place, WorkerSpec
+from vla_eval.workers.cluster.actor import Place
 from vla_eval.workers.cluster.machines import Machine
 from vla_eval.workers.cluster.pool import MAX_JOBS_PER_CALL, MAX_LOSSES, ClusterPool
 from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered
 from vla_eval.workers.messages import Failed
+from vla_eval.workers.process import WorkerSpec
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,8 @@ class OneMachine:
 def run(ray: StandIn, jobs: Sequence[Job], monkeypatch: pytest.MonkeyPatch) -> list[Answered[Job, Any]]:
     monkeypatch.setattr(pool_module, "on_machine", lambda node: node)
     place = Place(folder=".", variables={}, path=(), logs=str(Path.cwd()))
-    spec = WorkerSpec(main=print, answers=(), timeouts=TimeoutConfig(), preload=(), place=place)
-    pool: ClusterPool[Job, Any] = ClusterPool(ray, OneMachine(), spec, size=2)  # type: ignore[arg-type]
+    spec = WorkerSpec(main=print, answers=(), timeouts=TimeoutConfig(), logs=Path.cwd())
+    pool: ClusterPool[Job, Any] = ClusterPool(ray, OneMachine(), spec, place, size=2)  # type: ignore[arg-type]
     with pool as running:
         return [event for event in running.run(JobList(jobs)) if isinstance(event, Answered)]
 

@@ -67,6 +67,7 @@ import os, sys, time
 from multiprocessing import forkserver
 from pathlib import Path
 from vla_eval.evaluation import evaluate as evaluate_module
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.strict.decoding import decode
 from vla_eval.config.evaluation import EvalConfig
 
@@ -81,7 +82,7 @@ class Observer(evaluate_module.Silence):
 data = {"name": "t", "tasks": ["RememberColor3-v0"], "policies": ["random", "hold"], "episodes": 2,
         "simulator": "fake", "workers": 1, "timeouts": {"setup_seconds": float(sys.argv[3])}}
 config = decode(EvalConfig, data, where="t")
-summary = evaluate_module.evaluate(config, out=Path(sys.argv[2]), observer=Observer())
+summary = evaluate_module.evaluate(resolve(config, out=Path(sys.argv[2])), observer=Observer())
 print(summary.n_errors, summary.n_open)
 """
 

@@ -44,11 +44,11 @@ def kind_of(task: TaskSpec) -> Kind:
     """
     if not task.oracle:
         return "unscripted"
-    if task.suite != "paper" and task.has_candidates:
+    if task.is_official and task.has_candidates:
         return "search" if task.waits_for_choice or task.phase_source == "none" else "choice"
     if task.candidates is None:
         return task.seen_in_one_frame or "no_choice"
-    return "several" if "n_shown" in task.kwargs else "choice"
+    return "several" if task.several_right else "choice"
 
 
 def protocols_of(tasks: Sequence[str], wanted: Sequence[AuditProtocol]) -> tuple[AuditProtocol, ...]:
@@ -58,7 +58,7 @@ def protocols_of(tasks: Sequence[str], wanted: Sequence[AuditProtocol]) -> tuple
         UnknownNameError: a task that is not in the catalogue.
         RecipeError: tasks of this package and of the official one.
     """
-    official = {task: task_spec(task).suite != "paper" for task in tasks}
+    official = {task: task_spec(task).is_official for task in tasks}
     if not any(official.values()):
         return tuple(wanted)
     if not all(official.values()):

@@ -29,11 +29,7 @@ WITHOUT = "Without trained weights: --set policy.pretrained_backbone_weights=nul
 
 
 def check_backbone(folder: Path, name: str) -> str:
-    """Compare the names and shapes of a backbone's weights with torchvision's network; return a line.
-
-    Args:
-        folder: with the weights.
-        name: of the base, which is torchvision's of the network.
+    """Compare the names and shapes of a backbone's weights with torchvision's network `name`; return a line.
 
     Raises:
         CheckpointError: weights are missing, unexpected or of another shape.
@@ -58,11 +54,7 @@ def check_backbone(folder: Path, name: str) -> str:
 
 @contextlib.contextmanager
 def fetched_backbones() -> Iterator[None]:
-    """Let torchvision take trained weights from fetched folders within the context.
-
-    Raises:
-        CheckpointError: from within, where such a folder is not there.
-    """
+    """Let torchvision take trained weights from fetched folders within the context; they have to exist."""
     download = WeightsEnum.get_state_dict
 
     def read(self: WeightsEnum, *args: Any, **kwargs: Any) -> Mapping[str, Any]:

@@ -30,9 +30,6 @@ def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
         cls: lerobot's configuration class.
         data: of the file, without `type`. Fields that the class does not have are left to lerobot.
         where: the file, for messages.
-
-    Raises:
-        CheckpointError: a field is of another type, or out of its range.
     """
     hints = get_type_hints(cls)
     for field in dataclasses.fields(cls):
@@ -60,11 +57,7 @@ def _check_most(where: str, name: str, value: object) -> None:
 
 
 def check_features(config: Any, *, where: str) -> None:
-    """Refuse a policy that has no inputs or no actions, or whose fields have impossible shapes.
-
-    Raises:
-        CheckpointError: it is so.
-    """
+    """Raise `CheckpointError` for a policy without inputs or actions, or with impossible shapes."""
     for name in ("input_features", "output_features"):
         features = getattr(config, name) or {}
         if not features:

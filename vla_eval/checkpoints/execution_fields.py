@@ -7,12 +7,11 @@ checkpoint. A test compares this table with the installed lerobot. Standard libr
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any  # JSON of another program
 
-from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, read_json
-from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
+from vla_eval.checkpoints.files import CONFIG_FILE, read_json
+from vla_eval.checkpoints.notes import checkpoint_folder
 from vla_eval.chunking import ChunkingSpec
 
 RTC = "real-time chunking is of LeRobot's rollouts; here a chunk does not depend on the one before"
@@ -62,18 +61,12 @@ def ignored_fields(
 ) -> tuple[str, ...]:
     """Return a sentence for each field of a policy's checkpoint that asks for what is not done here.
 
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-        chunking: of the evaluation; None: it is the client's.
-
-    Raises:
-        CheckpointError: there is no checkpoint, or its configuration is damaged.
+    The policy is given by a recipe's adapter and args. Without `chunking`, it is the client's.
     """
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
         return ()
-    file = find_checkpoint(Path(checkpoint)) / CONFIG_FILE
+    file = folder / CONFIG_FILE
     data = read_json(file)
     return tuple(
         f"{file}: {name} = {value!r:.200} is ignored: {answer.instead.format(value=value)}."

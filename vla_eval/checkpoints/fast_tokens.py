@@ -39,11 +39,7 @@ class FastActionTokenizer:
         self.bpe_tokenizer, self.scale, self.min_token = bpe_tokenizer, scale, min_token
 
     def __call__(self, actions: ArrayLike) -> list[list[int]]:
-        """Return the tokens of each chunk.
-
-        Args:
-            actions: (B, T, action) normalised.
-        """
+        """Return the tokens of each chunk of normalised actions (B, T, action)."""
         # The stubs of scipy know lists of one number only.
         coefficients: Any = dct(np.asarray(actions, dtype=np.float64), axis=1, norm="ortho")
         characters = np.maximum(np.around(coefficients * self.scale) - self.min_token, 0).astype(int)
@@ -89,11 +85,7 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
 
 
 def _vocabulary(name: str) -> Any:
-    """Return the byte-pair encoding, which lies beside the settings, or in `VOCABULARY_FOLDER`.
-
-    Raises:
-        OSError, ValueError: it is in neither.
-    """
+    """Return the byte-pair encoding, which lies beside the settings, or in `VOCABULARY_FOLDER`."""
     tokenizer: Any = PreTrainedTokenizerFast
     try:
         return tokenizer.from_pretrained(name)

@@ -21,10 +21,10 @@ from huggingface_hub.errors import GatedRepoError, HFValidationError
 from huggingface_hub.file_download import http_get
 from huggingface_hub.utils import build_hf_headers, filter_repo_objects  # type: ignore[attr-defined]
 
-from vla_eval.checkpoints.bases import Base, Source
 from vla_eval.checkpoints.files import BASE_FILE, file_sha256, find_checkpoint
 from vla_eval.errors import CheckpointError, some_of
 from vla_eval.lock.switch import let_connect, let_write
+from vla_eval.models.family import Base, Source
 
 DOWNLOADS = ".downloads"
 PARTIAL_SUFFIX = ".part"
@@ -42,14 +42,7 @@ class RemoteFile(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemotePart:
-    """What is fetched of one repository.
-
-    Attributes:
-        source: see there.
-        commit: the version.
-        licence: as the repository states it; None if it states none.
-        files: name -> size and digest.
-    """
+    """What is fetched of one repository: the commit, the licence if it states one, and its files by name."""
 
     source: Source
     commit: str
@@ -65,7 +58,7 @@ class RemotePart:
 def fetch_base(
     base: Base, out: Path, *, revision: str | None = None, api: HfApi | None = None, say: Say
 ) -> Path:
-    """Make the folder of a base checkpoint; one that is there is only checked.
+    """Make the folder `out` of a base checkpoint; one that is there is only checked.
 
     Args:
         base: which.
@@ -75,8 +68,7 @@ def fetch_base(
         say: gets lines for a person.
 
     Raises:
-        CheckpointError: the Hub cannot be reached or refuses, the disk is too small, or a file is damaged or
-            not of this model.
+        CheckpointError: the Hub refuses or is not there, the disk is too small, or a file is damaged.
     """
     if out.exists():
         say(f"{out} is there: {_check(base, out)}")
@@ -160,7 +152,7 @@ def _check_disk(base: Base, parts: list[RemotePart], downloads: Path, say: Say) 
     """Show what will be fetched under which terms, and refuse it if the disk is too small."""
     n_bytes = sum(part.n_bytes for part in parts)
     n_have = sum(file.stat().st_size for file in downloads.rglob("*") if file.is_file())
-    n_converted = parts[-1].n_bytes if base.converter is not None else 0
+    n_converted = parts[-1].n_bytes if base.options is not None else 0
     n_needed = max(0, n_bytes - n_have) + n_converted
     existing = next(folder for folder in (downloads, *downloads.resolve().parents) if folder.is_dir())
     n_free = shutil.disk_usage(existing).free
@@ -197,15 +189,15 @@ def _check_files(part: RemotePart, folder: Path) -> None:
 def _publish(base: Base, parts: list[RemotePart], downloads: Path, out: Path) -> Path:
     """Convert what was fetched, or give it its name; note where it came from."""
     note = json.dumps({"base": base.name, "terms": base.terms, "parts": [_noted(x) for x in parts]}, indent=2)
-    if base.converter is None:
+    if base.options is None:
         (downloads / BASE_FILE).write_text(f"{note}\n", encoding="utf-8")
         downloads.rename(out)
         return out
     # Here and not above: a download need not wait for torch, nor lerobot's import settle HF_HUB_OFFLINE.
-    from vla_eval.checkpoints.conversion.published import convert_published
+    from vla_eval.checkpoints.conversion import convert_base
 
     with _offline():
-        convert_published(base.converter, downloads, out)
+        convert_base(base, downloads, out)
     (out / BASE_FILE).write_text(f"{note}\n", encoding="utf-8")
     shutil.rmtree(downloads)
     return out
@@ -258,27 +250,14 @@ def _hub_errors(base: Base, source: Source, out: Path) -> Iterator[None]:
 
 def by_hand(base: Base, out: Path) -> str:
     """Return how to fill the folder without a network."""
-    target = out if base.converter is None else out.with_name(f"{out.name}-original")
+    target = out if base.options is None else out.with_name(f"{out.name}-original")
     lines = ["Without a network, fetch these on another machine and copy them:"]
     for part in base.parts:
         pinned = f" --revision {part.revision}" if part.revision else ""
         names = " ".join(f"--include '{pattern}'" for pattern in part.patterns)
         lines.append(f"  hf download {part.repo_id}{pinned} {names} --local-dir {target / part.folder}")
-    if base.converter is not None:
+    if base.options is not None:
+        from vla_eval.checkpoints.conversion import convert_command  # as above
+
         lines.append(f"then: {convert_command(base, target, out)}")
     return "\n".join(lines)
-
-
-def convert_command(base: Base, source: Path, out: Path) -> str:
-    """Return the command that makes a LeRobot checkpoint of the published files."""
-    octo = f"--dataset-name bridge_dataset --gripper unit_open --tokenizer {source}/tokenizer"
-    options = {
-        "octo-small": f"--size small {octo}",
-        "octo-base": f"--size base {octo}",
-        "openvla": "--gripper unit_open --image-aug no",
-        "spatialvla": "",
-    }
-    assert base.converter is not None  # only such a base is converted
-    verb = f"convert-{base.converter.partition('-')[0]}"
-    words = ["mikasa-vla checkpoint", verb, str(source), options[base.converter], "--out", str(out)]
-    return " ".join(word for word in words if word)

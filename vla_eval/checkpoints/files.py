@@ -18,7 +18,7 @@ from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.lock.switch import distrust
 from vla_eval.seeding import SeedRange
 from vla_eval.strict.decoding import decode
-from vla_eval.strict.json_fields import get_text
+from vla_eval.strict.json_fields import FETCH_AGAIN, get_text
 from vla_eval.strict.json_fields import read_json as read_json  # where most look for it
 
 CONFIG_FILE = "config.json"
@@ -243,6 +243,11 @@ def _hashed_files(folder: Path) -> Iterator[tuple[str, Path]]:
         name = file.relative_to(folder).as_posix()
         if file.is_file() and name not in NOT_HASHED:
             yield name, file
+
+
+def unreadable(file: Path, exc: Exception) -> CheckpointError:
+    """Return the error of a file that is not safetensors, whose library raises a class that is not public."""
+    return CheckpointError(f"{file}: cannot be read as safetensors ({exc}). {FETCH_AGAIN}")
 
 
 def file_sha256(path: Path) -> str:

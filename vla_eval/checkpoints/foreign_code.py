@@ -20,13 +20,11 @@ from unittest.mock import patch
 from vla_eval.checkpoints.closed_doors import Door, closed, functions_of, refuse, replace
 from vla_eval.checkpoints.safe_processors import processors_through_the_door
 from vla_eval.checkpoints.saved_processor import leads_out
+from vla_eval.models.families import family_of
+from vla_eval.models.family import imported
 from vla_eval.strict.json_fields import FETCH_AGAIN, read_json
 from vla_eval.strict.json_text import shown
 
-READS_ACTION_TOKENIZERS = (
-    "lerobot.policies.pi0_fast.modeling_pi0_fast",
-    "lerobot.processor.tokenizer_processor",
-)
 COPY_AND_IMPORT = ("transformers.dynamic_module_utils", "diffusers.utils.dynamic_modules_utils")
 """They copy code files into a cache, import what these import, and run them: nothing of it is left open."""
 LEFT_OPEN = frozenset({"custom_object_save", "_sanitize_module_name", "find_pipeline_class"})
@@ -78,7 +76,7 @@ def no_foreign_code(kind: str) -> Iterator[None]:
     """Let nothing that a checkpoint names be run while it is loaded, unless it is checked or installed.
 
     Args:
-        kind: lerobot's type of policy. The action tokenizer of `pi0_fast` is read as data.
+        kind: lerobot's type of policy; what its family replaces in lerobot stands there meanwhile.
 
     Raises:
         CheckpointError: such code would have been run, also where lerobot or transformers caught the error.
@@ -87,24 +85,17 @@ def no_foreign_code(kind: str) -> Iterator[None]:
         stack.enter_context(only_data())
         stack.enter_context(processors_through_the_door())
         stack.enter_context(_no_cache_of_modules())
-        if kind == "pi0_fast":
-            from vla_eval.checkpoints.fast_tokens import FastProcessors
-
-            for name in READS_ACTION_TOKENIZERS:
-                stack.enter_context(
-                    patch.object(importlib.import_module(name), "AutoProcessor", FastProcessors)
-                )
+        for replaced, ours in family_of(kind).replaces.items():
+            module, _, name = replaced.partition(":")
+            stack.enter_context(patch.object(importlib.import_module(module), name, imported(ours)))
         yield
 
 
 @contextlib.contextmanager
 def only_data() -> Iterator[None]:
-    """Keep the doors closed within the context; cheap enough for every forward pass.
+    """Keep the doors closed within the context, as `no_foreign_code`; cheap enough for every forward pass.
 
     Some policies open a tokenizer only in the first one.
-
-    Raises:
-        CheckpointError: as `no_foreign_code`.
     """
     replace(_doors())
     with closed():

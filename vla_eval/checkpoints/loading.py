@@ -26,13 +26,6 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
-import vla_eval.models.memory.configuration_memory  # importing it registers
-import vla_eval.models.octo.configuration_octo
-import vla_eval.models.offline_rl.configuration_offline_rl
-import vla_eval.models.openvla.configuration_openvla
-import vla_eval.models.sequence.configuration_sequence
-import vla_eval.models.spatialvla.configuration_spatialvla
-import vla_eval.models.vla_memory.configuration_vla_memory  # noqa: F401  as above
 from vla_eval.checkpoints.adapter_config import read_adapter_config
 from vla_eval.checkpoints.config_check import check_config, check_features
 from vla_eval.checkpoints.execution_fields import without_execution
@@ -48,24 +41,18 @@ from vla_eval.checkpoints.files import (
 )
 from vla_eval.checkpoints.foreign_code import no_foreign_code, only_data
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly, says_what_is_missing
-from vla_eval.checkpoints.policy_types import CANNOT_BE_ASKED
 from vla_eval.checkpoints.processors import check_statistics, load_processors, own_tokenizers
 from vla_eval.checkpoints.saved_processor import refuse_built_in_normalization
 from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
+from vla_eval.models.families import family_of, register_families
 from vla_eval.models.shared.empty_weights import empty_weights
 from vla_eval.models.shared.weight_file import WeightFile
 from vla_eval.models.shared.weights import check_same, put_weights
 
+register_families()
+
 # Fields that make a constructor fetch weights which the checkpoint is about to replace.
 NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
-
-BUILT_EMPTY = frozenset(
-    {
-        *("pi0", "pi05", "pi0_fast", "smolvla", "mikasa_octo", "mikasa_openvla", "mikasa_spatialvla"),
-        *("mikasa_pi0", "mikasa_pi05", "mikasa_smolvla"),
-    }
-)
-"""Types whose constructors do not compute with their weights: they are built without memory for them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,22 +84,14 @@ class LoadedPolicy:
 
     @contextlib.contextmanager
     def acting(self) -> Iterator[None]:
-        """Let the policy infer within the context, as safely as it was loaded.
-
-        Raises:
-            CheckpointError: from within, whatever its steps and its network make of what does not fit.
-        """
+        """Let the policy infer within the context, as safely and with the same errors as it was loaded."""
         # Some policies open a tokenizer only in their first pass.
         with plain_errors(self.folder, self.config.type, "cannot infer"), only_data():
             yield
 
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
-    """Load policy and processors.
-
-    Args:
-        path: a checkpoint or a run folder, see `find_checkpoint`.
-        options: how.
+    """Load policy and processors of a checkpoint or a run folder.
 
     Raises:
         CheckpointError: anything is missing, damaged, or does not fit.
@@ -172,13 +151,7 @@ def asked_for(cls: Any, kind: str, data: Mapping[str, Any]) -> Any:
 
 
 def with_local_files(data: dict[str, Any], folder: Path, *, tokenizer: str | None) -> dict[str, Any]:
-    """Return a configuration that asks for no download, and for the tokenizers of this checkpoint.
-
-    Args:
-        data: of the checkpoint.
-        folder: of the checkpoint.
-        tokenizer: see `LoadOptions`.
-    """
+    """Return a configuration that asks for no download, and for the tokenizers of its checkpoint."""
     here = {**NO_DOWNLOADS, **own_tokenizers(folder, tokenizer)}
     return {**data, **{name: value for name, value in here.items() if name in data}}
 
@@ -189,6 +162,7 @@ def config_class(kind: str, *, where: str) -> Any:
     Raises:
         CheckpointError: there is no such type, or one that this loop cannot ask for chunks.
     """
+    register_families()
     _register_plugins(_search_path())
     known = list(PreTrainedConfig.get_known_choices())
     if kind not in known:
@@ -196,10 +170,11 @@ def config_class(kind: str, *, where: str) -> Any:
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
         )
-    if kind in CANNOT_BE_ASKED:
+    why_not = family_of(kind).why_not
+    if why_not:
         raise CheckpointError(
             f"{where}: a LeRobot policy of type '{kind}' cannot be evaluated in this loop, which asks for "
-            f"whole chunks and hides no frame: {CANNOT_BE_ASKED[kind]}. For it there is "
+            f"whole chunks and hides no frame: {why_not}. For it there is "
             "LeRobot's own loop: lerobot-eval --env.type=mikasa (docs/lerobot_commands.md)."
         )
     return PreTrainedConfig.get_choice_class(kind)
@@ -248,16 +223,13 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
-    """Return the policy with exactly the weights of the checkpoint.
+    """Return the policy with exactly the weights of a checkpoint, see `fill_policy`.
 
     Args:
         folder: with `model.safetensors`, or with a LoRA adapter.
         config: what `read_config` returned.
         options: `device`, `dtype` and `base_checkpoint` are used.
         kwargs: further arguments of the policy's constructor.
-
-    Raises:
-        CheckpointError: keys, shapes or types differ; the message lists them.
     """
     return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
         config.device
@@ -266,18 +238,14 @@ def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any)
 
 def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:
     """Return a policy that is about to be filled, or only counted: large ones have no memory for weights."""
-    with empty_weights() if config.type in BUILT_EMPTY else contextlib.nullcontext():
+    with empty_weights() if family_of(config.type).is_built_empty else contextlib.nullcontext():
         return make_empty_policy(config, **kwargs)
 
 
 def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: Sequence[str] = ()) -> Any:
     """Put the weights of a checkpoint into a policy, or an adapter on top of them; return the policy.
 
-    Args:
-        policy: with whatever weights.
-        folder: of the checkpoint.
-        options: how to load.
-        may_be_new: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
+    `may_be_new`: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
 
     Raises:
         CheckpointError: keys, shapes or types differ; the message lists them.
@@ -298,10 +266,6 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
 
 def begin_from(policy: Any, base: Path) -> None:
     """Let a policy change its base's weights, which were just loaded, into what its training begins from.
-
-    Args:
-        policy: with the base's weights; most have nothing to change.
-        base: folder of the base.
 
     Raises:
         CheckpointError: the base is an adapter, whose own base would be changed a second time.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from vla_eval.checkpoints.conversion.writing import check_free, folder_when_whole
+from vla_eval.checkpoints.conversion import check_free, folder_when_whole
 from vla_eval.checkpoints.files import (
     ADAPTER_CONFIG_FILE,
     ADAPTER_WEIGHTS_FILE,
@@ -31,9 +31,6 @@ def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, 
         out: a folder that is not there yet.
         base_checkpoint: where the base lies; None: where it was in training.
         device: where to compute.
-
-    Raises:
-        CheckpointError: it is no adapter, or `out` exists.
     """
     folder = find_checkpoint(path)
     if not (folder / ADAPTER_CONFIG_FILE).is_file():

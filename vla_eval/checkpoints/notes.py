@@ -14,15 +14,19 @@ from vla_eval.checkpoints.files import (
     checkpoint_sha256,
     find_checkpoint,
     read_facts,
+    unreadable,
 )
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.models.families import FAMILIES
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 from vla_eval.seeding import SeedRange
 from vla_eval.strict.json_fields import get_mapping, get_text
 
 LEROBOT_ADAPTER = "lerobot"
-LEROBOT_CHECKPOINTS = frozenset({LEROBOT_ADAPTER, "openvla"})
+LEROBOT_CHECKPOINTS = frozenset(
+    {LEROBOT_ADAPTER, *(name for family in FAMILIES.values() for name in family.adapters)}
+)
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
 
 NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
@@ -37,13 +41,16 @@ LEROBOT_STEPS = frozenset({"normalizer_processor", "unnormalizer_processor"})
 OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
 
 
-def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
-    """Return digests of all that a policy's weights consist of, and of what they were trained on.
+def checkpoint_folder(adapter: str, args: Mapping[str, Any]) -> Path | None:
+    """Return the folder with the weights of a recipe's policy; None: it has none, or is another package's."""
+    checkpoint = args.get("checkpoint")
+    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+        return None
+    return find_checkpoint(Path(checkpoint))
 
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-        policy: the recipe's name.
+
+def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
+    """Return digests of all that the weights of a recipe's policy consist of, and of their training data.
 
     Returns:
         `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
@@ -51,17 +58,16 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 
     Raises:
         CheckpointError: the weights are not there.
-        RecipeError: an argument that names a folder is no text.
+        RecipeError: an argument that names a folder is not text.
     """
     for name in ("checkpoint", "base_checkpoint"):
         if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
             raise RecipeError(
                 f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
             )
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
         return {}
-    folder = find_checkpoint(Path(checkpoint))
     hashes = {f"checkpoints/{policy}": checkpoint_sha256(folder)}
     base = args.get("base_checkpoint")
     if isinstance(base, str):
@@ -73,24 +79,16 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 
 
 def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by which statistics a policy normalises what it sees and un-normalises what it does.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
+    """Return by which statistics a policy, of a recipe's adapter and args, normalises and un-normalises.
 
     Returns:
         `of`: the dataset whose statistics they are, by its name, or `the checkpoint` where that is not
         known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
         is used. Empty for a policy without a checkpoint of LeRobot's.
-
-    Raises:
-        CheckpointError: a file that the checkpoint names is missing or damaged.
     """
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
         return {}
-    folder = find_checkpoint(Path(checkpoint))
     facts = read_facts(folder)
     return {
         "of": "the checkpoint" if facts is None else facts.dataset,
@@ -100,41 +98,20 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
 
 
 def training_seeds(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[SeedRange, ...]]:
-    """Return of which seeds a policy was shown demonstrations.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-
-    Returns:
-        Task id -> seeds; empty where they are not known.
-
-    Raises:
-        CheckpointError: what the checkpoint says of its training is damaged.
-    """
+    """Return task -> the seeds of whose demonstrations a policy was trained; empty: they are not known."""
     facts = _facts(adapter, args)
     return {} if facts is None else facts.seeds or {}
 
 
 def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple[str, ...]] | None:
-    """Return task id -> the sentences that a policy was trained with; None where they are not known.
-
-    Args:
-        adapter: registry name of the recipe's adapter.
-        args: the arguments of the recipe's adapter.
-
-    Raises:
-        CheckpointError: what the checkpoint says of its training is damaged.
-    """
+    """Return task -> the sentences that a policy was trained with; None where they are not known."""
     facts = _facts(adapter, args)
     return None if facts is None else facts.sentences
 
 
 def _facts(adapter: str, args: Mapping[str, Any]) -> TrainingFacts | None:
-    checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
-        return None
-    return read_facts(find_checkpoint(Path(checkpoint)))
+    folder = checkpoint_folder(adapter, args)
+    return None if folder is None else read_facts(folder)
 
 
 def _used(folder: Path, processor: str) -> dict[str, dict[str, list[float]]]:
@@ -184,7 +161,5 @@ def _numbers(file: Path) -> dict[str, list[float]]:
     try:
         tensors = load_file(file)
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
-        ) from exc
+        raise unreadable(file, exc) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}

@@ -14,15 +14,12 @@ from vla_eval.strict.json_fields import FETCH_AGAIN
 
 @contextlib.contextmanager
 def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
-    """Make one message of whatever lerobot, torch and transformers raise of files that do not fit.
+    """Raise one `CheckpointError` for whatever lerobot, torch and transformers raise within.
 
     Args:
         where: the checkpoint.
         kind: lerobot's type of policy.
         what: what fails, for the message.
-
-    Raises:
-        CheckpointError: from within, for every error that says nothing to the user.
     """
     try:
         yield
@@ -41,13 +38,12 @@ def raise_plainly(exc: ImportError | OSError | RuntimeError, config: Any) -> NoR
     """Say which package or file is missing, if that ended the making of a policy or of its processors.
 
     Args:
-        exc: whatever lerobot or transformers raised.
+        exc: what lerobot or transformers raised; raised again if it was something else.
         config: of the policy; or its type and fields.
 
     Raises:
         MissingDependencyError: a package is not installed.
         CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
-        OSError, RuntimeError: as given, if it was something else.
     """
     if isinstance(exc.__cause__, VlaEvalError):
         raise exc.__cause__

@@ -29,12 +29,9 @@ TOKENIZER_STEP, ACTION_TOKENIZER_STEP = "tokenizer_processor", "action_tokenizer
 
 
 def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tuple[Any, Any]:
-    """Return pre- and post-processor as the checkpoint describes them.
+    """Return pre- and post-processor as the checkpoint in a folder describes them.
 
-    Args:
-        folder: of the checkpoint.
-        config: of the policy.
-        tokenizer: folder of the tokenizer; None: the one in the checkpoint, else the one it names.
+    `tokenizer`: its folder; None: the one in the checkpoint, else the one it names.
 
     Raises:
         CheckpointError: one is missing, or names code or a tokenizer that is not there.
@@ -83,11 +80,7 @@ def tokenizer_overrides(
 ) -> dict[str, dict[str, Any]]:
     """Return what the steps of a saved preprocessor that make tokens need as settings, by their names.
 
-    Args:
-        folder: of the checkpoint.
-        config: of the policy.
-        steps: names of the preprocessor's steps.
-        tokenizer: see `load_processors`.
+    `tokenizer`: see `load_processors`.
     """
     overrides: dict[str, dict[str, Any]] = {}
     own = _tokenizer(folder, tokenizer)
@@ -126,11 +119,7 @@ def _tokenizer(folder: Path, named: str | None) -> str | None:
 
 
 def step_names(path: Path) -> tuple[str, ...]:
-    """Return what lerobot addresses the steps of a saved processor by.
-
-    Raises:
-        CheckpointError: the file is missing or damaged.
-    """
+    """Return what lerobot addresses the steps of a saved processor by."""
     return read_saved_processor(path).names()
 
 

@@ -21,13 +21,14 @@ from lerobot.processor import DataProcessorPipeline, ProcessorStep, ProcessorSte
 from lerobot.processor.converters import batch_to_transition, transition_to_batch
 from safetensors.torch import load
 
+from vla_eval.checkpoints.files import unreadable
 from vla_eval.checkpoints.saved_processor import SavedProcessor, SavedStep, check_paths, read_saved_processor
 from vla_eval.errors import CheckpointError
 from vla_eval.strict.json_fields import FETCH_AGAIN
 
 PROCESSOR_MODULES = re.compile(
     r"lerobot\.processor(\.\w+)?|lerobot\.policies\.\w+\.processor_\w+"
-    r"|vla_eval\.policies\.\w+\.processor_\w+",
+    r"|vla_eval\.models\.\w+\.processor_\w+",
     re.ASCII,
 )
 """Modules of lerobot, and of ours, whose steps a checkpoint may name by their import path."""
@@ -69,14 +70,10 @@ def load_processor(
     to_output: Callable[[Any], Any] | None = None,
     make: type[Any] = DataProcessorPipeline,
 ) -> Any:
-    """Return the pipeline that a file of a checkpoint describes.
+    """Return the pipeline that a file of a checkpoint describes; everything it names lies in its folder.
 
-    Args:
-        path: the file; everything it names lies in its folder.
-        overrides: step's name -> arguments that replace the saved ones. They are ours, and not checked.
-        to_transition: see lerobot's `DataProcessorPipeline`; None: its own.
-        to_output: the same.
-        make: its class.
+    `overrides`: step's name -> arguments that replace the saved ones; they are ours, and not checked. The
+    other arguments are lerobot's of a `DataProcessorPipeline`.
 
     Raises:
         CheckpointError: the file is damaged, or names code, files or settings that it may not.
@@ -189,9 +186,7 @@ def _state(step: SavedStep) -> dict[str, Any] | None:
     try:
         return dict(load(step.state_file.read_bytes()))
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{step.state_file}: cannot be read as safetensors ({exc}). {FETCH_AGAIN}"
-        ) from exc
+        raise unreadable(step.state_file, exc) from exc
 
 
 def _made(step: SavedStep, cls: type[Any], overrides: Mapping[str, Any]) -> Any:

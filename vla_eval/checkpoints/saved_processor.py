@@ -13,7 +13,13 @@ from typing import Any  # JSON of another program
 
 from safetensors import safe_open
 
-from vla_eval.checkpoints.files import CONFIG_FILE, POSTPROCESSOR_FILE, PREPROCESSOR_FILE, WEIGHTS_FILE
+from vla_eval.checkpoints.files import (
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    WEIGHTS_FILE,
+    unreadable,
+)
 from vla_eval.errors import CheckpointError
 from vla_eval.strict.json_fields import (
     FETCH_AGAIN,
@@ -62,13 +68,7 @@ class SavedStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SavedProcessor:
-    """A pipeline of steps.
-
-    Attributes:
-        path: the file.
-        title: lerobot's name of the pipeline.
-        steps: in order.
-    """
+    """A pipeline of steps in their order, the file that describes it, and lerobot's name of it."""
 
     path: Path
     title: str
@@ -119,13 +119,10 @@ def _step(path: Path, index: int, step: object) -> SavedStep:
 
 
 def refuse_built_in_normalization(folder: Path) -> None:
-    """Refuse a checkpoint that has its normalisation among its weights.
-
-    Args:
-        folder: with the weights; one without them passes.
+    """Refuse weights that hold their normalisation: of a LeRobot before its processors.
 
     Raises:
-        CheckpointError: it is of a LeRobot before its processors, or the weights are damaged.
+        CheckpointError: the weights in the folder do, or are damaged.
     """
     file = folder / WEIGHTS_FILE
     if not file.is_file():
@@ -134,9 +131,7 @@ def refuse_built_in_normalization(folder: Path) -> None:
         with safe_open(file, framework="np") as header:
             names = list(header.keys())
     except Exception as exc:  # safetensors raises its own class, which is no public name
-        raise CheckpointError(
-            f"{file}: cannot be read as safetensors ({exc}). Fetch the checkpoint again."
-        ) from exc
+        raise unreadable(file, exc) from exc
     built_in = [name for name in names if name.startswith(BUILT_IN) and name.endswith(BUILT_IN_STATISTICS)]
     if built_in:
         raise CheckpointError(
@@ -170,16 +165,7 @@ def _state_file(folder: Path, name: str, *, where: str) -> Path:
 
 
 def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> None:
-    """Refuse settings that are paths out of the checkpoint's folder.
-
-    Args:
-        step: for messages.
-        config: those of its settings that are not overridden.
-        folder: of the checkpoint.
-
-    Raises:
-        CheckpointError: there is one.
-    """
+    """Raise `CheckpointError` for settings of a step that are paths out of the checkpoint's folder."""
     for key, value in _texts(config):
         if leads_out(value, folder):
             raise CheckpointError(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 
 from torch import Tensor
 
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS
+from vla_eval.models.families import family_of
 
 
 class Step(NamedTuple):
@@ -26,11 +26,11 @@ def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | 
     Args:
         policy: whose `reset` was just called.
         batch: the newest frame (B, …).
-        queues: those after the previous step; None at the beginning of the episode. They are not changed.
+        queues: those after the previous step, which are not changed; None: the episode begins.
     """
     owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
     for name, value in (queues or {}).items():
         setattr(owner, name, copy.deepcopy(value))
     action: Tensor = owner.select_action(batch)
-    kept = {name: getattr(owner, name) for name in ASKED_FOR_STEPS[owner.config.type]}
+    kept = {name: getattr(owner, name) for name in family_of(owner.config.type).queues}
     return Step(action.unsqueeze(1), kept)

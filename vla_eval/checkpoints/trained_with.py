@@ -88,13 +88,7 @@ def differences(facts: TrainingFacts | None, asked: Asked) -> list[str]:
 
 
 def refuse_differences(lines: Iterable[str], *, policy: str, task: str) -> None:
-    """Raise `SpecMismatchError` if there is a line.
-
-    Args:
-        lines: what differs.
-        policy: its name, for the message.
-        task: the task's.
-    """
+    """Raise `SpecMismatchError` with the lines if there are any, for a policy and a task."""
     listed = "\n".join(f"  {line}" for line in lines)
     if listed:
         raise SpecMismatchError(
@@ -105,13 +99,8 @@ def refuse_differences(lines: Iterable[str], *, policy: str, task: str) -> None:
 def about_sentence(trained: Sentences | None, sentence: str, *, policy: str, task: str) -> str | None:
     """Return a line if a policy is asked with a sentence that it was never trained with; else None.
 
-    It is no error: whether a policy understands a paraphrase may be what is tested.
-
-    Args:
-        trained: see `Sentences`; None: not known.
-        sentence: of the task; words in braces stand for what differs per episode.
-        policy: its name, for the line.
-        task: the task's id.
+    It is not an error: whether a policy understands a paraphrase may be what is tested. Words in braces stand
+    for what differs per episode. Without `trained`, nothing is known.
     """
     if not trained:
         return None

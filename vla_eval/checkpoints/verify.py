@@ -20,12 +20,12 @@ from vla_eval.checkpoints.loading import (
     read_config,
     read_weights,
 )
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS, chunk_size, history, noise_shape
+from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, history, noise_shape
 from vla_eval.checkpoints.select_step import select_step
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.models.episodes.memory import remembers_singly
+from vla_eval.models.shared.earlier_frames import mask_field
 from vla_eval.models.shared.weights import check_fit
-from vla_eval.models.vla_memory.fields import mask_field
 
 INSTRUCTION = "pick the cube"
 
@@ -68,13 +68,7 @@ class Verified:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """What a checkpoint's header and its configuration say of each other, in agreement.
-
-    Attributes:
-        kind: lerobot's name of the policy's type.
-        n_tensors: in the file.
-        n_parameters: of the model; shared ones once.
-    """
+    """What a checkpoint's header and its configuration agree about: type, tensors in the file, parameters."""
 
     kind: str
     n_tensors: int
@@ -160,7 +154,7 @@ def _act(loaded: LoadedPolicy) -> Tensor:
         )
     loaded.policy.reset()
     batch = loaded.preprocessor(random_batch(config, history(config), draws))
-    if config.type in ASKED_FOR_STEPS:
+    if asked_for_steps(config.type):
         raw = select_step(loaded.policy, batch, None).action
     else:
         raw = loaded.policy.predict_action_chunk(batch, **extra)

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.cli.shared.arguments import add_verb
-from vla_eval.cli.shared.output import FORMATS, print_in
+from vla_eval.cli.shared.output import print_in
 from vla_eval.cli.terminal.screen import screen_width
+from vla_eval.results.formats import COMPARED_BY, FORMATS
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
 chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired
@@ -26,10 +27,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         epilog="docs/chunk_sizes.md explains the columns.",
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
-    # Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
-    parser.add_argument(
-        "--by", choices=("n_action_steps", "policy"), default="n_action_steps", help="(n_action_steps)"
-    )
+    parser.add_argument("--by", choices=COMPARED_BY, default="n_action_steps", help="(n_action_steps)")
     parser.add_argument(
         "--reference", metavar="NAME", help="a K, or a policy (the smallest K, or the first policy)"
     )
@@ -47,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.results.sweep import compare_runs
-    from vla_eval.results.sweep_format import render_sweep, sweep_notes
+    from vla_eval.results.sweep_format import render_sweep, sweep_table
     from vla_eval.storage.run_folder import read_run
 
     sweep = compare_runs(
@@ -58,6 +56,6 @@ def run(args: argparse.Namespace) -> int:
     )
     print_in(args.format, render_sweep(sweep, args.format, width=screen_width()))
     if args.format == "csv":  # has no place for them
-        for note in sweep_notes(sweep):
+        for note in sweep_table(sweep).notes:
             print(f"note: {note}", file=sys.stderr)
     return 0

@@ -51,10 +51,10 @@ def run(args: argparse.Namespace) -> int:
 def _words() -> Words:
     from vla_eval.cli.main import VERBS, build_parser, flags_of
     from vla_eval.config.files import list_recipes
-    from vla_eval.tasks.catalog import TASKS
+    from vla_eval.tasks.catalog import TASKS, installed_tasks
 
     known = {
-        "tasks": list(TASKS),
+        "tasks": [*TASKS, *_plain(installed_tasks())],
         "policies": _plain(list_recipes("policies")),
         "configs": _plain(list_recipes("configs")),
     }

@@ -250,7 +250,7 @@ def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.config.dataset import EVALUATION_SEEDS
     from vla_eval.data.sharing.initial_states import read_initial_states
     from vla_eval.data.sharing.leak import check_leak
-    from vla_eval.results.table_formats import markdown_table
+    from vla_eval.results.printed_table import markdown_table
     from vla_eval.tasks.catalog import task_spec
 
     if args.task is not None:

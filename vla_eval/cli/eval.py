@@ -3,7 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
@@ -29,6 +29,9 @@ from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.storage.shard import shard_folder
 from vla_eval.strict.decoding import decode, set_field
 from vla_eval.workers.needed_files import Needed, shared_folder
+
+if TYPE_CHECKING:
+    from vla_eval.evaluation.resolve import ResolvedEvaluation
 
 DESCRIPTION = """Run the episodes of a configuration that have no result yet, and print the table.
 
@@ -151,9 +154,8 @@ def run(args: argparse.Namespace) -> int:
         write_html,
     )
     from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.evaluation.evaluate import RUNS_FOLDER, default_run_folder
-    from vla_eval.evaluation.inference_choice import with_inference
     from vla_eval.evaluation.needed_files import needed_files
+    from vla_eval.evaluation.resolve import RUNS_FOLDER, ResolvedEvaluation
     from vla_eval.policies.entries import load_policy_entries
     from vla_eval.storage.run_folder import read_run
 
@@ -164,8 +166,6 @@ def run(args: argparse.Namespace) -> int:
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
-    if args.dry_run:
-        return _dry_run(config, args)
     check_table_arguments(args)
     policies = load_policy_entries(config.policies)
     check_baseline(args.baseline, [policy.name for policy in policies])
@@ -175,9 +175,12 @@ def run(args: argparse.Namespace) -> int:
         return (*needed_files(policies), *captured)
 
     with backend_of(args, needs=needs) as backend, stop_on_signals() as stop:
-        config = with_inference(config, policies, backend)
-        out = shard_folder(args.out or default_run_folder(config), args.shard)
-        summary = evaluate_one(config, out, args, stop=stop, backend=backend, policies=policies)
+        out = shard_folder(args.out, args.shard) if args.out else None
+        resolved = ResolvedEvaluation.of(config, policies, backend=backend, out=out, shard=args.shard)
+        if args.dry_run:
+            return _dry_run(resolved, args)
+        summary = evaluate_one(resolved, args, stop=stop)
+    out = resolved.out
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
         print(
@@ -196,16 +199,17 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_html([found], args)
     if args.shard is not None:
-        hint_merge(args.out or default_run_folder(config), args.shard)
+        hint_merge(args.out or resolved.default_folder, args.shard)
     return EXIT_EPISODE_ERRORS if summary.n_errors else 0
 
 
-def _dry_run(config: EvalConfig, args: argparse.Namespace) -> int:
+def _dry_run(resolved: "ResolvedEvaluation", args: argparse.Namespace) -> int:
     from vla_eval.evaluation.dry_run import AssumedRates, describe_evaluation
 
     named = {name: getattr(args, name) for name in ("steps_per_second", "inference_seconds")}
     rates = AssumedRates(**{name: value for name, value in named.items() if value is not None})
-    print("\n".join(describe_evaluation(config, out=args.out, rates=rates, shard=args.shard)))
+    allowed = args.allow_environment_change
+    print("\n".join(describe_evaluation(resolved, rates=rates, allow_environment_change=allowed)))
     return 0
 
 

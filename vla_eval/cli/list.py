@@ -13,17 +13,17 @@ from vla_eval.config.files import Folder, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import instruction_for, load_prompts
 from vla_eval.config.protocol import Protocol
-from vla_eval.errors import RecipeError
+from vla_eval.errors import PluginError, RecipeError, VlaEvalError
 from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.tasks.catalog import FAMILIES, SUITES
+from vla_eval.tasks.catalog import FAMILIES, SUITES, installed_tasks
 from vla_eval.tasks.spec import Suite, TaskSpec
 
 Row = Sequence[str]
 Groups = Mapping[str, Sequence[Row]]
 """Heading -> rows; a list without groups has one, without a heading."""
-UNGROUPED, BROKEN = "", "cannot be read"
+UNGROUPED, BROKEN, OF_PACKAGES = "", "cannot be read", "of other packages"
 BASELINES = "baselines and controls"
 READY, TO_TRAIN, FROM_BASE = (
     "ready to evaluate",
@@ -94,6 +94,11 @@ def _tasks(suite: Suite = "paper") -> Groups:
     groups: dict[str, list[Row]] = {}
     for spec in SUITES[suite].values():
         groups.setdefault(spec.split or UNGROUPED, []).append(_task(spec))
+    if suite == "paper":
+        try:
+            groups[OF_PACKAGES] = [_task(spec) for spec in installed_tasks().values()]
+        except PluginError as exc:
+            groups[BROKEN] = [(OF_PACKAGES, "", "", "", _broken("", exc)[-1])]
     return groups
 
 
@@ -170,7 +175,7 @@ def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> Groups:
     return {UNGROUPED: rows}
 
 
-def _broken(name: str, exc: RecipeError) -> Row:
+def _broken(name: str, exc: VlaEvalError) -> Row:
     """Return a line for a file that cannot be read: it must not hide the others."""
     return (name, f"CANNOT BE READ: {exc}")
 

@@ -16,11 +16,12 @@ from vla_eval.cli.shared.arguments import (
     workers_argument,
 )
 from vla_eval.cli.shared.cluster import add_cluster
-from vla_eval.cli.shared.output import FORMATS, print_in
+from vla_eval.cli.shared.output import print_in
 from vla_eval.cli.shared.probe_runs import run_all
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, load_recipe
 from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.results.formats import FORMATS
 from vla_eval.strict.decoding import decode
 
 if TYPE_CHECKING:

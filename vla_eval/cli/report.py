@@ -43,15 +43,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         help="also print the summary figure of this protocol (`mikasa-vla list protocols`); those that the "
         "runs name are always printed",
     )
-    parser.add_argument(
-        "--columns",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="only these, in this order, in formats for reading: task policy K variant success difference "
-        "second_difference first_choice chose right_if_chose chance ceiling corrected steps at_end "
-        "inferences episodes errors",
-    )
+    columns = parser.add_argument("--columns", nargs="+", default=[], metavar="NAME")
+    columns.help = "only these, in this order, in formats for reading: %(names)s"
+    vars(columns)["names"] = _ColumnNames()  # argparse puts it into the help
     parser.add_argument(
         "--html", type=Path, metavar="DIR", help="write a page that needs no network: DIR/index.html"
     )
@@ -62,6 +56,16 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         metavar="DIR",
         help="write DIR/TASK_POLICY_Kn.png for each row with captured episodes (eval --capture-video)",
     )
+
+
+class _ColumnNames:
+    """The names of the columns, read when a help is shown: `mikasa-vla --help` need not wait for scipy."""
+
+    def __str__(self) -> str:
+        """Return the names, from the left of the table."""
+        from vla_eval.results.statistics import printed_columns
+
+        return " ".join(printed_columns())
 
 
 def run(args: argparse.Namespace) -> int:

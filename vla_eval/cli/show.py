@@ -18,7 +18,7 @@ from vla_eval.tasks.spec import PhaseSource, TaskSpec
 
 WIDTH = 100
 INDENT = 14
-OWN_PACKAGE = "vla_eval."
+SIMULATOR = "mani_skill"  # to look for one of its modules would import it
 OFFICIAL_PHASES: dict[PhaseSource, str] = {
     "cue_and_delay": "cue, delay, response; lengths as the package has or draws them",
     "cue": "cue, response; lengths as the package has or draws them",
@@ -47,7 +47,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what is known of the task without starting a simulator."""
     spec = task_spec(args.task)
-    if spec.suite != "paper":
+    if spec.is_official:
         return _show_official(spec, args.prompt_set)
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
     _print("asks", spec.description)
@@ -129,7 +129,7 @@ def _in_turn(spec: TaskSpec, phase: str) -> str:
 
 
 def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
-    """Yield the keyword arguments of the task's class and of its bases in this package, nearest first."""
+    """Yield the keyword arguments of the task's class and of its bases, nearest first."""
     module_name, _, class_name = spec.entry_point.partition(":")
     seen: set[str] = set(NOT_FOR_USERS)
     for origin, node in _classes(module_name, class_name):
@@ -144,7 +144,7 @@ def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
 
 
 class _Module(NamedTuple):
-    """What a module of this package says."""
+    """What a module says."""
 
     body: Sequence[ast.stmt]
     imported: dict[str, tuple[str, str]]  # name here -> module, name there
@@ -152,8 +152,8 @@ class _Module(NamedTuple):
 
 @cache
 def _module(name: str) -> _Module:
-    found = find_spec(name) if name.startswith(OWN_PACKAGE) else None
-    if found is None or found.origin is None:
+    found = None if name.partition(".")[0] == SIMULATOR else find_spec(name)
+    if found is None or found.origin is None or not found.origin.endswith(".py"):
         return _Module([], {})
     tree = ast.parse(Path(found.origin).read_text(encoding="utf-8"))
     imported = {
@@ -166,7 +166,7 @@ def _module(name: str) -> _Module:
 
 
 def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:
-    """Yield a class and its bases in this package, each with its module's name, from their source."""
+    """Yield a class and its bases below ManiSkill's, each with its module's name, from their source."""
     module = _module(module_name)
     for node in module.body:
         if not isinstance(node, ast.ClassDef) or node.name != class_name:

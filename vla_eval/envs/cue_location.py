@@ -7,21 +7,18 @@ from typing import Any
 import numpy as np
 
 from vla_eval.cue_view import CueBoxes, PixelBox
-from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
+from vla_eval.tasks.memory_env import CueSize, MemoryTableEnv, Place
 
 MARGIN_PX = 1  # an edge's pixel may show some of the object
 NEAR_M = 0.01  # what is nearer to the camera, or behind it, is not seen
 
 
-def boxes_of_cue(env: Any, row: int, cameras: tuple[str, ...]) -> CueBoxes:  # Any: ManiSkill is untyped
+def boxes_of_cue(env: MemoryTableEnv, row: int, cameras: tuple[str, ...]) -> CueBoxes:
     """Return the boxes that hold the cue of one parallel environment, in the images of these cameras.
 
     Raises:
         TaskArgumentError: the task has no cue phase.
     """
-    if not isinstance(env, ChoiceEnv):
-        raise TaskArgumentError("cue_view: this task has no cue phase in which something could be hidden.")
     places, size = env.cue_places_m(row), env.cue_size_m()
     found = {}
     for name in cameras:

@@ -33,7 +33,7 @@ def make_env(settings: EnvSettings) -> SimEnv:
     if settings.simulator not in SIMULATORS:
         raise unknown_name("simulator", settings.simulator, SIMULATORS)
     factory_name = SIMULATORS[settings.simulator]
-    if settings.simulator == "maniskill" and task_spec(settings.task).suite != "paper":
+    if settings.simulator == "maniskill" and task_spec(settings.task).is_official:
         factory_name = OFFICIAL
     module_name, _, attribute = factory_name.partition(":")
     try:

@@ -19,14 +19,13 @@ from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
-from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
+from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.chance import chance_of_several
 from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.interface import ACTION, CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.objects.layout import places_from_right
-from vla_eval.tasks.spec import TaskSpec
+from vla_eval.tasks.spec import TaskSpec, chance_of_several
 
 M_PER_STEP = 0.039  # measured displacement of ManiSkill's pd_ee_delta_pose per step at action 1
 TCP_START_M = (-0.07, 0.0, 0.318)
@@ -37,18 +36,14 @@ MUG_REACH_M = 0.07  # the arm comes to rest on a mug, which is taller than a cub
 STATIC_ACTION = 0.2  # the point counts as at rest if every dimension is below it
 GOAL_RADIUS_M = 0.1
 GRIPPER_MAX_M = 0.08
-MAX_ITEMS = 100
 CUE_ROWS = 8  # of an image: they show the cue, or what distracts
 DISTRACTOR_LEVEL = 255  # of these rows; no cue has it
 RULES = {
     **{"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False},
     **{"move_in_delay": False, "distract_steps": 0, "cue_after_steps": 0},
 }
-CHOICE_DEFAULTS = {"n_items": 3, "cue_steps": 5, "delay_steps": 5, **RULES}
-SEVERAL_DEFAULTS = {
-    **{"n_items": 9, "n_shown": 3, "cue_steps": 5, "delay_steps": 5, "swap_order": 0},
-    **{**RULES, "shuffle_cue": False},
-}
+CHOICE_DEFAULTS = {"cue_steps": 5, "delay_steps": 5, **RULES}
+SEVERAL_DEFAULTS = {**CHOICE_DEFAULTS, "n_shown": 3, "swap_order": 0, "shuffle_cue": False}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
 
 Vector = NDArray[np.float64]
@@ -90,8 +85,8 @@ class FakeEnv:
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
         for name, value in settings.kwargs.items():
             check_argument(_argument_type(name), value, name=name, task=task.id)
-        _check_ranges(arguments, where=task.id)
-        self._n_items: int = arguments.get("n_items", 0)
+        self._n_items = task.n_candidates(settings.kwargs)
+        _check_ranges(arguments, n_items=self._n_items, where=task.id)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
         self._in_order = task.memory == "sequential"
         self._touch_reach_m = MUG_REACH_M if task.id.startswith("ShellGame") else REACH_M
@@ -257,7 +252,7 @@ class FakeEnv:
             phase=self._phase(episode),
             success=success and not is_lost,
             fail=is_lost,
-            target=_only(episode.targets),
+            target=only_one(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=self._chance(),
             candidate_places=places_from_right(episode.candidates_m[:, :2]),
@@ -322,7 +317,7 @@ class FakeEnv:
             tcp_velocity_m_s=episode.tcp_velocity_m_s.copy(),
             gripper_width_m=episode.gripper_width_m,
             candidate_positions_m=episode.candidates_m.copy(),
-            target=_only(episode.targets),
+            target=only_one(episode.targets),
             right_candidates=episode.targets,
             shown_candidates=episode.targets if self._is_in_view(episode) else (),
             in_order=self._in_order,
@@ -342,16 +337,13 @@ def _argument_type(name: str) -> Any:  # Any: a type annotation
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them
     if not task.has_candidates:
         return BALL_DEFAULTS
-    several = "n_shown" in (*task.kwargs, *task.open_arguments)
-    return SEVERAL_DEFAULTS if several else CHOICE_DEFAULTS
+    return {**(SEVERAL_DEFAULTS if task.several_right else CHOICE_DEFAULTS), **task.candidate_counts}
 
 
-def _check_ranges(arguments: Mapping[str, Any], *, where: str) -> None:  # Any: as above
-    n_items, n_shown = arguments.get("n_items", 1), arguments.get("n_shown", 1)
-    if not 1 <= n_shown <= n_items <= MAX_ITEMS:
-        raise TaskArgumentError(
-            f"{where}: n_items={n_items}, n_shown={n_shown}: expected 1 ≤ n_shown ≤ n_items ≤ {MAX_ITEMS}."
-        )
+def _check_ranges(arguments: Mapping[str, Any], *, n_items: int, where: str) -> None:  # Any: as above
+    n_items, n_shown = n_items or 1, arguments.get("n_shown", 1)
+    if not 1 <= n_shown <= n_items:
+        raise TaskArgumentError(f"{where}: n_shown={n_shown}: expected 1 to {n_items}, one per item.")
     several = n_shown > 1 or "swap_order" in arguments
     most = {
         "swap_cue": 1 if n_items == 1 else n_items - n_shown if several else n_items - 1,
@@ -364,10 +356,6 @@ def _check_ranges(arguments: Mapping[str, Any], *, where: str) -> None:  # Any: 
     speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
     if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
         raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")
-
-
-def _only(targets: tuple[int, ...]) -> int | None:
-    return targets[0] if len(targets) == 1 else None
 
 
 def make_fake_env(settings: EnvSettings) -> FakeEnv:

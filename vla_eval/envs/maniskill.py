@@ -26,21 +26,18 @@ from vla_eval.envs.scenes import (
     take_human_image,
     take_images,
     to_array,
-    to_vector,
 )
 from vla_eval.envs.shaders import use_lean_shaders
 from vla_eval.errors import RenderingError, TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
-from vla_eval.task_state import BodyState, PrivilegedState, TaskStatus
 from vla_eval.tasks.appearance import with_appearance
 from vla_eval.tasks.arm.arms import ARMS
 from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.choice import NO_CHOICE, ChoiceEnv
 from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
-from vla_eval.tasks.memory_env import PHASES, MemoryTableEnv
+from vla_eval.tasks.memory_env import MemoryTableEnv
 from vla_eval.tasks.register import env_class
 from vla_eval.tasks.spec import TaskSpec
 
@@ -90,7 +87,6 @@ class ManiSkillEnv:
             horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
         )
-        self.n_candidates = len(self._envs[0].candidates) if isinstance(self._envs[0], ChoiceEnv) else 0
         self.device = describe(self._envs[0], settings)
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
@@ -179,11 +175,11 @@ class ManiSkillEnv:
                 step=int(info["elapsed_steps"][row]),
                 images={name: batch[row].copy() for name, batch in images.items()} if slot in render else {},
                 state={name: to_array(batch[row]) for name, batch in state.items()},
-                privileged=_privileged(env, info, row) if self._settings.privileged else None,
+                privileged=env.true_state(info, row) if self._settings.privileged else None,
             )
             results[slot] = StepResult(
                 observation=observation,
-                status=_status(env, info, row),
+                status=env.status(info, row),
                 reward=0.0 if reward is None else float(reward[row]),
                 executed_action=None if executed is None else to_array(executed[row]),
             )
@@ -267,54 +263,3 @@ def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> in
             "shorten the phases."
         )
     return horizon_steps
-
-
-def _status(env: Any, info: Any, row: int) -> TaskStatus:
-    is_choice = isinstance(env, ChoiceEnv)
-    first = int(info["first_choice"][row]) if is_choice else NO_CHOICE
-    return TaskStatus(
-        phase=PHASES[int(info["phase"][row])],
-        success=bool(info["success"][row]),
-        fail=bool(info["fail"][row]) if "fail" in info else False,
-        target=_only(env.right_candidates(row)) if is_choice else None,
-        n_candidates=len(env.candidates) if is_choice else 0,
-        first_choice=None if first == NO_CHOICE else first,
-        n_wrong_choices=int(info["n_wrong_choices"][row]) if is_choice else 0,
-        right_first_choices=env.right_first_choices(row) if is_choice else (),
-        chance_success=env.chance_success() if is_choice else None,
-        candidate_places=env.candidate_places(row) if is_choice else (),
-        right_candidates=env.right_candidates(row) if is_choice else None,
-        touched_candidates=env.touched_candidates(row) if is_choice else None,
-        turned_rad=float(info["relative_angle"][row]) if "relative_angle" in info else None,
-    )
-
-
-def _privileged(env: Any, info: Any, row: int) -> PrivilegedState:
-    is_choice = isinstance(env, ChoiceEnv)
-    positions = to_vector(env.final_positions_m()[row]) if is_choice else np.zeros((0, 3))
-    return PrivilegedState(
-        phase=PHASES[int(info["phase"][row])],
-        response_step=int(info["cue_steps"][row] + info["delay_steps"][row]),
-        tcp_position_m=to_vector(env.agent.tcp.pose.p[row]),
-        tcp_velocity_m_s=to_vector(env.agent.tcp.linear_velocity[row]),
-        gripper_width_m=float(env.agent.robot.get_qpos()[row, -2:].sum()),
-        candidate_positions_m=positions,
-        target=_only(env.right_candidates(row)) if is_choice else None,
-        right_candidates=env.right_candidates(row) if is_choice else (),
-        shown_candidates=env.shown_candidates(row) if is_choice else (),
-        in_order=env.in_order if is_choice else False,
-        touched_candidates=env.touched_candidates(row) if is_choice else (),
-        bodies={
-            name: BodyState(
-                position_m=to_vector(body.position_m[row]),
-                velocity_m_s=to_vector(body.velocity_m_s[row]),
-                yaw_rad=float(body.yaw_rad[row]),
-            )
-            for name, body in env.moving_bodies().items()
-        },
-        tcp_yaw_rad=float(env.tcp_yaw_rad()[row]),
-    )
-
-
-def _only(right_candidates: tuple[int, ...]) -> int | None:
-    return right_candidates[0] if len(right_candidates) == 1 else None

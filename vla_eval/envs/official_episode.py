@@ -6,9 +6,8 @@ from typing import Any, NamedTuple  # ManiSkill and the package are untyped: env
 import numpy as np
 
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates
-from vla_eval.envs.scenes import to_vector
 from vla_eval.task_state import Phase, PrivilegedState, TaskStatus
-from vla_eval.tasks.objects.bodies import yaw_rad
+from vla_eval.tasks.objects.bodies import to_vector, yaw_rad
 from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
@@ -67,11 +66,6 @@ class OfficialEpisode:
         said = TaskStatus(
             phase=None if self._row.phase_source == "none" else self.phase,
             success=success,
-            fail=False,
-            target=None,
-            n_candidates=0,
-            first_choice=None,
-            n_wrong_choices=0,
         )
         if self.candidates is None:
             return said

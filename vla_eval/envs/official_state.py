@@ -14,11 +14,10 @@ from typing import Any, NamedTuple  # ManiSkill and the package are untyped: env
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.envs.scenes import to_vector
 from vla_eval.envs.true_states import PARKED_ABOVE_M
 from vla_eval.errors import SpecMismatchError
 from vla_eval.task_state import BodyState
-from vla_eval.tasks.objects.bodies import yaw_rad
+from vla_eval.tasks.objects.bodies import to_vector, yaw_rad
 from vla_eval.tasks.spec import TaskSpec
 
 Vector = NDArray[np.float64]

@@ -103,8 +103,3 @@ def to_array(tensor: Any) -> FloatArray:
     """Return a tensor as new float32 numbers."""
     copied: FloatArray = tensor.detach().cpu().numpy().astype(np.float32, copy=True)
     return copied
-
-
-def to_vector(tensor: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return a tensor as new float64 numbers."""
-    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()

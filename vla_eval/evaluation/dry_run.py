@@ -1,24 +1,18 @@
 """`eval --dry-run`: what would run, and what it takes. Starts no worker and writes nothing."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.checkpoints.files import find_checkpoint, weights_file
-from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.episode_jobs import EpisodeJob
-from vla_eval.evaluation.evaluate import default_run_folder, worker_count
-from vla_eval.evaluation.inference_choice import with_inference
+from vla_eval.evaluation.evaluate import describe, worker_count
 from vla_eval.evaluation.job_queue import JobQueue
-from vla_eval.evaluation.plan import Plan
+from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.evaluation.rendered import images_read, n_rendered
-from vla_eval.evaluation.sharding import plan_shard
-from vla_eval.policies.entries import PolicyEntry, load_policy_entries
-from vla_eval.records import EpisodeKey
-from vla_eval.storage.run_file import RUN_FILE
-from vla_eval.storage.run_folder import read_run
-from vla_eval.storage.shard import Shard, shard_folder
+from vla_eval.evaluation.resolve import ResolvedEvaluation
+from vla_eval.storage.run_folder import check_startable
 from vla_eval.tasks.catalog import task_spec
 
 N_CAMERAS = 2
@@ -73,41 +67,39 @@ class EvaluationEffort:
 
 
 def describe_evaluation(
-    config: EvalConfig, *, out: Path | None, rates: AssumedRates, shard: Shard | None = None
+    resolved: ResolvedEvaluation, *, rates: AssumedRates, allow_environment_change: bool = False
 ) -> list[str]:
     """Return lines for a person.
 
     Raises:
-        VlaEvalError: a mistake in the configuration, a recipe or a checkpoint; a folder of another run.
+        VlaEvalError: what `evaluate` would raise before its first episode.
     """
-    policies = load_policy_entries(config.policies)
-    config = with_inference(config, policies)
-    path = shard_folder(out or default_run_folder(config), shard)
-    effort = evaluation_effort(config, out=path, shard=shard, policies=policies)
-    return list(_lines(config, path, effort, rates))
+    effort = evaluation_effort(resolved, allow_environment_change=allow_environment_change)
+    return list(_lines(resolved, effort, rates))
 
 
 def evaluation_effort(
-    config: EvalConfig,
-    *,
-    out: Path,
-    shard: Shard | None = None,
-    policies: Sequence[PolicyEntry] | None = None,
+    resolved: ResolvedEvaluation, *, allow_environment_change: bool = False
 ) -> EvaluationEffort:
-    """Return what is left to run; `policies`: see `make_plan`.
+    """Return what is left to run.
 
     Raises:
         VlaEvalError: see `describe_evaluation`.
     """
-    policies = load_policy_entries(config.policies) if policies is None else policies
-    plan = plan_shard(config, shard, policies)
-    finished = _finished(out)
+    config, plan = resolved.config, make_plan(resolved)
+    records = check_startable(
+        resolved.out,
+        describe(resolved, plan, command=""),
+        allow_environment_change=allow_environment_change,
+        groups={job.group.key for job in plan.jobs},
+    )
+    finished = frozenset(record.key for record in records if record.error is None)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
     steps = [horizon_steps(job) for job in ahead]
     inferences = [_inferences(job) for job in ahead]
     checkpoints = _checkpoints(plan)
-    reads = images_read(policies)
+    reads = images_read(resolved.policies)
     rendered = [
         n_rendered(job, config, reads=reads[job.group.key.policy], n_steps=n_steps)
         for job, n_steps in zip(ahead, steps, strict=True)
@@ -120,15 +112,16 @@ def evaluation_effort(
         n_inferences=sum(inferences),
         n_learned_inferences=sum(learned),
         n_frames=N_CAMERAS * sum(rendered),
-        n_workers=worker_count(config, plan, n_jobs=queue.n_batches),
+        n_workers=worker_count(resolved, plan, n_jobs=queue.n_batches),
         copies={policy: _n_bytes(folder) for policy, folder in checkpoints.items()},
         warnings=tuple(plan.warnings),
         notes=tuple(plan.notes),
     )
 
 
-def _lines(config: EvalConfig, out: Path, effort: EvaluationEffort, rates: AssumedRates) -> Iterator[str]:
-    yield f"evaluation: {config.name}, to {out}"
+def _lines(resolved: ResolvedEvaluation, effort: EvaluationEffort, rates: AssumedRates) -> Iterator[str]:
+    config = resolved.config
+    yield f"evaluation: {config.name}, to {resolved.out}"
     yield (
         f"tasks {', '.join(config.tasks)}; policies {', '.join(config.policies)}; {config.runs} runs of "
         f"{config.episodes} episodes"
@@ -157,12 +150,6 @@ def _lines(config: EvalConfig, out: Path, effort: EvaluationEffort, rates: Assum
         f"{rates.inference_seconds:g} s per inference of a learned policy, every worker busy to the end, no "
         "episode ends early; starting and loading not counted. The run's progress bar shows the real rate"
     )
-
-
-def _finished(out: Path) -> frozenset[EpisodeKey]:
-    if not (out / RUN_FILE).is_file():
-        return frozenset()
-    return frozenset(record.key for record in read_run(out).records if record.error is None)
 
 
 def horizon_steps(job: EpisodeJob) -> int:

@@ -8,7 +8,7 @@ means, the same call resumes where it stopped.
 import functools
 import logging
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -18,32 +18,25 @@ from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
 from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.episode_jobs import EpisodeJob, SetupKey
-from vla_eval.evaluation.fingerprint import fingerprint, results_config
-from vla_eval.evaluation.inference_choice import with_inference
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
-from vla_eval.evaluation.plan import Plan
+from vla_eval.evaluation.plan import Plan, make_plan
+from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.server_phases import ReadyPhase, phases, with_servers
-from vla_eval.evaluation.sharding import plan_shard
 from vla_eval.evaluation.worker import Finished, SentenceRead, worker_main
 from vla_eval.models.shared.sentence_reading import SentenceWatch
-from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError, EpisodeKey, EpisodeRecord
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
-from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.viz.capture import EpisodeCapture
-from vla_eval.workers.backend import Backend, Pool
+from vla_eval.workers.backend import Pool
 from vla_eval.workers.jobs import Answered, MachineKind
 from vla_eval.workers.load import Load
-from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.process import WorkerMain
+from vla_eval.workers.process import WorkerMain, WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
-RUNS_FOLDER = Path("runs")
-FINGERPRINT_DIGITS = 8
 WORKER_MODULE = "vla_eval.evaluation.worker"
 LOAD_SECONDS = 1.0  # between two calls of `on_load`
 MAX_SERVER_STARTS = 3  # of one policy, so that one that always dies ends in errors
@@ -116,55 +109,39 @@ class EvaluationSummary:
     was_stopped: bool
 
 
-def default_run_folder(config: EvalConfig) -> Path:
-    """Return the folder that a configuration's results go to: the same for the same configuration."""
-    return RUNS_FOLDER / f"{config.name}-{fingerprint(config)[:FINGERPRINT_DIGITS]}"
-
-
 def evaluate(
-    config: EvalConfig,
+    resolved: ResolvedEvaluation,
     *,
-    out: Path | None = None,
     command: str = "",
     allow_environment_change: bool = False,
     observer: EvaluationObserver | None = None,
-    backend: Backend = LOCAL,
-    shard: Shard | None = None,
-    policies: Sequence[PolicyEntry] | None = None,
 ) -> EvaluationSummary:
-    """Run all episodes of a configuration that have no result yet.
+    """Run all episodes of an evaluation that have no result yet.
 
     Args:
-        config: what to evaluate.
-        out: the run folder; by default `default_run_folder(config)`, or that of its shard.
+        resolved: what to evaluate, where: `resolve` makes it.
         command: what the user typed, for the record.
         allow_environment_change: continue although package versions or the machine have changed.
         observer: gets the progress.
-        backend: where the workers run.
-        shard: run only this part of the episodes.
-        policies: those of the configuration; None: they are read, and policy servers asked.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
-    policies = load_policy_entries(config.policies) if policies is None else policies
-    config = with_inference(config, policies, backend)
-    observer, path = observer or Silence(), out or shard_folder(default_run_folder(config), shard)
-    plan = plan_shard(config, shard, policies)
+    observer, path, plan = observer or Silence(), resolved.out, make_plan(resolved)
     with RunFolder.open(
         path,
-        _describe(config, plan, command),
+        describe(resolved, plan, command),
         allow_environment_change=allow_environment_change,
         groups={job.group.key for job in plan.jobs},
     ) as folder:
         finished = folder.finished_keys()
         queue = JobQueue(plan.jobs, finished=finished)
         n_open = queue.n_episodes
-        n_workers = worker_count(config, plan, n_jobs=queue.n_batches, backend=backend)
+        n_workers = worker_count(resolved, plan, n_jobs=queue.n_batches)
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
-        bookkeeper = _Bookkeeper(folder=folder, path=path, config=config, observer=observer, queue=queue)
-        was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished, backend)
+        bookkeeper = _Bookkeeper(folder=folder, path=path, resolved=resolved, observer=observer, queue=queue)
+        was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished)
     return EvaluationSummary(
         out=path,
         n_episodes=len(plan.jobs),
@@ -174,25 +151,27 @@ def evaluate(
     )
 
 
-def worker_count(config: EvalConfig, plan: Plan, *, n_jobs: int, backend: Backend = LOCAL) -> int:
+def worker_count(resolved: ResolvedEvaluation, plan: Plan, *, n_jobs: int) -> int:
     """Return how many workers to start."""
-    if config.workers != "auto":
-        return max(1, min(config.workers, n_jobs))
-    n_cores = backend.n_cores
+    asked = resolved.config.workers
+    if asked != "auto":
+        return max(1, min(asked, n_jobs))
+    n_cores = resolved.backend.n_cores
     return max(1, min(n_cores, n_jobs, plan.max_workers or n_cores))
 
 
-def _describe(config: EvalConfig, plan: Plan, command: str) -> RunDescription:
+def describe(resolved: ResolvedEvaluation, plan: Plan, command: str) -> RunDescription:
+    """Return the run's description, for `run.json`."""
     return RunDescription(
-        name=config.name,
+        name=resolved.config.name,
         config={
-            **results_config(config),
+            **resolved.results_config,
             "policy_names": list(plan.policy_names),
             "task_versions": dict(plan.task_versions),
         },
         recipes=dict(plan.recipe_hashes),
         environment=collect_environment(),
-        options=options_of(config, options=OPTION_FIELDS),
+        options=options_of(resolved.config, options=OPTION_FIELDS),
         command=command,
         normalization=dict(plan.normalization),
         servers=dict(plan.servers),
@@ -209,29 +188,28 @@ def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
     return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
 
 
-def _run_phases(
-    plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey], backend: Backend
-) -> bool:
+def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
     """Run the episodes that have no result; return whether the observer stopped it."""
-    logs, config = bookkeeper.path / "logs", bookkeeper.config
+    logs, resolved = bookkeeper.path / "logs", bookkeeper.resolved
     logs.mkdir(exist_ok=True)
+    spec = WorkerSpec(
+        main=_worker_main(bookkeeper),
+        answers=(Finished,),
+        timeouts=resolved.config.timeouts,
+        logs=logs,
+        preload=_modules(resolved.config, plan),
+    )
     for phase in phases(plan):
         if not JobQueue(phase.jobs, finished=finished).n_episodes:
             continue
         stops = bookkeeper.observer.on_tick
         for n_starts in range(1, MAX_SERVER_STARTS + 1):
-            with with_servers(phase, config, plan, backend=backend, logs=logs, stops=stops) as ready:
+            with with_servers(phase, resolved, plan, logs=logs, stops=stops) as ready:
                 if ready is None:
                     return True
                 bookkeeper.queue = JobQueue(ready.jobs, finished={*finished, *bookkeeper.keys})
-                pool: EpisodePool = backend.pool(
-                    _worker_main(bookkeeper),
-                    answers=(Finished,),
-                    size=worker_count(config, plan, n_jobs=bookkeeper.queue.n_batches, backend=backend),
-                    timeouts=config.timeouts,
-                    logs=logs,
-                    preload=_modules(config, plan),
-                )
+                size = worker_count(resolved, plan, n_jobs=bookkeeper.queue.n_batches)
+                pool: EpisodePool = resolved.backend.pool(spec, size=size)
                 ending = _run(ready, bookkeeper, pool, is_last_start=n_starts == MAX_SERVER_STARTS)
             if ending == "stopped":
                 return True
@@ -242,7 +220,7 @@ def _run_phases(
 
 def _worker_main(bookkeeper: "_Bookkeeper") -> WorkerMain:
     """Return what workers run."""
-    config = bookkeeper.config
+    config = bookkeeper.resolved.config
     if not config.capture.is_on:
         return worker_main
     folder = bookkeeper.path.resolve()
@@ -285,7 +263,7 @@ class _Bookkeeper:
 
     folder: RunFolder
     path: Path
-    config: EvalConfig
+    resolved: ResolvedEvaluation
     observer: EvaluationObserver
     queue: JobQueue
     n_results: int = 0
@@ -310,7 +288,7 @@ class _Bookkeeper:
         """Store the results, or the error in their place."""
         batch, answer = answered.job, answered.answer
         if isinstance(answer, Failed):
-            # A group that has worked before is no mistake of the user: a GPU was lost, for example.
+            # A group that has worked before is not a user's mistake: a GPU was lost, for example.
             if answer.refused and batch.setup_key not in self.proven:
                 raise as_exception(answer.error)
             if len(batch.jobs) > 1:
@@ -354,7 +332,7 @@ class _Bookkeeper:
         record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)
         self.unstored.append(StoredEpisode(record, None))
         self.n_consecutive_errors += 1
-        if self.n_consecutive_errors >= self.config.max_consecutive_errors:
+        if self.n_consecutive_errors >= self.resolved.config.max_consecutive_errors:
             raise TooManyErrorsError(
                 f"{self.n_consecutive_errors} episodes in a row ended in an error (max_consecutive_errors). "
                 f"The last: {job.key.policy} on {job.key.task}, seed {job.key.seed}: {error.kind} during "

@@ -106,7 +106,7 @@ class ModelTable:
         steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
         run_seeds: one fine-tuning each; the SEM is over them.
         episodes, seed_start: of each evaluation.
-        controls: scripted policies beside the rows of a task, at each of their numbers of action steps.
+        controls: scripted policies next to the rows of a task, at each of their numbers of action steps.
         protocol: the published protocol whose summary figure is printed below the table; None: none.
         simulator: what the evaluations run on.
         env: arguments of all tasks, such as the control mode of the datasets.
@@ -356,5 +356,5 @@ def describe_effort(table: ModelTable, *, n_finished: int) -> str:
     each = ", ".join(f"{name} {hours:.2g}" for name, hours in known.items())
     return (
         f"{told} All of them take about {total:.0f} GPU hours at {SUSTAINED_TFLOPS} TFLOP/s (operations "
-        f"only, an assumption and no measurement; each: {each})."
+        f"only, an assumption, not a measurement; each: {each})."
     )

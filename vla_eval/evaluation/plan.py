@@ -5,7 +5,7 @@ first episode. Knows nothing of processes or files of results.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -24,11 +24,8 @@ from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.cue_view import CueViewSettings
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
-from vla_eval.evaluation.inference_choice import (
-    chosen_inference,
-    has_weights,
-)
-from vla_eval.policies.entries import PolicyEntry, load_policy_entries
+from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
+from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
@@ -51,7 +48,7 @@ class Plan:
             policies, and the datasets that these were trained on (another dataset of the same name is
             `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
-        servers: policy behind a socket -> what its server says of itself.
+        servers: policy behind a socket -> its server's metadata.
         sentences: policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was
             trained with, see `Sentences`; None where that is not known.
         training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
@@ -103,36 +100,32 @@ class Plan:
         return list({id(job.group): job.group for job in self.jobs}.values())
 
 
-def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None) -> Plan:
-    """Plan the episodes of a configuration.
-
-    Args:
-        config: the configuration.
-        policies: those of the configuration; None: they are read, and policy servers asked.
+def make_plan(resolved: ResolvedEvaluation) -> Plan:
+    """Plan the episodes of an evaluation, or of its shard.
 
     Raises:
         UnknownNameError: a task, policy, adapter or prompt set does not exist.
-        RecipeError: a recipe is wrong, two policies have the same name, or there are too many episodes.
+        RecipeError: a recipe is wrong, two policies have the same name, there are too many episodes, or more
+            shards than blocks of episodes that stay together.
         MissingInstructionError: a task has no instruction in the prompt set.
         TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
             tasks with candidates, and one of the tasks has none.
         CheckpointError: the weights that a recipe names are not there, or not whole.
-        RemotePolicyError: a policy server is not there, or is none of a policy.
     """
+    config, policies = resolved.config, resolved.policies
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
-    policies = load_policy_entries(config.policies) if policies is None else policies
     _refuse_doubles("tasks", [task.id for task in tasks])
     _refuse_doubles("policies", [policy.name for policy in policies])
     _check_runs(config, policies)
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
-    shared = _shared(config, policies)
+    shared = resolved.shared
     found = _groups_of_all(config, tasks, policies, prompts=prompts, servers=servers, shared=shared)
     if not found.groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(found.left_out)}).")
     _refuse_too_many(config, found.groups)
-    return Plan(
+    plan = Plan(
         jobs=tuple(job for group in found.groups for job in _jobs(config, group)),
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization=_noted(policies, normalization_notes),
@@ -149,6 +142,16 @@ def make_plan(config: EvalConfig, policies: Sequence[PolicyEntry] | None = None)
         max_workers=_max_workers(policies, shared),
         ignored=_ignored(found.groups),
     )
+    return plan if resolved.shard is None else _shard_of(plan, config, resolved.shard)
+
+
+def _shard_of(plan: Plan, config: EvalConfig, shard: Shard) -> Plan:
+    """Return one shard; slots, rows and run numbers stay those of the whole plan, and so do records."""
+    groups = tuple(dict.fromkeys(job.group.key for job in plan.jobs))
+    # Episodes that run side by side stay together, so that a batch has the same neighbours as in one run.
+    own = replace(shard.of_blocks(config.slots_per_worker, config.episodes), groups=groups)
+    jobs = tuple(job for job in plan.jobs if own.holds(job.seed - config.seed_start))
+    return replace(plan, jobs=jobs, shard=own)
 
 
 class _Found(NamedTuple):
@@ -255,18 +258,6 @@ def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
 
 def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
     return range(config.runs) if group.checkpoint is None else (group.checkpoint,)
-
-
-def _shared(config: EvalConfig, policies: Sequence[PolicyEntry]) -> dict[str, str]:
-    """Return the policies whose inference is shared, see `Plan.shared`."""
-    if chosen_inference(config, policies=policies) == "in_process":
-        return {}
-    return {
-        policy.part(index): text
-        for policy in policies
-        for index, text in enumerate(policy.texts)
-        if has_weights(policy.recipes[index].value)
-    }
 
 
 def _recipe_hashes(

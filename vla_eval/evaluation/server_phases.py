@@ -14,12 +14,12 @@ from vla_eval.config.files import digest_of
 from vla_eval.errors import RemoteConnectionError, RemoteReplyError, RemoteTimeoutError, RunChangedError
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.plan import Plan
+from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError
 from vla_eval.serving.host import HostOptions
 from vla_eval.serving.shared import KEY_VARIABLE, SharedServers
-from vla_eval.workers.backend import Backend
 
 CONNECTION_ERRORS = frozenset(
     error.__name__ for error in (RemoteConnectionError, RemoteReplyError, RemoteTimeoutError)
@@ -70,10 +70,9 @@ class ReadyPhase:
 @contextlib.contextmanager
 def with_servers(
     phase: Phase,
-    config: EvalConfig,
+    resolved: ResolvedEvaluation,
     plan: Plan,
     *,
-    backend: Backend,
     logs: Path,
     stops: Callable[[], bool],
 ) -> Iterator[ReadyPhase | None]:
@@ -81,9 +80,8 @@ def with_servers(
 
     Args:
         phase: the episodes.
-        config: what is evaluated.
+        resolved: what is evaluated, and where the servers run.
         plan: what the servers' policies are called in the configuration.
-        backend: where the servers run.
         logs: folder for what the servers write.
         stops: asked while servers start; true: give up, and give None.
 
@@ -94,6 +92,7 @@ def with_servers(
     if phase.policy is None:
         yield ReadyPhase(jobs=phase.jobs, servers=None)
         return
+    config = resolved.config
     options = HostOptions(policy=plan.shared[phase.policy], max_batch=config.inference_max_batch)
     adapters = [job.group.adapter for job in phase.jobs[:1]]
     with SharedServers(
@@ -101,7 +100,7 @@ def with_servers(
         logs=logs,
         start_seconds=config.timeouts.setup_seconds,
         preload=own_modules(adapters),
-        backend=backend,
+        backend=resolved.backend,
         stops=stops,
     ) as servers:
         if servers.was_stopped:

@@ -42,7 +42,7 @@ from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_erro
 logger = logging.getLogger(__name__)
 
 PASSING_ERRORS = (InvalidActionError, RemoteConnectionError, RemoteReplyError, RemoteTimeoutError)
-"""Errors of a setup that are no mistake of the user's: a policy server may soon be there again."""
+"""Transient setup errors; retried: a policy server may soon be there again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,12 +1,14 @@
 """The plug-in for LeRobot's own commands: importing this package registers it with lerobot.
 
-The environment `mikasa`, and the policies `memory` and `memoryless`.
+The environment `mikasa`, and our families of policies.
 
 Named by `--env.discover_packages_path=vla_eval.lerobot_plugin`, or found by itself where the
 distribution of the folder `plugins/` is installed.
 """
 
-import vla_eval.models.memory.configuration_memory  # noqa: F401  importing it registers
 from vla_eval.lerobot_plugin.environment import MikasaEnvConfig, MikasaGym
+from vla_eval.models.families import register_families
+
+register_families()
 
 __all__ = ["MikasaEnvConfig", "MikasaGym"]

@@ -39,8 +39,6 @@ OVERSHOOT_M = 0.03  # over the required height
 class PickExpert:
     """Lifts a mug by its handle."""
 
-    turns_wrist = True
-
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7) that lift a mug, planned from `state` alone."""
         mug, goal = state.bodies[f"mug_{candidate}"], state.bodies[f"goal_{candidate}"]

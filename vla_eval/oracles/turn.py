@@ -7,7 +7,6 @@ total rotation is used. The wrist already turns during the descent. Turning is t
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +182,6 @@ class PegTurns:
 
     angle_range_rad: tuple[float, float]
     signed: bool
-    turns_wrist: ClassVar[bool] = True
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> TurnExpert:
         """Draw the imagined angle now, before the first observation."""

@@ -18,6 +18,7 @@ from vla_eval.page import choice_sections, machine_sections, rates
 from vla_eval.page.episode_list import episode_list
 from vla_eval.page.material import Material, gather
 from vla_eval.page.probe_section import ProbeSection
+from vla_eval.results.own_statistics import EPISODES
 from vla_eval.results.table_formats import render
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun
@@ -149,8 +150,8 @@ def with_code(text: str) -> Markup:
 def _summary(material: Material) -> str:
     rows = material.table.rows
     counts = (
-        (sum(row.n_episodes for row in rows), "episodes with a result"),
-        (sum(row.n_errors for row in rows), "errors"),
+        (sum(row[EPISODES].n_episodes for row in rows), "episodes with a result"),
+        (sum(row[EPISODES].n_errors for row in rows), "errors"),
         (len(material.tasks), "tasks"),
         (len(material.colors), "policies"),
         (len(material.runs), "run folders"),

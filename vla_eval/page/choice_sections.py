@@ -63,7 +63,7 @@ class Choices:
 
 def choices(material: Material) -> Choices | None:
     """Return the choices behind the results; None if no row has candidates."""
-    reports = [(row, report_choices(material.group_of(row))) for row in material.table.rows]
+    reports = [(row, report_choices(row.episodes)) for row in material.table.rows]
     found = [(row, report) for row, report in reports if report is not None]
     if not found:
         return None

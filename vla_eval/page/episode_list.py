@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from vla_eval.page.material import Material, key_of
+from vla_eval.page.material import Material
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import rrd_file, video_file
 from vla_eval.tasks.objects.item_names import item_names
@@ -46,7 +46,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     episodes = []
     rows = []
     for number, row in enumerate(material.table.rows):
-        group = material.grouping.groups[key_of(row)]
+        group = row.episodes
         n_candidates = max((record.n_candidates or 0 for record in group.results), default=0)
         rows.append(
             {

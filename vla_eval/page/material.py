@@ -4,9 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
-from vla_eval.results.comparison import Comparison, compare_with_baselines, count_pairs
-from vla_eval.results.estimates import PairCounts
-from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey, group_runs
 from vla_eval.results.report import build_table
 from vla_eval.results.success_table import Row, Table
 from vla_eval.storage.run_folder import StoredRun
@@ -20,18 +17,12 @@ class Material:
     Attributes:
         runs: each run folder once.
         table: as `mikasa-vla report` prints it.
-        grouping: the episodes of each of its rows.
-        compared: baseline -> each comparison with it.
-        pairs: baseline -> the counts of each comparison with it.
         timings: run folder -> episode -> seconds.
         colors: policy -> number of its colour and marker, the same in every plot.
     """
 
     runs: tuple[StoredRun, ...]
     table: Table
-    grouping: Grouping
-    compared: Mapping[str, Mapping[RowKey, Comparison]]
-    pairs: Mapping[str, Mapping[RowKey, PairCounts]]
     timings: Mapping[str, Mapping[EpisodeKey, EpisodeTiming]]
     colors: Mapping[str, int]
 
@@ -43,10 +34,6 @@ class Material:
     def rows_of(self, task: str) -> list[Row]:
         """Return the rows of a task."""
         return [row for row in self.table.rows if row.task == task]
-
-    def group_of(self, row: Row) -> RowEpisodes:
-        """Return the episodes of a row."""
-        return self.grouping.groups[key_of(row)]
 
     def name_of(self, row: Row, *, with_task: bool = False) -> str:
         """Return the name of a row within its task: policy, K, and the letter of its variant.
@@ -66,11 +53,6 @@ class Material:
         return {variant: chr(ord("a") + i) for i, variant in enumerate(told)}
 
 
-def key_of(row: Row) -> RowKey:
-    """Return the key of a row."""
-    return RowKey(row.task, row.policy, row.n_action_steps, row.variant)
-
-
 def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequence[str] = ()) -> Material:
     """Read and compute everything that the page shows.
 
@@ -85,19 +67,10 @@ def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequen
     """
     runs = tuple({run.path.resolve(): run for run in runs}.values())
     table = build_table(runs, baseline=baseline, protocols=protocols)
-    grouping = group_runs(runs)
-    compared = compare_with_baselines(grouping.groups, table.baselines)
-    groups = grouping.groups
     policies = dict.fromkeys(row.policy for row in table.rows)
     return Material(
         runs=runs,
         table=table,
-        grouping=grouping,
-        compared=compared,
-        pairs={
-            baseline: {key: count_pairs(groups[key], groups[one.baseline]) for key, one in found.items()}
-            for baseline, found in compared.items()
-        },
         timings={str(run.path): read_timings(run.path) for run in runs},
         colors={policy: number for number, policy in enumerate(policies)},
     )
@@ -107,8 +80,8 @@ def errors_of(material: Material) -> list[EpisodeRecord]:
     """Return all episodes that ended in an error and are in the table."""
     return [
         record
-        for group in material.grouping.groups.values()
-        for run in group.runs
+        for row in material.table.rows
+        for run in row.episodes.runs
         for record in run.records.values()
         if record.outcome == "error"
     ]

@@ -20,13 +20,15 @@ from vla_eval.page.charts import (
     reference_sign,
     sign,
 )
-from vla_eval.page.material import Material, key_of
+from vla_eval.page.material import Material
 from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
-from vla_eval.results.side_table import SideTable
+from vla_eval.results.own_statistics import EPISODES, STEPS, SUCCESS
+from vla_eval.results.printed_table import PrintedTable
+from vla_eval.results.relative_statistics import CEILING, CHANCE, PAIRED
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.sweep import compare_runs
-from vla_eval.results.sweep_format import sweep_cells, sweep_notes
-from vla_eval.results.table_columns import Layout, lay_out, sentence_of
+from vla_eval.results.sweep_format import sweep_table
+from vla_eval.results.table_columns import lay_out
 from vla_eval.results.table_formats import side_tables
 
 MAX_STEP_TICKS = 7
@@ -68,13 +70,12 @@ class Results:
 def results(material: Material) -> Results:
     """Return the table as the terminal has it, each row with its JSON, and the table of all columns."""
     narrow = lay_out(material.table)
+    rows = tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows)
+    caption = "Success by task, policy and K (actions executed per inference)"
     return Results(
-        same=sentence_of(narrow.same) if narrow.same else "",
-        table=replace(
-            _layout_table(narrow, "Success by task, policy and K (actions executed per inference)"),
-            row_data=tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows),
-        ),
-        wide=_layout_table(lay_out(material.table, wide=True), "Every column"),
+        same=narrow.sentence,
+        table=replace(printed_on_page(narrow, caption), row_data=rows),
+        wide=printed_on_page(lay_out(material.table, wide=True), "Every column"),
     )
 
 
@@ -88,23 +89,17 @@ class SideSection(NamedTuple):
 
 def side_sections(table: Table, *, published: str | None) -> tuple[SideSection, ...]:
     """Return the tables that `mikasa-vla report` prints below the success table."""
-    return tuple(_side_section(side) for side in side_tables(table, published=published))
-
-
-def _side_section(side: SideTable) -> SideSection:
-    columns = (
-        Column(title, "number" if is_number else "text")
-        for title, is_number in zip(side.titles, side.is_number, strict=True)
+    return tuple(
+        SideSection(side.title, printed_on_page(side, side.title) if side.rows else None, tuple(side.notes))
+        for side in side_tables(table, published=published)
     )
-    rows = tuple(tuple(row) for row in side.rows)
-    table = PageTable(columns=tuple(columns), rows=rows, caption=side.title) if rows else None
-    return SideSection(side.title, table, tuple(side.notes))
 
 
-def _layout_table(layout: Layout, caption: str) -> PageTable:
+def printed_on_page(table: PrintedTable, caption: str | None) -> PageTable:
+    """Return a table for reading as the templates take it."""
     return PageTable(
-        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in layout.columns),
-        rows=layout.cells,
+        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in table.columns),
+        rows=tuple(map(tuple, table.rows)),
         caption=caption,
     )
 
@@ -118,11 +113,11 @@ def success_plots(material: Material) -> Plots:
             Bar(
                 label=material.name_of(row),
                 color=material.colors[row.policy],
-                value=row.success_once,
-                low=row.ci_low,
-                high=row.ci_high,
-                chance=row.chance,
-                ceiling=row.ceiling,
+                value=row[SUCCESS].success_once,
+                low=row[SUCCESS].ci_low,
+                high=row[SUCCESS].ci_high,
+                chance=_chance(row),
+                ceiling=row[CEILING],
             )
             for row in material.rows_of(task)
         ]
@@ -137,14 +132,16 @@ def chunk_plots(material: Material) -> Plots:
     charts: list[Chart] = []
     colors: dict[str, int] = {}
     for task in material.tasks:
-        rows = [row for row in material.rows_of(task) if row.success_once is not None]
+        rows = [row for row in material.rows_of(task) if row[SUCCESS].success_once is not None]
         sizes = sorted({row.n_action_steps for row in rows})
         for variant in dict.fromkeys(row.variant for row in rows):
             own = [row for row in rows if row.variant == variant]
             if len({row.n_action_steps for row in own}) < 2:
                 continue
             colors |= {row.policy: material.colors[row.policy] for row in own}
-            described = "; ".join(f"{material.name_of(row)}: {_rate(row.success_once)}" for row in own)
+            described = "; ".join(
+                f"{material.name_of(row)}: {_rate(row[SUCCESS].success_once)}" for row in own
+            )
             charts.append(
                 curves(
                     _by_chunk(material, own),
@@ -163,30 +160,27 @@ def chunk_sweep(material: Material) -> Sweep:
         sweep = compare_runs(material.runs)
     except ReportError as exc:
         return Sweep(table=None, refusal=str(exc))
-    titles, rows = sweep_cells(sweep)
-    n_texts = titles.index("episodes")
-    columns = (
-        Column(title, "number" if i >= n_texts or title == "K" else "text") for i, title in enumerate(titles)
-    )
-    table = PageTable(columns=tuple(columns), rows=tuple(map(tuple, rows)))
-    return Sweep(table=table, notes=tuple(sweep_notes(sweep)))
+    table = sweep_table(sweep)
+    # On the page, all columns from the episodes on are aligned to the right, intervals included.
+    n_texts = table.titles.index("episodes")
+    columns = (replace(one, is_number=one.is_number or i >= n_texts) for i, one in enumerate(table.columns))
+    shown = replace(table, columns=tuple(columns))
+    return Sweep(table=printed_on_page(shown, None), notes=tuple(table.notes))
 
 
 def paired_table(material: Material) -> PageTable | None:
     """Return the counts of each policy against each baseline; None if none is compared."""
     rows = []
     for row in material.table.rows:
-        for baseline, compared in material.compared.items():
-            found = compared.get(key_of(row))
+        for found in row[PAIRED]:
             if found is None:
                 continue
-            pairs, test = material.pairs[baseline][key_of(row)], found.test
-            counts = (pairs.n_pairs, pairs.both, pairs.only_first, pairs.only_second, pairs.neither)
+            test = found.test
             rows.append(
                 [
                     material.name_of(row, with_task=True),
-                    f"{baseline} K={found.baseline.n_action_steps}",
-                    *map(str, counts),
+                    f"{found.baseline.policy} K={found.baseline.n_action_steps}",
+                    *map(str, (found.pairs.n_pairs, *found.pairs)),
                     f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]",
                     _p(test.p_value),
                     _p(found.corrected_p),
@@ -206,10 +200,10 @@ def steps_plots(material: Material) -> Plots:
         rows = [
             row
             for row in material.rows_of(task)
-            if (row.n_action_steps, row.variant) == (size, variant) and row.n_episodes
+            if (row.n_action_steps, row.variant) == (size, variant) and row[EPISODES].n_episodes
         ]
         # With `stop_at_success` only failures last until the horizon.
-        horizon = max((r.n_steps or 0 for row in rows for r in material.group_of(row).results), default=0)
+        horizon = max((r.n_steps or 0 for row in rows for r in row.episodes.results), default=0)
         if not horizon:
             continue
         series = [_cumulative(material, row, horizon) for row in rows]
@@ -247,16 +241,16 @@ def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
             name=policy,
             color=material.colors[policy],
             points=tuple(
-                Point(r.n_action_steps, r.success_once, r.ci_low, r.ci_high)
-                for r in rows
-                if r.policy == policy and r.success_once is not None
+                Point(row.n_action_steps, rate, row[SUCCESS].ci_low, row[SUCCESS].ci_high)
+                for row in rows
+                if row.policy == policy and (rate := row[SUCCESS].success_once) is not None
             ),
         )
         for policy in dict.fromkeys(row.policy for row in rows)
     ]
     kinds: dict[LineKind, Callable[[Row], float | None]] = {
-        "chance": lambda row: row.chance,
-        "ceiling": lambda row: row.ceiling,
+        "chance": _chance,
+        "ceiling": lambda row: row[CEILING],
     }
     for kind, rate_of in kinds.items():
         known = {r.n_action_steps: rate for r in rows if (rate := rate_of(r)) is not None}
@@ -278,7 +272,7 @@ def _round_ticks(end: int) -> list[int]:
 
 
 def _cumulative(material: Material, row: Row, horizon: int) -> Series:
-    results = material.group_of(row).results
+    results = row.episodes.results
     steps = sorted(record.success_step for record in results if record.success_step is not None)
     points = [Point(0, 0.0), *(Point(step, (i + 1) / len(results)) for i, step in enumerate(steps))]
     points.append(Point(horizon, points[-1].y))
@@ -296,7 +290,13 @@ def _rate(value: float | None) -> str:
 
 
 def _steps(row: Row) -> str:
-    return "no success" if row.mean_success_step is None else f"{row.mean_success_step:.1f}"
+    steps = row[STEPS]
+    return "no success" if steps is None else f"{steps:.1f}"
+
+
+def _chance(row: Row) -> float | None:
+    chance = row[CHANCE]
+    return None if chance is None else chance.rate
 
 
 def _p(value: float | None) -> str:

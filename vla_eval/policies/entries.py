@@ -46,11 +46,7 @@ class PolicyEntry:
 
 
 def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
-    """Return the policies of a configuration.
-
-    Raises:
-        VlaEvalError: see `load_policy_entry`.
-    """
+    """Return the policies of a configuration, see `load_policy_entry`."""
     return tuple(load_policy_entry(text) for text in texts)
 
 

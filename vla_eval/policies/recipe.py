@@ -17,7 +17,7 @@ from vla_eval.checkpoints.files import (
     weights_file,
 )
 from vla_eval.checkpoints.notes import LEROBOT_ADAPTER
-from vla_eval.checkpoints.policy_types import ASKED_FOR_STEPS
+from vla_eval.checkpoints.policy_types import asked_for_steps
 from vla_eval.config.files import Recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.remote.survey import moved, survey_address
@@ -59,7 +59,7 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     where = str(folder / CONFIG_FILE)
     n_action_steps = get_count(config, "n_action_steps", maximum=MAX_ACTIONS, where=where)
     kind = get_text(config, "type", where=where)
-    if kind in ASKED_FOR_STEPS:  # its own queue holds that many
+    if asked_for_steps(kind):  # its own queue holds that many
         n_action_steps = None
     weights = weights_file(folder)
     is_big = weights is not None and weights.stat().st_size >= BIG_CHECKPOINT_BYTES

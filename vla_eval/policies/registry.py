@@ -28,6 +28,7 @@ from vla_eval.errors import (
     unknown_name,
 )
 from vla_eval.lock.switch import let_everything
+from vla_eval.models.families import FAMILIES
 from vla_eval.policies.context import PolicyContext
 from vla_eval.seeding import seed_global_generators
 
@@ -47,8 +48,8 @@ POLICIES = {
     "cue_touch": "vla_eval.policies.controls.shortcuts:make_cue_touch",
     "one_frame": "vla_eval.policies.controls.shortcuts:make_one_frame",
     "lerobot": "vla_eval.policies.lerobot.policy:make_lerobot",
-    "openvla": "vla_eval.policies.lerobot.openvla_paper:make_openvla",
     "remote": "vla_eval.policies.remote.policy:make_remote",
+    **{name: target for family in FAMILIES.values() for name, target in family.adapters.items()},
 }
 _SCRIPTED_MODULES = ("vla_eval.policies.controls.scripted:", "vla_eval.policies.controls.shortcuts:")
 SCRIPTED = frozenset(name for name, target in POLICIES.items() if target.startswith(_SCRIPTED_MODULES))
@@ -77,11 +78,7 @@ def check_adapter(adapter: str) -> None:
 
 
 def own_modules(adapters: Iterable[str]) -> tuple[str, ...]:
-    """Return the modules of those adapters that come with this package.
-
-    Raises:
-        UnknownNameError: there is no such adapter.
-    """
+    """Return the modules of those adapters that come with this package."""
     modules = (_target(adapter)[0] for adapter in adapters)
     return tuple(dict.fromkeys(name for name in modules if name.startswith("vla_eval.")))
 
@@ -127,14 +124,9 @@ def policy_factory(adapter: str) -> PolicyFactory:
 def make_from_adapter(adapter: str, context: PolicyContext, args: Mapping[str, Any]) -> Policy:
     """Make a policy of an adapter, with global generators seeded by its name.
 
-    Args:
-        adapter: a name from the registry, or `module:attr`.
-        context: what the policy gets to know.
-        args: keyword arguments of the adapter, from a recipe.
-
     Raises:
         UnknownNameError, MissingDependencyError: see `policy_factory`.
-        RecipeError: the adapter does not take these arguments.
+        RecipeError: the adapter does not take these arguments, which come from a recipe.
     """
     factory = policy_factory(adapter)
     seed_global_generators("policy", context.name)

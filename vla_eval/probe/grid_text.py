@@ -5,39 +5,42 @@ from collections.abc import Sequence
 
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_table import GridCell, GridPart, GridTable
-from vla_eval.probe.text_table import (
-    JsonRow,
-    ProbeFormat,
-    rows_as_csv,
-    shown_rate,
-    shown_table,
-)
-from vla_eval.results.table_columns import UNDEFINED
+from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate
+from vla_eval.results.formats import Format
+from vla_eval.results.own_statistics import rate
+from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
 
 GRID_VERSION = 1
 MOST_LISTED = 8  # first inferences whose steps fit into a cell
-TITLES = (
-    *("task", "policy", "K", "length", "first inference", "inferences in the cue", "cue frames", "late"),
-    *("success once", "lowest, highest", "same inferences", "chance"),
-)
-TEXT_TITLES = ("task", "policy", "length", "inferences in the cue")
-FOLDS = ("task", "policy", "chance")
 
 
-def render_grid(table: GridTable, fmt: ProbeFormat) -> str:
+def render_grid(table: GridTable, fmt: Format) -> str:
     """Return the table as text, without a newline at its end."""
     if fmt == "json":
         return json.dumps(grid_json(table), indent=2, ensure_ascii=False, allow_nan=False)
     if fmt == "csv":
         return rows_as_csv([_flat(cell, part) for cell in table.cells for part in (None, *cell.parts)])
-    cells = grid_cells(table)
+    return write_tables([printed_grid(table)], fmt)
+
+
+def printed_grid(table: GridTable) -> PrintedTable:
+    """Return the table for reading, with its sentences and notes below it."""
+    columns: list[Column[GridCell]] = [
+        Column("task", lambda cell: cell.task, is_number=False, folds=True),
+        Column("policy", lambda cell: cell.policy, is_number=False, folds=True),
+        Column("K", lambda cell: str(cell.n_action_steps)),
+        Column("length", lambda cell: f"{cell.axis} {cell.level}", is_number=False),
+        Column("first inference", lambda cell: _range([part.first_inference_step for part in cell.parts])),
+        Column("inferences in the cue", lambda cell: _steps_of(cell.parts), is_number=False),
+        Column("cue frames", _frames_seen),
+        Column("late", lambda cell: _range([part.inferences.n_late for part in cell.parts])),
+        Column("success once", _shown),
+        Column("lowest, highest", _spread),
+        Column("same inferences", lambda cell: _shown(table.reference_of(cell))),
+        Column("chance", lambda cell: rate(cell.chance), folds=True),
+    ]
     said = [*grid_sentences(table), *grid_notes(table)]
-    return shown_table(TITLES, cells, said, fmt, text_titles=TEXT_TITLES, folds=FOLDS)
-
-
-def grid_cells(table: GridTable) -> list[list[str]]:
-    """Return the cells of the table for reading, in the order of `TITLES`."""
-    return [_cells(table, cell) for cell in table.cells]
+    return PrintedTable(columns=columns, rows=cells_of(columns, table.cells), notes=said).folded()
 
 
 def grid_json(table: GridTable) -> JsonRow:
@@ -114,28 +117,20 @@ def _flat(cell: GridCell, part: GridPart | None) -> JsonRow:
     return {**_key(cell), **own, "n_cue_frames": cell.n_cue_frames, "chance": cell.chance}
 
 
-def _cells(table: GridTable, cell: GridCell) -> list[str]:
-    rates = [part.success.rate for part in cell.parts if part.success is not None]
-    reference = table.reference_of(cell)
+def _frames_seen(cell: GridCell) -> str:
     seen = _range([part.n_seen for part in cell.parts])
-    return [
-        cell.task,
-        cell.policy,
-        str(cell.n_action_steps),
-        f"{cell.axis} {cell.level}",
-        _range([part.first_inference_step for part in cell.parts]),
-        _steps_of(cell.parts),
-        UNDEFINED if seen == UNDEFINED else f"{seen} of {cell.n_cue_frames}",
-        _range([part.inferences.n_late for part in cell.parts]),
-        _shown(cell),
-        f"{min(rates):.2f}, {max(rates):.2f}" if len(rates) > 1 else UNDEFINED,
-        UNDEFINED if reference is None else _shown(reference),
-        UNDEFINED if cell.chance is None else f"{cell.chance:.2f}",
-    ]
+    return UNDEFINED if seen == UNDEFINED else f"{seen} of {cell.n_cue_frames}"
 
 
-def _shown(cell: GridCell) -> str:
-    return UNDEFINED if cell.rate is None or cell.interval is None else shown_rate(cell.rate, cell.interval)
+def _spread(cell: GridCell) -> str:
+    rates = [part.success.rate for part in cell.parts if part.success is not None]
+    return f"{min(rates):.2f}, {max(rates):.2f}" if len(rates) > 1 else UNDEFINED
+
+
+def _shown(cell: GridCell | None) -> str:
+    if cell is None or cell.rate is None or cell.interval is None:
+        return UNDEFINED
+    return shown_rate(cell.rate, cell.interval)
 
 
 def _range(values: Sequence[int | None]) -> str:

@@ -124,7 +124,12 @@ class World:
     @property
     def label(self) -> str:
         """What is changed and by how much: `swap 1`."""
-        return self.intervention if self.level is None else f"{self.intervention} {self.level}"
+        return label_of(self.intervention, self.level)
+
+
+def label_of(intervention: Intervention, level: Level) -> str:
+    """Return what is changed in a world, and by how much."""
+    return intervention if level is None else f"{intervention} {level}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,38 +8,29 @@ from vla_eval.probe.retention import HalfLife, Range
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
-from vla_eval.probe.text_table import (
-    JsonRow,
-    ProbeFormat,
-    rows_as_csv,
-    shown_rate,
-    shown_table,
-)
+from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate
 from vla_eval.results.estimates import Interval
-from vla_eval.results.table_columns import SMALLEST_SHOWN_P, UNDEFINED
+from vla_eval.results.formats import Format
+from vla_eval.results.own_statistics import rate
+from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
+from vla_eval.results.relative_statistics import SMALLEST_SHOWN_P
 
 PROBE_VERSION = 1
-TITLES = (
-    *("task", "policy", "K", "world", "pairs", "sensitivity", "warranted", "value", "reliable", "follows"),
-    *("success once", "chance", "left", "kept", "over delay", "p", "p (Holm)"),
-)
-TEXT_TITLES = ("task", "policy", "world")
-FOLDS = ("task", "policy", "K", "pairs", "chance")
 
 
-def render_probe(table: ProbeTable, fmt: ProbeFormat) -> str:
+def render_probe(table: ProbeTable, fmt: Format) -> str:
     """Return the table as text, without a newline at its end."""
     if fmt == "json":
         return json.dumps(probe_json(table), indent=2, ensure_ascii=False, allow_nan=False)
     if fmt == "csv":
         return rows_as_csv([json_row(row) for row in table.rows])
-    said = [*sentences(table), *notes(table)]
-    return shown_table(TITLES, probe_cells(table), said, fmt, text_titles=TEXT_TITLES, folds=FOLDS)
+    return write_tables([printed_probe(table)], fmt)
 
 
-def probe_cells(table: ProbeTable) -> list[list[str]]:
-    """Return the cells of the table for reading, in the order of `TITLES`."""
-    return [_cells(row) for row in table.rows]
+def printed_probe(table: ProbeTable) -> PrintedTable:
+    """Return the table for reading, with its sentences and notes below it."""
+    cells = cells_of(_COLUMNS, table.rows)
+    return PrintedTable(columns=_COLUMNS, rows=cells, notes=[*sentences(table), *notes(table)]).folded()
 
 
 def probe_json(table: ProbeTable) -> JsonRow:
@@ -139,31 +130,6 @@ def _state(half: HalfLife | None) -> str:
     return "beyond_longest_delay" if half.steps is None else "measured"
 
 
-def _cells(row: ProbeRow) -> list[str]:
-    swap = row.swap
-    return [
-        row.task,
-        row.policy,
-        str(row.n_action_steps),
-        row.intervention if row.level is None else f"{row.intervention} {row.level}",
-        str(row.n_pairs),
-        _shown(swap.sensitivity if swap else None),
-        _shown(swap.warranted_choice if swap else None),
-        shown_rate(swap.matched_value, swap.matched_interval) if swap else UNDEFINED,
-        _shown(swap.reliability if swap else None),
-        _shown(row.followed),
-        _shown(row.success),
-        UNDEFINED if row.chance is None else f"{row.chance:.2f}",
-        UNDEFINED
-        if row.left is None or row.left_interval is None
-        else shown_rate(row.left, row.left_interval),
-        shown_rate(*row.kept) if row.kept else UNDEFINED,
-        shown_rate(*row.over_delay[1:]) if row.over_delay else UNDEFINED,
-        _shown_p(row.p_value),
-        _shown_p(row.corrected_p),
-    ]
-
-
 def _shown(share: Share | None) -> str:
     return UNDEFINED if share is None else shown_rate(share.rate, share.interval)
 
@@ -172,3 +138,33 @@ def _shown_p(p_value: float | None) -> str:
     if p_value is None:
         return UNDEFINED
     return f"<{SMALLEST_SHOWN_P}" if p_value < SMALLEST_SHOWN_P else f"{p_value:.3f}"
+
+
+def _shown_left(row: ProbeRow) -> str:
+    if row.left is None or row.left_interval is None:
+        return UNDEFINED
+    return shown_rate(row.left, row.left_interval)
+
+
+_COLUMNS: tuple[Column[ProbeRow], ...] = (
+    Column("task", lambda row: row.task, is_number=False, folds=True),
+    Column("policy", lambda row: row.policy, is_number=False, folds=True),
+    Column("K", lambda row: str(row.n_action_steps), folds=True),
+    Column("world", lambda row: row.label, is_number=False),
+    Column("pairs", lambda row: str(row.n_pairs), folds=True),
+    Column("sensitivity", lambda row: _shown(row.swap.sensitivity if row.swap else None)),
+    Column("warranted", lambda row: _shown(row.swap.warranted_choice if row.swap else None)),
+    Column(
+        "value",
+        lambda row: shown_rate(row.swap.matched_value, row.swap.matched_interval) if row.swap else UNDEFINED,
+    ),
+    Column("reliable", lambda row: _shown(row.swap.reliability if row.swap else None)),
+    Column("follows", lambda row: _shown(row.followed)),
+    Column("success once", lambda row: _shown(row.success)),
+    Column("chance", lambda row: rate(row.chance), folds=True),
+    Column("left", _shown_left),
+    Column("kept", lambda row: shown_rate(*row.kept) if row.kept else UNDEFINED),
+    Column("over delay", lambda row: shown_rate(*row.over_delay[1:]) if row.over_delay else UNDEFINED),
+    Column("p", lambda row: _shown_p(row.p_value)),
+    Column("p (Holm)", lambda row: _shown_p(row.corrected_p)),
+)

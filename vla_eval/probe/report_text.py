@@ -8,7 +8,7 @@ from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.probe_text import render_probe
 from vla_eval.results.cells import markdown_text
-from vla_eval.results.table_formats import markdown_table
+from vla_eval.results.printed_table import markdown_table
 from vla_eval.storage.run_folder import StoredRun
 
 

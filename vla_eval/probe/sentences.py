@@ -169,7 +169,7 @@ def _columns(rows: Sequence[ProbeRow]) -> list[str]:
 def _failed_controls(rows: Sequence[ProbeRow]) -> list[str]:
     return [
         f"the oracle follows the cue in {_of(row.swap.warranted_choice)} pairs of {row.task}, "
-        f"{_named(row)}: in the others even an arm that knows the answer fails."
+        f"{row.label}: in the others even an arm that knows the answer fails."
         for row in rows
         if row.policy == ORACLE
         and row.swap is not None
@@ -191,15 +191,11 @@ def _chunk_and_phase(rows: Sequence[ProbeRow]) -> list[str]:
         if row.success.interval.high < best.success.interval.low:
             late = f" ({row.inferences.n_late} steps late)" if row.inferences else ""
             found.append(
-                f"{row.task}, {_named(row)}: at K = {row.n_action_steps}{late} the oracle, which forgets "
+                f"{row.task}, {row.label}: at K = {row.n_action_steps}{late} the oracle, which forgets "
                 f"nothing, succeeds in {_of(row.success)} instead of {_of(best.success)} at K = "
                 f"{best.n_action_steps}: chunk and phase explain a drop of this size, not memory."
             )
     return found
-
-
-def _named(row: ProbeRow) -> str:
-    return row.intervention if row.level is None else f"{row.intervention} {row.level}"
 
 
 def _world(row: ProbeRow) -> tuple[object, ...]:

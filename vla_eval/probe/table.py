@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of
+from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of, label_of
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
@@ -72,6 +72,11 @@ class ProbeRow:
     p_value: float | None
     corrected_p: float | None
     n_errors: int
+
+    @property
+    def label(self) -> str:
+        """What is changed and by how much: `swap 1`."""
+        return label_of(self.intervention, self.level)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

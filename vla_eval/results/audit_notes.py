@@ -42,7 +42,7 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
             continue
         for task in sorted({record.task for record in run.records}):
             spec = find_task(task)
-            protocol = protocol_of(env, is_official=spec is not None and spec.suite != "paper")
+            protocol = protocol_of(env, is_official=spec is not None and spec.is_official)
             audit = None if protocol is None else shipped_audits().get((task, protocol))
             if spec is not None and audit is not None and audit.version == spec.version:
                 found.setdefault(audit.protocol, {})[task] = audit

@@ -1,10 +1,9 @@
 """Measure one row, and compare it: with baselines on the same episodes, with chance, with the ceiling."""
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import (
     Interval,
     PairCounts,
@@ -14,8 +13,7 @@ from vla_eval.results.estimates import (
     mcnemar_exact,
     wilson_interval,
 )
-from vla_eval.results.grouping import RowEpisodes, RowKey, Run
-from vla_eval.results.success_table import ChanceSource, IntervalKind
+from vla_eval.results.grouping import RowEpisodes, RowKey
 from vla_eval.tasks.catalog import find_task
 
 CHANCE_POLICY = "cue_blind"
@@ -24,31 +22,36 @@ RANDOM_POLICY = "random"
 TOUR_POLICY = "tour"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """Estimates from one row's own episodes; everything is None without a result."""
+IntervalKind = Literal["wilson", "t_over_runs"]
+ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
 
-    n_runs: int
+
+class Success(NamedTuple):
+    """Success once of a row; everything is None without a result.
+
+    Attributes:
+        n_success_once: how many episodes succeeded at any step.
+        success_once: their share; over several runs the mean of the run means.
+        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
+        n_runs: independent runs with a result.
+        sem: standard error over them.
+    """
+
     n_success_once: int | None = None
     success_once: float | None = None
-    interval: Interval | None = None
-    interval_kind: IntervalKind | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    interval: IntervalKind | None = None
+    n_runs: int = 0
     sem: float | None = None
-    success_at_end: float | None = None
-    first_choice_success: float | None = None
-    n_chose: int | None = None
-    n_chose_right: int | None = None
-    right_if_chose: float | None = None
-    right_if_chose_interval: Interval | None = None
-    mean_success_step: float | None = None
-    inferences_per_episode: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """A row against the baseline."""
+    """A row against another one, on the same episodes; `corrected_p` is Holm's, over the whole table."""
 
     baseline: RowKey
+    pairs: PairCounts
     test: PairedTest
     corrected_p: float
 
@@ -62,44 +65,67 @@ class Chance:
     interval: Interval | None = None
 
 
-def measure(group: RowEpisodes) -> Measured:
-    """Estimate all rates of a row.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What the statistics of one row are estimated from.
 
-    Rates of several runs are means of the run means. If these are all equal, a t interval would have zero
-    width, as if there were no uncertainty; then the episodes of one run give the interval.
+    Attributes:
+        episodes: its episodes.
+        success: how often they succeed.
+        chance, ceiling: success without memory, and of the oracle, in the setting of the row.
+        comparisons: with each baseline of the table; None where there is no pair of episodes.
     """
-    runs = [run for run in group.runs if run.results]
-    estimate = estimate_runs([_n_success(run.results.values()) / len(run.results) for run in runs])
+
+    episodes: RowEpisodes
+    success: Success
+    chance: Chance | None
+    ceiling: float | None
+    comparisons: tuple[Comparison | None, ...]
+
+
+def success_of(group: RowEpisodes) -> Success:
+    """Estimate success once.
+
+    The rate of several runs is the mean of the run means. If these are all equal, a t interval would have
+    zero width, as if there were no uncertainty; then the episodes of one run give the interval.
+    """
+    runs = group.runs_with_results
+    estimate = estimate_runs([run.rate for run in runs])
     if estimate is None:
-        return Measured(n_runs=0)
-    kind: IntervalKind = "t_over_runs" if estimate.sem else "wilson"
-    smallest = min((run.results.values() for run in runs), key=len)
-    one_run = wilson_interval(_n_success(smallest), len(smallest))
-    results = group.results
-    chose = [record for record in results if record.first_choice is not None]
-    has_candidates = any(record.first_choice_success is not None for record in results)
-    n_right = sum(bool(record.first_choice_success) for record in chose)
-    return Measured(
-        n_runs=len(runs),
-        n_success_once=_n_success(results),
+        return Success()
+    smallest = min(runs, key=lambda run: len(run.results))
+    one_run = wilson_interval(smallest.n_success, len(smallest.results))
+    interval = estimate.interval if estimate.sem else one_run
+    assert interval is not None  # there is a result
+    return Success(
+        n_success_once=sum(run.n_success for run in runs),
         success_once=estimate.mean,
-        interval=estimate.interval if kind == "t_over_runs" else one_run,
-        interval_kind=kind,
+        ci_low=interval.low,
+        ci_high=interval.high,
+        interval="t_over_runs" if estimate.sem else "wilson",
+        n_runs=len(runs),
         sem=estimate.sem,
-        success_at_end=_mean_over_runs(runs, lambda record: record.success_at_end),
-        first_choice_success=_mean_over_runs(runs, lambda record: record.first_choice_success),
-        n_chose=len(chose) if has_candidates else None,
-        n_chose_right=n_right if has_candidates else None,
-        right_if_chose=n_right / len(chose) if chose else None,
-        right_if_chose_interval=wilson_interval(n_right, len(chose)) if len(runs) == 1 else None,
-        mean_success_step=_rate([r for r in results if r.success_once], lambda record: record.success_step),
-        inferences_per_episode=_rate(results, lambda record: record.n_inferences),
     )
+
+
+def compare[K](pairs: Mapping[K, tuple[RowEpisodes, RowEpisodes]]) -> dict[K, Comparison]:
+    """Compare rows with other rows on the same run and seed; the p values are corrected together.
+
+    Returns:
+        The comparisons of those that share episodes.
+    """
+    counts = {place: count_pairs(*pair) for place, pair in pairs.items()}
+    tests = {place: test for place, found in counts.items() if (test := mcnemar_exact(found)) is not None}
+    corrected = holm([test.p_value for test in tests.values()])
+    return {
+        place: Comparison(baseline=pairs[place][1].key, pairs=counts[place], test=test, corrected_p=p)
+        for (place, test), p in zip(tests.items(), corrected, strict=True)
+    }
 
 
 def compare_with_baselines(
     groups: Mapping[RowKey, RowEpisodes], baselines: Sequence[str]
-) -> dict[str, dict[RowKey, Comparison]]:
+) -> dict[RowKey, tuple[Comparison | None, ...]]:
     """Compare every other policy with each baseline, on the same task, variant, run and seed.
 
     No pair of policies is tested twice: a baseline is not compared with those before it.
@@ -109,34 +135,49 @@ def compare_with_baselines(
         baselines: names of the policies to compare with.
 
     Returns:
-        Baseline -> one comparison per row that shares episodes with it; p values are corrected for all
-        comparisons with all baselines.
+        Row -> its comparison with each baseline, None where they share no episodes.
     """
-    found: dict[tuple[str, RowKey], tuple[RowKey, PairedTest]] = {}
-    for rank, baseline in enumerate(baselines):
-        for key, group in groups.items():
-            other = None if key.policy in baselines[rank + 1 :] else _baseline_of(key, groups, baseline)
-            test = mcnemar_exact(count_pairs(group, other)) if other is not None else None
-            if other is not None and test is not None:
-                found[baseline, key] = (other.key, test)
-    corrected = holm([test.p_value for _, test in found.values()])
-    compared: dict[str, dict[RowKey, Comparison]] = {baseline: {} for baseline in baselines}
-    for ((baseline, key), (other_key, test)), p in zip(found.items(), corrected, strict=True):
-        compared[baseline][key] = Comparison(baseline=other_key, test=test, corrected_p=p)
-    return compared
+    found = compare(
+        {
+            (baseline, key): (group, other)
+            for rank, baseline in enumerate(baselines)
+            for key, group in groups.items()
+            if key.policy not in baselines[rank + 1 :]
+            and (other := _baseline_of(key, groups, baseline)) is not None
+        }
+    )
+    return {key: tuple(found.get((baseline, key)) for baseline in baselines) for key in groups}
+
+
+def gather_evidence(
+    groups: Mapping[RowKey, RowEpisodes], compared: Mapping[RowKey, tuple[Comparison | None, ...]]
+) -> dict[RowKey, Evidence]:
+    """Return what the statistics of each row are estimated from."""
+    successes = {key: success_of(group) for key, group in groups.items()}
+    return {
+        key: Evidence(
+            episodes=group,
+            success=successes[key],
+            chance=chance_of(key, groups, successes),
+            ceiling=successes.get(key._replace(policy=CEILING_POLICY), Success()).success_once,
+            comparisons=compared[key],
+        )
+        for key, group in groups.items()
+    }
 
 
 def chance_of(
-    key: RowKey, groups: Mapping[RowKey, RowEpisodes], measured: Mapping[RowKey, Measured]
+    key: RowKey, groups: Mapping[RowKey, RowEpisodes], successes: Mapping[RowKey, Success]
 ) -> Chance | None:
     """Return the success of a policy without memory in the setting of this row.
 
     It is that of the cue-blind arm on the same task, variant and `n_action_steps`, if it was run; otherwise
     the value of the records or the catalogue (1/N for N candidates); None if there are no candidates.
     """
-    cue_blind = measured.get(key._replace(policy=CHANCE_POLICY))
-    if cue_blind is not None and cue_blind.success_once is not None:
-        return Chance(rate=cue_blind.success_once, source="cue_blind", interval=cue_blind.interval)
+    blind = successes.get(key._replace(policy=CHANCE_POLICY), Success())
+    if blind.success_once is not None and blind.ci_low is not None and blind.ci_high is not None:
+        interval = Interval(blind.ci_low, blind.ci_high)
+        return Chance(rate=blind.success_once, source="cue_blind", interval=interval)
     records = [
         record
         for other, group in groups.items()
@@ -154,12 +195,6 @@ def chance_of(
     if n_candidates or spec is None or spec.chance_success is None:
         return None
     return Chance(rate=spec.chance_success, source="catalogue")
-
-
-def ceiling_of(key: RowKey, measured: Mapping[RowKey, Measured]) -> float | None:
-    """Return the success of the oracle on the same task, variant and `n_action_steps`."""
-    oracle = measured.get(key._replace(policy=CEILING_POLICY))
-    return oracle.success_once if oracle is not None else None
 
 
 def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: str) -> RowEpisodes | None:
@@ -180,10 +215,10 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: st
 def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
     """Count the outcomes of two rows on the same run and seed."""
     counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
-    others = {(run.index, run.copy): run.results for run in other.runs}
+    others = {run.key: run.results for run in other.runs}
     seen: set[tuple[int, str, str]] = set()
     for run in group.runs:
-        partner = others.get((run.index, run.copy), {})
+        partner = others.get(run.key, {})
         for seed, record in run.results.items():
             if seed not in partner:
                 continue
@@ -193,28 +228,5 @@ def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
                 if (seed, first, second) in seen:
                     continue
                 seen.add((seed, first, second))
-            counts[_once(record), _once(partner[seed])] += 1
+            counts[record.outcome == "success", partner[seed].outcome == "success"] += 1
     return PairCounts(*counts.values())
-
-
-def _once(record: EpisodeRecord) -> bool:
-    return record.outcome == "success"
-
-
-def _n_success(results: Iterable[EpisodeRecord]) -> int:
-    return sum(_once(record) for record in results)
-
-
-def _mean_over_runs(runs: Sequence[Run], value: Callable[[EpisodeRecord], float | None]) -> float | None:
-    means = [mean for run in runs if (mean := _rate(run.results.values(), value)) is not None]
-    return math.fsum(means) / len(means) if len(means) == len(runs) else None
-
-
-def _rate(records: Iterable[EpisodeRecord], value: Callable[[EpisodeRecord], float | None]) -> float | None:
-    """Return the mean of a value; None if any record has none.
-
-    Excluding those would bias it: with `stop_at_success`, success_at_end is known for failures only.
-    """
-    values = [value(record) for record in records]
-    known = [float(item) for item in values if item is not None]
-    return math.fsum(known) / len(known) if values and len(known) == len(values) else None

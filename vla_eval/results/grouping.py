@@ -38,6 +38,21 @@ class RowKey(NamedTuple):
     n_action_steps: int
     variant: str | None
 
+    @property
+    def place(self) -> str:
+        """What is the same for all policies: `RememberColor3-v0 K=4 (env.delay_steps=10)`."""
+        variant = f" ({self.variant})" if self.variant else ""
+        return f"{self.task} K={self.n_action_steps}{variant}"
+
+    @property
+    def of_all_tasks(self) -> "RowKey":
+        """The key that rows of one policy on several tasks share."""
+        return self._replace(task="")
+
+    def __str__(self) -> str:
+        """Return `oracle on RememberColor3-v0 K=4`."""
+        return f"{self.policy} on {self.place}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
@@ -61,6 +76,21 @@ class Run:
         """Return seed -> record of all episodes that are not errors."""
         return {seed: record for seed, record in self.records.items() if record.outcome != "error"}
 
+    @property
+    def key(self) -> tuple[int, int]:
+        """What distinguishes it from the other runs of its row: index and copy."""
+        return self.index, self.copy
+
+    @property
+    def n_success(self) -> int:
+        """How many of its episodes succeeded."""
+        return sum(record.outcome == "success" for record in self.results.values())
+
+    @property
+    def rate(self) -> float:
+        """The share that succeeded, of at least one episode with a result."""
+        return self.n_success / len(self.results)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowEpisodes:
@@ -68,6 +98,11 @@ class RowEpisodes:
 
     key: RowKey
     runs: tuple[Run, ...]
+
+    @property
+    def runs_with_results(self) -> list[Run]:
+        """The runs with an episode that is not an error."""
+        return [run for run in self.runs if run.results]
 
     @property
     def results(self) -> list[EpisodeRecord]:

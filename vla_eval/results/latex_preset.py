@@ -5,9 +5,12 @@ Knows nothing of episodes.
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
+from vla_eval.results.comparison import Success
+from vla_eval.results.grouping import RowKey
 from vla_eval.results.latex import latex_first, latex_text
+from vla_eval.results.own_statistics import EPISODES, SUCCESS
+from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE
 from vla_eval.results.success_table import Row, Table
 
 CONTROLS = {
@@ -29,24 +32,16 @@ LONGEST_LINE = 10  # letters in a line of a column's title
 CHANCE_NAME = "chance, 1/N"
 
 
-class _Label(NamedTuple):
-    """What a row of the paper's table is of."""
-
-    policy: str
-    n_action_steps: int
-    variant: str | None
-
-
 def paper_preset(table: Table) -> str:
     """Return a `table` environment that fits into one line width; it needs booktabs.
 
     Tasks that do not fit side by side continue in a second block below the first.
     """
     tasks = list(dict.fromkeys(row.task for row in table.rows))
-    labels = dict.fromkeys(_label(row) for row in table.rows)
+    labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
     variants = {text: chr(ord("a") + i) for i, text in enumerate(_variants(table))}
     names = {label: _name(label, list(labels), variants) for label in labels}
-    cells = {(_label(row), row.task): row for row in table.rows}
+    cells = {(row.key.of_all_tasks, row.task): row for row in table.rows}
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
@@ -66,7 +61,7 @@ def paper_preset(table: Table) -> str:
 
 
 def _tabular(
-    tasks: Sequence[str], names: dict[_Label, str], cells: dict[tuple[_Label, str], Row]
+    tasks: Sequence[str], names: dict[RowKey, str], cells: dict[tuple[RowKey, str], Row]
 ) -> list[str]:
     lines = [f"\\begin{{tabular}}{{@{{}}l{'c' * len(tasks)}@{{}}}}", "\\toprule"]
     titles = [_title(task) for task in tasks]
@@ -96,16 +91,16 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
     """Return a line of rates, and below it a line of their intervals."""
     rates, intervals = [], []
     for row, best in zip(rows, is_best, strict=True):
-        if row is None or row.success_once is None:
+        success = Success() if row is None else row[SUCCESS]
+        if success.success_once is None:
             rates.append("---")
             intervals.append("")
             continue
-        rate = f"{row.success_once:.2f}"
+        rate = f"{success.success_once:.2f}"
         rates.append(f"\\textbf{{{rate}}}" if best else rate)
-        if row.sem is not None:
-            rates[-1] += f" $\\pm$ {row.sem:.2f}"
-        known = row.ci_low is not None and row.ci_high is not None
-        intervals.append(f"{{\\scriptsize [{row.ci_low:.2f}, {row.ci_high:.2f}]}}" if known else "")
+        if success.sem is not None:
+            rates[-1] += f" $\\pm$ {success.sem:.2f}"
+        intervals.append(f"{{\\scriptsize [{success.ci_low:.2f}, {success.ci_high:.2f}]}}")
     return [
         latex_first(name) + "".join(f" & {rate}" for rate in rates) + r" \\",
         " & ".join(["", *intervals]) + r" \\[2pt]",
@@ -114,28 +109,22 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
 
 def _best(rows: Sequence[Row | None]) -> list[Row]:
     """Return the rows with the highest rate; none if there is nothing to be better than."""
-    known = [row for row in rows if row is not None and row.success_once is not None]
-    if len(known) < 2:
-        return []
-    highest = max(row.success_once or 0.0 for row in known)
-    return [row for row in known if row.success_once == highest]
+    known = [(row, rate) for row in rows if row and (rate := row[SUCCESS].success_once) is not None]
+    highest = max((rate for _, rate in known), default=0.0)
+    return [row for row, rate in known if rate == highest] if len(known) > 1 else []
 
 
-def _by_luck(task: str, cells: dict[tuple[_Label, str], Row]) -> str | None:
+def _by_luck(task: str, cells: dict[tuple[RowKey, str], Row]) -> str | None:
     """Return chance by arithmetic, if that is what the rows of the task are compared with."""
     rates = {
-        row.chance
+        chance.rate
         for (_, other), row in cells.items()
-        if other == task and row.chance is not None and row.chance_source in ("1/N", "catalogue")
+        if other == task and (chance := row[CHANCE]) is not None and chance.source in BY_ARITHMETIC
     }
     return f"{rates.pop():.2f}" if len(rates) == 1 else None
 
 
-def _label(row: Row) -> _Label:
-    return _Label(row.policy, row.n_action_steps, row.variant)
-
-
-def _name(label: _Label, labels: Sequence[_Label], variants: Mapping[str, str]) -> str:
+def _name(label: RowKey, labels: Sequence[RowKey], variants: Mapping[str, str]) -> str:
     """Return the policy, its K if there are several, and the letter of its variant."""
     several = len({other.n_action_steps for other in labels}) > 1
     name = f"{label.policy}, K = {label.n_action_steps}" if several else label.policy
@@ -158,15 +147,15 @@ def _title(task: str) -> list[str]:
 
 
 def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
-    rate = len("0.00 ± 0.00") if any(row.sem is not None for row in rows) else len("0.00")
+    rate = len("0.00 ± 0.00") if any(row[SUCCESS].sem is not None for row in rows) else len("0.00")
     title = max(len(line) for task in tasks for line in _title(task))
     return max(max(rate, title) * SMALL_PT, len("[0.00, 0.00]") * SCRIPT_PT) + COLUMN_SPACE_PT
 
 
 def _caption(table: Table, variants: Mapping[str, str]) -> str:
-    rows = [row for row in table.rows if row.success_once is not None]
+    rows = [row for row in table.rows if row[SUCCESS].success_once is not None]
     parts = ["Success once with its 95\\,\\% interval"]
-    counts = sorted({row.n_episodes for row in rows})
+    counts = sorted({row[EPISODES].n_episodes for row in rows})
     if counts:
         spread = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         parts.append(f", {spread} episodes per cell")
@@ -174,9 +163,9 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     if len(sizes) == 1:
         parts.append(f", $K = {sizes.pop()}$")
     sentences = ["".join(parts) + "."]
-    if any(row.sem is not None for row in rows):
+    if any(row[SUCCESS].sem is not None for row in rows):
         sentences.append("$\\pm$: standard error over the runs.")
-    learned = {_label(row) for row in rows if row.policy not in CONTROLS}
+    learned = {row.key.of_all_tasks for row in rows if row.policy not in CONTROLS}
     if len(learned) > 1:
         sentences.append("The best policy of each task is in bold.")
     controls = dict.fromkeys(row.policy for row in rows if row.policy in CONTROLS)
@@ -186,7 +175,7 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     if variants:
         said = "; ".join(f"({letter}) {latex_text(text)}" for text, letter in variants.items())
         sentences.append(f"Settings: {said}.")
-    n_errors = sum(row.n_errors for row in table.rows)
+    n_errors = sum(row[EPISODES].n_errors for row in table.rows)
     if n_errors:
         sentences.append(f"Episodes that ended in an error are in no rate: {n_errors}.")
     return " ".join(sentences)

@@ -1,4 +1,4 @@
-"""The footnotes of a table: how its values are computed, and where they could mislead a reader."""
+"""The footnotes of a table on its run folders: what is missing, counted once, or not the same in all."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -6,16 +6,14 @@ from itertools import product
 from typing import NamedTuple
 
 from vla_eval.errors import MAX_NAMED, some_of
-from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
-from vla_eval.results.grouping import PROMPTS, Grouping, RowKey, config_names
-from vla_eval.results.success_table import Row
+from vla_eval.results.grouping import PROMPTS, Grouping, config_names
+from vla_eval.results.own_statistics import count
 from vla_eval.storage.run_file import DEVICE, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import find_task
 
 DEVICE_FACTS = f"{DEVICE}."
-VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 
 
 class PlannedRow(NamedTuple):
@@ -31,151 +29,11 @@ class PlannedRow(NamedTuple):
         return f"{self.policy} on {self.task}{k}"
 
 
-def row_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Return the notes on the rows' own values, and where they mislead."""
-    return [
-        *_interval_notes(rows),
-        *_chance_notes(rows),
-        *_vague_chances(rows, chances),
-        *_tour_notes(rows, chances),
-        *_error_notes(rows),
-    ]
-
-
-def _interval_notes(rows: Sequence[Row]) -> list[str]:
-    """Say which interval is used where."""
-    notes = []
-    if any(row.interval == "wilson" and row.n_runs == 1 for row in rows):
-        notes.append("success once, one run: 95 % Wilson interval over its episodes.")
-    if any(row.interval == "t_over_runs" for row in rows):
-        notes.append(
-            "success once, several runs: mean of the run means ± SEM over the runs, 95 % t interval over the "
-            "run means."
-        )
-    without_spread = [row for row in rows if row.n_runs > 1 and row.sem == 0]
-    if without_spread:
-        notes.append(
-            f"SEM is exactly 0 for {some_of(_shown(row) for row in without_spread)}: all runs have the same "
-            "rate. Scripted deterministic controls do not vary between runs, and more runs of them add "
-            "nothing. Their interval is Wilson's over the episodes of one run."
-        )
-    return notes
-
-
-def comparison_notes(rows: Sequence[Row], compared: Mapping[str, Mapping[RowKey, Comparison]]) -> list[str]:
-    """Say what the comparisons with the baselines are."""
-    n_comparisons = sum(len(found) for found in compared.values())
-    if not n_comparisons:
-        return []
-    columns = ", ".join(f"vs {baseline}" for baseline, found in compared.items() if found)
-    notes = [
-        f"{columns}: difference of success once over the same episodes (run, seed); p of the exact "
-        f"McNemar test, Holm-corrected over {_number(n_comparisons, 'comparison')} in this table."
-    ]
-    if any(row.n_runs > 1 and (row.n_pairs or row.second_n_pairs) for row in rows):
-        notes.append(
-            "p treats pairs of several runs as independent: it describes these trained policies, not "
-            "training them again; for that, use the interval over the runs."
-        )
-    n_runs = {_key(row): row.n_runs for row in rows}
-    for baseline, found in compared.items():
-        fewer = [
-            f"{_shown(row)} ({n_runs[one.baseline]} of {row.n_runs} runs)"
-            for row in rows
-            if (one := found.get(_key(row))) and n_runs[one.baseline] < row.n_runs
-        ]
-        if fewer:
-            notes.append(
-                f"vs {baseline}: {some_of(fewer)} over the runs that {baseline} has, too; `--runs` gives it "
-                "as many."
-            )
-        other_k = [
-            f"{_shown(row)} against K={one.baseline.n_action_steps}"
-            for row in rows
-            if (one := found.get(_key(row))) and one.baseline.n_action_steps != row.n_action_steps
-        ]
-        if other_k:
-            notes.append(f"compared with {baseline} at another n_action_steps: {some_of(other_k)}.")
-    return notes
-
-
-def _chance_notes(rows: Sequence[Row]) -> list[str]:
-    notes = []
-    if any(row.chance_source == "cue_blind" for row in rows):
-        notes.append("chance: `cue_blind` as measured on the same task at the same n_action_steps.")
-    if any(row.chance_source in ("1/N", "catalogue") for row in rows):
-        notes.append(
-            "† chance is 1/N for N candidates (by arithmetic where several are right), not measured: "
-            "`cue_blind` has no result there at this n_action_steps."
-        )
-    missing = _unique(
-        f"{row.task} K={row.n_action_steps}"
-        for row in rows
-        if row.chance is None and row.n_episodes and _has_controls(row.task)
-    )
-    if missing:
-        notes.append(
-            f"chance is unknown for {some_of(missing)}: it has to be measured there; run `cue_blind` at the "
-            "same n_action_steps."
-        )
-    return notes
-
-
-def _has_controls(task: str) -> bool:
-    """Whether chance can be measured by `cue_blind`; half of the official 90 tasks have no scripted arm."""
-    spec = find_task(task)
-    return spec is None or bool(spec.oracle)
-
-
-def _vague_chances(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Warn if chance was measured on too few episodes to be precise, as in a run that is in progress."""
-    vague = []
-    for row in rows:
-        chance = chances[_key(row)]
-        interval = chance.interval if chance is not None else None
-        if interval is not None and interval.high - interval.low > VAGUE:
-            vague.append(f"{_place(row)} [{interval.low:.2f}, {interval.high:.2f}]")
-    if not vague:
-        return []
-    return [
-        f"chance is imprecise for {some_of(_unique(vague))}: `cue_blind` has too few episodes there (95 % "
-        "interval in brackets). The corrected score is computed from it."
-    ]
-
-
-def _tour_notes(rows: Sequence[Row], chances: Mapping[RowKey, Chance | None]) -> list[str]:
-    """Warn if success can be reached by searching instead of remembering."""
-    notes = []
-    for row in rows:
-        chance = chances[_key(row)]
-        if row.policy != TOUR_POLICY or row.ci_low is None or chance is None:
-            continue
-        highest = chance.interval.high if chance.interval is not None else chance.rate
-        if row.ci_low > highest:
-            notes.append(
-                f"{_place(row)}: `tour` reaches {row.success_once:.2f} where chance is {chance.rate:.2f}. "
-                "Success there can be reached by touching one candidate after another and is not by itself "
-                "evidence of memory; use the first choice."
-            )
-    return notes
-
-
-def _error_notes(rows: Sequence[Row]) -> list[str]:
-    """Return the note on errors, if there are any."""
-    n_errors = sum(row.n_errors for row in rows)
-    if not n_errors:
-        return []
-    return [
-        f"errors: {_number(n_errors, 'episode')} without a result, in no rate, neither as success nor as "
-        "failure; the same `mikasa-vla eval` command runs such episodes again."
-    ]
-
-
 def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
     """Return the notes on the run folders."""
     notes = [(str(run.path), note) for run in runs for note in (*_no_evidence(run), *_unknown_weights(run))]
     doubles = "with the same trajectory as in another run folder; each is counted once."
-    notes += [(path, f"{_number(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
+    notes += [(path, f"{count(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
     notes += [
         (
             path,
@@ -329,23 +187,6 @@ def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
         f"the run folders were made with different contents of {some_of(differing)}; rows of the same name "
         "are combined anyway."
     ]
-
-
-def _number(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _key(row: Row) -> RowKey:
-    return RowKey(row.task, row.policy, row.n_action_steps, row.variant)
-
-
-def _shown(row: Row) -> str:
-    return f"{row.policy} on {_place(row)}"
-
-
-def _place(row: Row) -> str:
-    variant = f" ({row.variant})" if row.variant else ""
-    return f"{row.task} K={row.n_action_steps}{variant}"
 
 
 def _unique(items: Iterable[str]) -> list[str]:

@@ -5,7 +5,6 @@ Reads and returns; changes nothing. `docs/statistics.md` explains each column.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results import notes
@@ -13,19 +12,17 @@ from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.comparison import (
     CHANCE_POLICY,
     RANDOM_POLICY,
-    Chance,
-    Comparison,
-    Measured,
-    ceiling_of,
-    chance_of,
+    Evidence,
     compare_with_baselines,
-    measure,
+    gather_evidence,
+    success_of,
 )
-from vla_eval.results.estimates import chance_corrected
-from vla_eval.results.grouping import RowEpisodes, group_runs
+from vla_eval.results.formats import FORMATS, Format
+from vla_eval.results.grouping import group_runs
 from vla_eval.results.published.protocol_summary import protocol_summaries
-from vla_eval.results.success_table import Row, RunRow, Table
-from vla_eval.results.table_formats import FORMATS, Format, render
+from vla_eval.results.statistics import make_row, row_notes
+from vla_eval.results.success_table import Row, Table
+from vla_eval.results.table_formats import render
 from vla_eval.storage.run_folder import StoredRun
 
 __all__ = ["DEFAULT_BASELINES", "FORMATS", "Format", "Row", "Table", "build_table", "render"]
@@ -59,121 +56,32 @@ def build_table(
     baselines = (
         tuple(name for name in DEFAULT_BASELINES if name in policies) if baseline is None else (baseline,)
     )
-    compared = compare_with_baselines(grouping.groups, baselines)
-    measured = {key: measure(group) for key, group in grouping.groups.items()}
-    chances = {key: chance_of(key, grouping.groups, measured) for key in grouping.groups}
-    around = {key: _Around(chances[key], ceiling_of(key, measured)) for key in grouping.groups}
-    rows = [
-        Row(**_cells(group, measured[key], around[key], [compared[name].get(key) for name in baselines]))
-        for key, group in grouping.groups.items()
-    ]
+    groups = grouping.groups
+    compared = compare_with_baselines(groups, baselines)
+    evidence = gather_evidence(groups, compared).values()
+    rows = tuple(map(make_row, evidence))
     summaries = protocol_summaries(runs, grouping, names=protocols)
-    table_notes = (
-        *audit_notes(runs),
-        *notes.row_notes(rows, chances),
-        *notes.comparison_notes(rows, compared),
-        *notes.run_notes(runs, grouping),
-        *summaries.notes,
-    )
     return Table(
-        rows=tuple(rows),
-        run_rows=tuple(
-            RunRow(**_cells(alone, measure(alone), around[key], ()), run=run.index, copy=run.copy)
-            for key, group in grouping.groups.items()
-            if measured[key].n_runs > 1
-            for run in group.runs
-            for alone in [replace(group, runs=(run,))]
+        rows=rows,
+        run_rows=tuple(row for of in evidence if of.success.n_runs > 1 for row in _run_rows(of)),
+        notes=(
+            *audit_notes(runs),
+            *row_notes(rows),
+            *notes.run_notes(runs, grouping),
+            *summaries.notes,
         ),
-        notes=table_notes,
         baselines=baselines,
-        n_comparisons=sum(len(found) for found in compared.values()),
+        n_comparisons=sum(one is not None for found in compared.values() for one in found),
         runs={str(run.path): run.description.name for run in runs},
         protocols=summaries.rows,
     )
 
 
-class _Around(NamedTuple):
-    """What a rate is compared with."""
-
-    chance: Chance | None
-    ceiling: float | None
-
-
-def _cells(
-    group: RowEpisodes, own: Measured, around: _Around, versus: Sequence[Comparison | None]
-) -> dict[str, Any]:  # Any: the fields of `Row`
-    right = own.right_if_chose_interval
-    chance, ceiling = around
-    first, second = (*(_versus(one) for one in versus), _versus(None), _versus(None))[:2]
-    return dict(
-        **group.key._asdict(),
-        n_episodes=len(group.results),
-        n_errors=group.n_errors,
-        n_success_once=own.n_success_once,
-        success_once=own.success_once,
-        ci_low=own.interval.low if own.interval else None,
-        ci_high=own.interval.high if own.interval else None,
-        interval=own.interval_kind,
-        n_runs=own.n_runs,
-        sem=own.sem,
-        success_at_end=own.success_at_end,
-        first_choice_success=own.first_choice_success,
-        n_chose=own.n_chose,
-        n_chose_right=own.n_chose_right,
-        right_if_chose=own.right_if_chose,
-        right_if_chose_low=right.low if right else None,
-        right_if_chose_high=right.high if right else None,
-        mean_success_step=own.mean_success_step,
-        inferences_per_episode=own.inferences_per_episode,
-        baseline=first.baseline,
-        baseline_n_action_steps=first.n_action_steps,
-        paired_difference=first.difference,
-        paired_low=first.low,
-        paired_high=first.high,
-        n_pairs=first.n_pairs,
-        paired_p=first.p,
-        paired_p_raw=first.p_raw,
-        second_baseline=second.baseline,
-        second_n_action_steps=second.n_action_steps,
-        second_difference=second.difference,
-        second_low=second.low,
-        second_high=second.high,
-        second_n_pairs=second.n_pairs,
-        second_p=second.p,
-        second_p_raw=second.p_raw,
-        chance=chance.rate if chance else None,
-        chance_source=chance.source if chance else None,
-        ceiling=ceiling,
-        chance_corrected=chance_corrected(
-            own.success_once, chance=chance.rate if chance else None, ceiling=ceiling
-        ),
-    )
-
-
-class _Versus(NamedTuple):
-    """The cells of one comparison; all None without one."""
-
-    baseline: str | None = None
-    n_action_steps: int | None = None
-    difference: float | None = None
-    low: float | None = None
-    high: float | None = None
-    n_pairs: int | None = None
-    p: float | None = None
-    p_raw: float | None = None
-
-
-def _versus(comparison: Comparison | None) -> _Versus:
-    if comparison is None:
-        return _Versus()
-    test = comparison.test
-    return _Versus(
-        baseline=comparison.baseline.policy,
-        n_action_steps=comparison.baseline.n_action_steps,
-        difference=test.difference,
-        low=test.interval.low,
-        high=test.interval.high,
-        n_pairs=test.n_pairs,
-        p=comparison.corrected_p,
-        p_raw=test.p_value,
-    )
+def _run_rows(of: Evidence) -> list[Row]:
+    """Return a row for each run, compared with nothing, so that no test counts twice."""
+    alone = [(run, replace(of.episodes, runs=(run,))) for run in of.episodes.runs]
+    nothing = (None,) * len(of.comparisons)
+    return [
+        make_row(replace(of, episodes=own, success=success_of(own), comparisons=nothing), run=run)
+        for run, own in alone
+    ]

@@ -1,103 +1,88 @@
-"""The success table as data: its rows and their notes."""
+"""The success table as data: what a statistic is, the rows, and their notes."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, cast
 
-IntervalKind = Literal["wilson", "t_over_runs"]
-ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
+from vla_eval.results.comparison import Evidence
+from vla_eval.results.grouping import RowEpisodes, RowKey, Run
+from vla_eval.results.printed_table import Column
+
+Cell = str | int | float | None
 SummaryInterval = Literal["wilson_over_tasks", "t_over_runs"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Statistic[V]:
+    """One statistic of a row, with all that the formats, `--columns` and the notes say of it.
+
+    Attributes:
+        estimate: its value, from what is known of a row; None where it is undefined.
+        cells: its columns in CSV and JSON, a public format: name -> value.
+        columns: its columns in tables for reading.
+        column_of: the column of a baseline, by its number from 0 and its name, where each has one.
+        notes: the footnotes on its values in all rows of a table.
+    """
+
+    estimate: Callable[[Evidence], V]
+    cells: Callable[[V], Mapping[str, Cell]]
+    columns: tuple["Column[Row]", ...] = ()
+    column_of: "Callable[[int, str], Column[Row]] | None" = None
+    notes: "Callable[[Sequence[Row]], Iterable[str]]" = lambda _: ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Row:
-    """One policy on one task, at one `n_action_steps` and one variant of the settings.
+    """One policy on one task, at one `n_action_steps` and one variant of the settings; or one run of it.
 
-    `docs/statistics.md` says what each value means and how it is computed. An undefined value is None.
-
-    Attributes:
-        n_episodes: episodes with a result; n_errors: episodes without one, in no rate.
-        n_success_once: how many succeeded at any step.
-        success_once: their share; over several runs the mean of the run means.
-        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
-        n_runs: independent runs with a result; sem: standard error over them.
-        success_at_end: share that succeeded at the last step.
-        first_choice_success: share whose first candidate touched was the right one.
-        n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
-        right_if_chose: the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson
-            interval, of one run.
-        mean_success_step: control steps until success, over the successes.
-        inferences_per_episode: calls of the policy.
-        baseline, baseline_n_action_steps: the row with which this one is compared, on the same episodes.
-        paired_difference: this row minus the baseline, over n_pairs pairs; paired_low, paired_high: its 95 %
-            interval.
-        paired_p, paired_p_raw: exact McNemar, with and without Holm's correction.
-        second_baseline … second_p_raw: the same with a second baseline.
-        chance, chance_source: success without memory, and its source.
-        ceiling: success of the `oracle` at the same n_action_steps.
-        chance_corrected: success_once relative to chance (0) and ceiling (1).
-        variant: the settings that differ from the others in the table; None if there is only one.
-    """
-
-    task: str
-    policy: str
-    n_action_steps: int
-    variant: str | None
-    n_episodes: int
-    n_errors: int
-    n_success_once: int | None
-    success_once: float | None
-    ci_low: float | None
-    ci_high: float | None
-    interval: IntervalKind | None
-    n_runs: int
-    sem: float | None
-    success_at_end: float | None
-    first_choice_success: float | None
-    n_chose: int | None
-    n_chose_right: int | None
-    right_if_chose: float | None
-    right_if_chose_low: float | None
-    right_if_chose_high: float | None
-    mean_success_step: float | None
-    inferences_per_episode: float | None
-    baseline: str | None
-    baseline_n_action_steps: int | None
-    paired_difference: float | None
-    paired_low: float | None
-    paired_high: float | None
-    n_pairs: int | None
-    paired_p: float | None
-    paired_p_raw: float | None
-    second_baseline: str | None
-    second_n_action_steps: int | None
-    second_difference: float | None
-    second_low: float | None
-    second_high: float | None
-    second_n_pairs: int | None
-    second_p: float | None
-    second_p_raw: float | None
-    chance: float | None
-    chance_source: ChanceSource | None
-    ceiling: float | None
-    chance_corrected: float | None
-
-    def to_dict(self) -> dict[str, str | int | float | None]:
-        """Return the row by column name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunRow(Row):
-    """One run of a row that has several; compared with nothing, so that no test counts twice.
+    `docs/statistics.md` says what each statistic means and how it is computed.
 
     Attributes:
-        run: its number; with several checkpoints, which of them.
-        copy: above 0 where further run folders hold the same run with other trajectories or weights.
+        episodes: which episodes it is of.
+        estimates: the value of each statistic, in the order of the columns of CSV and JSON.
+        run: which run, for one of several; it is compared with nothing, so that no test counts twice.
     """
 
-    run: int
-    copy: int
+    episodes: RowEpisodes
+    estimates: Mapping[Statistic[Any], Any]
+    run: Run | None = None
+
+    def __getitem__[V](self, statistic: Statistic[V]) -> V:
+        """Return the value of a statistic."""
+        return cast(V, self.estimates[statistic])
+
+    @property
+    def key(self) -> RowKey:
+        """Task, policy, n_action_steps and variant."""
+        return self.episodes.key
+
+    @property
+    def task(self) -> str:
+        """Its task."""
+        return self.key.task
+
+    @property
+    def policy(self) -> str:
+        """Its policy."""
+        return self.key.policy
+
+    @property
+    def n_action_steps(self) -> int:
+        """How many actions are executed per inference."""
+        return self.key.n_action_steps
+
+    @property
+    def variant(self) -> str | None:
+        """The settings that differ from the others in the table; None if there is only one."""
+        return self.key.variant
+
+    def to_dict(self) -> dict[str, Cell]:
+        """Return the row by the names of the columns of CSV and JSON."""
+        cells: dict[str, Cell] = self.key._asdict()
+        for statistic, value in self.estimates.items():
+            cells |= statistic.cells(value)
+        # `copy`: above 0 where further run folders hold the same run with other trajectories or weights.
+        return cells if self.run is None else {**cells, "run": self.run.index, "copy": self.run.copy}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,14 +128,14 @@ class Table:
         rows: in the order of the configuration.
         run_rows: the runs of each row that has several.
         notes: footnotes, whole sentences.
-        baselines: the policies with which the others are compared: one, two or none.
+        baselines: the policies with which the others are compared.
         n_comparisons: how many p values were corrected together.
         runs: run folder -> name of its configuration.
         protocols: the summary figures of published protocols, as far as the runs name any.
     """
 
     rows: tuple[Row, ...]
-    run_rows: tuple[RunRow, ...] = ()
+    run_rows: tuple[Row, ...] = ()
     notes: tuple[str, ...]
     baselines: tuple[str, ...]
     n_comparisons: int
@@ -159,11 +144,6 @@ class Table:
 
     def with_runs(self) -> tuple[Row, ...]:
         """Return the rows, each followed by its runs."""
-        runs_of: dict[tuple[str, str, int, str | None], list[Row]] = {}
-        for run in self.run_rows:
-            runs_of.setdefault((run.task, run.policy, run.n_action_steps, run.variant), []).append(run)
         return tuple(
-            one
-            for row in self.rows
-            for one in (row, *runs_of.get((row.task, row.policy, row.n_action_steps, row.variant), ()))
+            one for row in self.rows for one in (row, *(run for run in self.run_rows if run.key == row.key))
         )

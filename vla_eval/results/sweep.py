@@ -5,17 +5,16 @@ Reads and returns; changes nothing. `docs/chunk_sizes.md` explains each column.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from vla_eval.errors import ReportError, unknown_name
-from vla_eval.results.comparison import Chance, Measured, ceiling_of, chance_of, count_pairs, measure
+from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.cue import CueFrames, cue_frames
-from vla_eval.results.estimates import PairCounts, PairedTest, holm, mcnemar_exact
+from vla_eval.results.formats import By
 from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
 from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
 from vla_eval.storage.run_folder import StoredRun
 
-By = Literal["n_action_steps", "policy"]
 DEFAULT_DIFFERENCE = 0.1
 
 
@@ -24,28 +23,22 @@ class SweepRow:
     """One row.
 
     Attributes:
-        key: task, policy, n_action_steps, variant.
-        n_episodes: with a result.
-        measured: rates and interval.
-        chance, ceiling: without memory, and with the answer, at the same n_action_steps.
+        evidence: its episodes, success, chance and ceiling.
+        comparison: with its reference; None for the reference itself. Holm's correction is over the table.
         cue: frames of the cue that the policy got.
-        reference: the row with which it is compared; None for the reference itself.
-        test: paired exact McNemar, this row minus the reference.
-        corrected_p: Holm over all comparisons of the table.
         n_to_settle: episodes that would detect the given difference, at the level corrected for the number
             of comparisons (Bonferroni, which Holm's method requires for its smallest p).
     """
 
-    key: RowKey
-    n_episodes: int
-    measured: Measured
-    chance: Chance | None
-    ceiling: float | None
+    evidence: Evidence
+    comparison: Comparison | None
     cue: CueFrames | None
-    reference: RowKey | None
-    test: PairedTest | None
-    corrected_p: float | None
     n_to_settle: int | None
+
+    @property
+    def key(self) -> RowKey:
+        """Task, policy, n_action_steps and variant."""
+        return self.evidence.episodes.key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,37 +81,27 @@ def compare_runs(
             "There is no episode with a result yet. Start an evaluation with `mikasa-vla eval`."
         )
     references = _references(groups, by, reference)
-    pairs = {
-        key: count_pairs(groups[key], groups[other]) for key, other in references.items() if other != key
-    }
-    tests = {key: test for key, counts in pairs.items() if (test := mcnemar_exact(counts)) is not None}
-    if not tests:
+    compared = compare(
+        {key: (groups[key], groups[other]) for key, other in references.items() if other != key}
+    )
+    if not compared:
         raise ReportError(
             f"Nothing to compare: no two rows share episodes and differ in {by} alone. Evaluate several with "
             f"the same seeds, for example --n-action-steps 1 4 8, or name other runs."
         )
-    corrected = dict(zip(tests, holm([test.p_value for test in tests.values()]), strict=True))
-    measured = {key: measure(group) for key, group in groups.items()}
+    evidence = gather_evidence(groups, {key: (compared.get(key),) for key in groups})
     arguments = _env_arguments(runs)
-    level = LEVEL / len(tests)
+    level = LEVEL / len(compared)
     rows = [
         SweepRow(
-            key=key,
-            n_episodes=len(group.results),
-            measured=measured[key],
-            chance=chance_of(key, groups, measured),
-            ceiling=ceiling_of(key, measured),
-            cue=cue_frames(group, arguments.get((key.task, key.variant), {})),
-            reference=references[key] if key in tests else None,
-            test=tests.get(key),
-            corrected_p=corrected.get(key),
-            n_to_settle=_n_to_settle(key, references[key], pairs.get(key), measured, difference, level)
-            if key in tests
-            else None,
+            evidence=of,
+            comparison=compared.get(key),
+            cue=cue_frames(of.episodes, arguments.get((key.task, key.variant), {})),
+            n_to_settle=_n_to_settle(of, evidence, difference, level),
         )
-        for key, group in groups.items()
+        for key, of in evidence.items()
     ]
-    return Sweep(by=by, rows=tuple(rows), n_comparisons=len(tests), difference=difference, level=level)
+    return Sweep(by=by, rows=tuple(rows), n_comparisons=len(compared), difference=difference, level=level)
 
 
 def _references(groups: Mapping[RowKey, RowEpisodes], by: By, wanted: str | None) -> dict[RowKey, RowKey]:
@@ -141,23 +124,19 @@ def _references(groups: Mapping[RowKey, RowEpisodes], by: By, wanted: str | None
 
 
 def _n_to_settle(
-    key: RowKey,
-    other: RowKey,
-    counts: PairCounts | None,
-    measured: Mapping[RowKey, Measured],
-    difference: float,
-    level: float,
+    of: Evidence, evidence: Mapping[RowKey, Evidence], difference: float, level: float
 ) -> int | None:
     """Plan with the share of episodes that differed; if none did, with that of independent policies."""
-    if counts is None:
+    (compared,) = of.comparisons
+    if compared is None:
         return None
-    n_different = counts.only_first + counts.only_second
-    if n_different:
-        return episodes_to_settle(difference, n_different / counts.n_pairs, level=level)
-    first, second = measured[key].success_once, measured[other].success_once
-    if first is None or second is None:
-        return None
-    return episodes_to_settle(difference, discordance_of_independent(first, second), level=level)
+    pairs = compared.pairs
+    discordance = (pairs.only_first + pairs.only_second) / pairs.n_pairs
+    if not discordance:
+        first, second = of.success.success_once, evidence[compared.baseline].success.success_once
+        assert first is not None and second is not None  # there is a pair
+        discordance = discordance_of_independent(first, second)
+    return episodes_to_settle(difference, discordance, level=level)
 
 
 def _env_arguments(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], Mapping[str, Any]]:

@@ -1,28 +1,18 @@
 """Write a table as Markdown, CSV, JSON, LaTeX or an HTML table. Knows nothing of episodes."""
 
-import csv
-import io
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from typing import Literal, get_args
+from collections.abc import Sequence
 
-from vla_eval.errors import ReportError, some_of
-from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
+from vla_eval.errors import ReportError
 from vla_eval.results.estimates import CONFIDENCE
-from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
+from vla_eval.results.formats import FOR_READING, Format, Preset
 from vla_eval.results.latex_preset import paper_preset
+from vla_eval.results.printed_table import SideTable, csv_text, write_tables
 from vla_eval.results.published.protocol_table import protocol_side_table
 from vla_eval.results.published.table import paper_side_table, published_side_tables
-from vla_eval.results.side_table import SideTable
-from vla_eval.results.success_table import Row, Table
-from vla_eval.results.table_columns import Layout, lay_out, sentence_of
-
-Format = Literal["markdown", "csv", "json", "latex", "html-table"]
-FORMATS: tuple[str, ...] = get_args(Format)
-Preset = Literal["paper"]
-PRESETS: tuple[str, ...] = get_args(Preset)
-FOR_READING = ("markdown", "latex", "html-table")
+from vla_eval.results.statistics import column_names
+from vla_eval.results.success_table import Table
+from vla_eval.results.table_columns import lay_out
 
 JSON_VERSION = 1
 
@@ -66,8 +56,7 @@ def render(
         return _csv(table, sides)
     if fmt == "json":
         return _json(table, sides)
-    layout = lay_out(table, names=columns, wide=wide, width=width)
-    return {"markdown": _markdown, "latex": _latex, "html-table": _html}[fmt](table, layout, sides)
+    return write_tables([lay_out(table, names=columns, wide=wide, width=width), *sides], fmt)
 
 
 def render_published(board: str, fmt: Format) -> str:
@@ -103,82 +92,13 @@ def side_tables(table: Table, *, paper: bool = False, published: str | None = No
     ]
 
 
-def _notes(table: Table, layout: Layout) -> list[str]:
-    """Return the notes of the table, and which columns it lacks."""
-    if not layout.left_out or not table.rows:
-        return list(table.notes)
-    return [*table.notes, f"not shown: {some_of(layout.left_out)} (`--wide` shows every column)."]
-
-
-def _titles(layout: Layout) -> list[str]:
-    return [column.title for column in layout.columns]
-
-
-def _is_number(layout: Layout) -> list[bool]:
-    return [column.is_number for column in layout.columns]
-
-
-# ------------------------------------------------------------------------------------------ formats
-
-
-def _markdown(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
-    parts = []
-    if layout.same:
-        parts.append(sentence_of([(title, markdown_cell(cell)) for title, cell in layout.same]))
-    if table.rows:
-        parts.append(markdown_table(_titles(layout), layout.cells, _is_number(layout)))
-    if notes := _notes(table, layout):
-        parts.append("\n".join(f"- {markdown_text(note)}" for note in notes))
-    parts += [markdown_side_table(side) for side in sides]
-    return "\n\n".join(parts)
-
-
-def markdown_side_table(side: SideTable) -> str:
-    """Return a table below the success table: title, table, notes."""
-    parts = []
-    if side.rows:
-        parts.append(f"**{markdown_text(side.title)}**")
-        parts.append(markdown_table(side.titles, side.rows, side.is_number))
-    if side.notes:
-        parts.append("\n".join(f"- {markdown_text(note)}" for note in side.notes))
-    return "\n\n".join(parts)
-
-
-def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_number: Sequence[bool]) -> str:
-    """Return a table of Markdown whose columns are aligned in its source, too."""
-    escaped = [[markdown_cell(cell) for cell in row] for row in (titles, *rows)]
-    widths = [max(2, *(len(row[i]) for row in escaped)) for i in range(len(titles))]
-
-    def line(cells: list[str]) -> str:
-        padded = (
-            cell.rjust(width) if number else cell.ljust(width)
-            for cell, width, number in zip(cells, widths, is_number, strict=True)
-        )
-        return f"| {' | '.join(padded)} |"
-
-    rule = [
-        "-" * (width - 1) + (":" if number else "-") for width, number in zip(widths, is_number, strict=True)
-    ]
-    return "\n".join(line(cells) for cells in (escaped[0], rule, *escaped[1:]))
-
-
 def _csv(table: Table, sides: Sequence[SideTable]) -> str:
-    names = [field.name for field in fields(Row)]
+    names = list(table.rows[0].to_dict()) if table.rows else column_names()
     source = ["source"] if sides else []  # a column, so that they are never confused
     added = dict.fromkeys(name for side in sides for name in side.csv_columns)
-    text = io.StringIO()
     columns = [*source, *names, *(name for name in added if name not in names)]
-    writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in table.rows:
-        writer.writerow({"source": "measured", **_csv_cells(row.to_dict())})
-    for side in sides:
-        writer.writerows(_csv_cells(line) for line in side.csv_rows)
-    return text.getvalue().rstrip("\n")
-
-
-def _csv_cells(values: Mapping[str, object]) -> dict[str, object]:
-    return {name: csv_cell(value) for name, value in values.items()}
+    measured = ({"source": "measured", **row.to_dict()} for row in table.rows)
+    return csv_text(columns, [*measured, *(line for side in sides for line in side.csv_rows)])
 
 
 def _json(table: Table, sides: Sequence[SideTable]) -> str:
@@ -196,39 +116,3 @@ def _json(table: Table, sides: Sequence[SideTable]) -> str:
     for side in sides:
         data |= side.json
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
-
-
-def _latex(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
-    lines = [NEEDS]
-    if layout.same:
-        lines.append(f"{{\\footnotesize {latex_text(sentence_of(layout.same))}\\par}}\\smallskip")
-    by_task = layout.columns[0].name == "task"
-    if table.rows:
-        lines += fitted(
-            latex_table(_titles(layout), layout.cells, _is_number(layout), ruled_by_first=by_task)
-        )
-    lines += footnotes(_notes(table, layout))
-    for side in sides:
-        if side.rows:
-            lines += ["", f"\\par\\medskip\\textbf{{{latex_text(side.title)}}}\\par\\smallskip"]
-            lines += fitted(
-                latex_table(side.titles, side.rows, side.is_number, ruled_by_first=side.ruled_by_first)
-            )
-        lines += footnotes(side.notes)
-    return "\n".join(lines)
-
-
-def _html(table: Table, layout: Layout, sides: Sequence[SideTable]) -> str:
-    parts = [f"<p>{html_text(sentence_of(layout.same))}</p>"] if layout.same else []
-    if table.rows:
-        parts.append(html_table(_titles(layout), layout.cells, _is_number(layout)))
-    parts += _html_notes(_notes(table, layout))
-    for side in sides:
-        if side.rows:
-            parts += [f"<p>{html_text(side.title)}</p>", html_table(side.titles, side.rows, side.is_number)]
-        parts += _html_notes(side.notes)
-    return "\n".join(parts)
-
-
-def _html_notes(notes: Sequence[str]) -> list[str]:
-    return ["\n".join(["<ul>", *(f"<li>{html_text(note)}</li>" for note in notes), "</ul>"])] if notes else []

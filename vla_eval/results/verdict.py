@@ -5,8 +5,10 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from vla_eval.results.comparison import CHANCE_POLICY
+from vla_eval.results.comparison import CHANCE_POLICY, Comparison
 from vla_eval.results.latex_preset import CONTROLS
+from vla_eval.results.own_statistics import CHOICES, EPISODES, SUCCESS
+from vla_eval.results.relative_statistics import CHANCE, PAIRED
 from vla_eval.results.success_table import Row, Table
 
 LEVEL = 0.05
@@ -41,7 +43,7 @@ class Verdict(NamedTuple):
 def verdicts(table: Table) -> list[Verdict]:
     """Return the verdict on each task of a table, in its order.
 
-    The scripted controls are no subject of a verdict, unless nothing else was run: then the oracle is.
+    No verdict is given on scripted controls, unless nothing else was run: then on the oracle.
     """
     found = []
     for task in dict.fromkeys(row.task for row in table.rows):
@@ -63,19 +65,25 @@ def verdicts(table: Table) -> list[Verdict]:
 
 def _rank(row: Row) -> tuple[float, float]:
     """Sort the best first, what is undefined last; ties stay in the order of the table."""
-    values = (row.paired_difference, row.success_once)
+    first = row[PAIRED][0] if row[PAIRED] else None
+    values = (first.test.difference if first else None, row[SUCCESS].success_once)
     difference, success = (math.inf if value is None else -value for value in values)
     return difference, success
 
 
+def _against_chance(row: Row) -> Comparison | None:
+    return next((one for one in row[PAIRED] if one and one.baseline.policy == CHANCE_POLICY), None)
+
+
 def _finding(row: Row) -> Finding:
-    if row.success_once is None:
+    if row[SUCCESS].success_once is None:
         return "no result"
-    if row.baseline != CHANCE_POLICY or row.paired_difference is None or row.paired_p is None:
+    compared = _against_chance(row)
+    if compared is None:
         return "chance unknown"
-    if row.paired_p >= LEVEL:
+    if compared.corrected_p >= LEVEL:
         return "not shown"
-    return "beats" if row.paired_difference > 0 else "worse"
+    return "beats" if compared.test.difference > 0 else "worse"
 
 
 def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
@@ -84,7 +92,7 @@ def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
     if finding == "no result":
         return f"{name} has no result yet."
     if finding == "chance unknown":
-        return f"{name} succeeds in {row.success_once:.2f} of its episodes{_choice(row)}."
+        return f"{name} succeeds in {row[SUCCESS].success_once:.2f} of its episodes{_choice(row)}."
     verb = VERBS[finding]
     if len(group) == 1:
         return f"{name} {verb}{' by' if finding == 'beats' else ':'} {_said(row)}."
@@ -101,16 +109,19 @@ def _unknown_chance(rows: Sequence[Row]) -> str:
     compared = any(_finding(row) in VERBS for row in rows)
     steps = sorted({row.n_action_steps for row in unknown})
     which = f" at K = {_listed(steps)}" if compared else ""
-    known = "not measured" if unknown[0].chance is None else f"{unknown[0].chance:.2f} by arithmetic"
+    chance = unknown[0][CHANCE]
+    known = "not measured" if chance is None else f"{chance.rate:.2f} by arithmetic"
     return (
         f"Chance{which} is {known}: without {CHANCE_POLICY} on the same episodes, nothing is said of memory."
     )
 
 
 def _said(row: Row) -> str:
-    assert row.paired_p is not None  # as in every row whose chance was measured
-    difference = f"{row.paired_difference:+.2f} [{row.paired_low:+.2f}, {row.paired_high:+.2f}]"
-    return f"{difference}, {_p(row.paired_p)}{_choice(row)}"
+    compared = _against_chance(row)
+    assert compared is not None  # as in every row whose chance was measured
+    test = compared.test
+    difference = f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]"
+    return f"{difference}, {_p(compared.corrected_p)}{_choice(row)}"
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -131,9 +142,8 @@ def _name(group: Sequence[Row], rows: Sequence[Row]) -> str:
 
 
 def _choice(row: Row) -> str:
-    if row.n_chose_right is None:
-        return ""
-    return f"; first choice right in {row.n_chose_right} of {row.n_episodes}"
+    n_right = row[CHOICES].n_chose_right
+    return "" if n_right is None else f"; first choice right in {n_right} of {row[EPISODES].n_episodes}"
 
 
 def _p(value: float) -> str:

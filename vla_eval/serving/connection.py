@@ -205,7 +205,7 @@ def _read(data: str | bytes) -> dict[str, Any]:
     """Return a request.
 
     Raises:
-        RequestError: it is no map in msgpack.
+        RequestError: it is not a map in msgpack.
     """
     if isinstance(data, str):
         raise RequestError("expected a binary message (msgpack), found a text message.")

@@ -66,7 +66,7 @@ class HostedPolicy:
 
     Attributes:
         policy: the policy.
-        metadata: what the server says of it.
+        metadata: what the server reports.
         reader: reads its observations.
         task: the task of an episode whose client names none.
         ignored: what its checkpoint asks for that is not done here.

@@ -35,7 +35,7 @@ from vla_eval.wire.keys import HEADER, explanation, key_problem, refused
 
 MAX_PORT = 65_535
 GOING_AWAY = 1001  # close code of RFC 6455
-# Of a stop, one after the other; whoever stops a service waits 10 s before it kills.
+# Of a stop, one after the other; a service that is stopped has 10 s before it is killed.
 PASS_SECONDS = 4.0  # for the pass under way; then the policy is left alone
 REPLY_SECONDS = 1.5  # for clients to take their replies
 CLOSE_SECONDS = 1.5  # for clients to answer the closing of their connections; then they are cut
@@ -192,7 +192,7 @@ class PolicyServer:
             self._connections.discard(connection)
 
     def _answer_http(self, socket: ServerConnection, request: Request) -> Response | None:
-        """Answer what is no WebSocket, refuse browsers and clients without the key; None: a WebSocket."""
+        """Answer anything but a WebSocket, refuse browsers and clients without the key; None: a WebSocket."""
         if request.path == "/healthz":
             return socket.respond(http.HTTPStatus.OK, "OK\n")
         if self._is_stopping:

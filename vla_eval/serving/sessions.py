@@ -102,7 +102,7 @@ class SessionTable:
             address: of the machine that the connection comes from.
 
         Raises:
-            RequestError: the id is no text, its session was dropped, or there are too many.
+            RequestError: the id is not text, its session was dropped, or there are too many.
         """
         name = _text(request, "session_id")
         key = (connection, name)

@@ -95,7 +95,7 @@ class SharedServers:
 
     @property
     def metadata(self) -> ServerMetadata:
-        """What the servers say of themselves."""
+        """Metadata of the servers."""
         return self._ready[0].metadata
 
     @property

@@ -17,18 +17,28 @@ UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
 
 def make_folder(path: Path) -> None:
-    """Make the folder of a run if it is not there.
+    """Make the folder that a run is to go into, if it is not there.
+
+    Raises:
+        RunFolderError: see `check_folder`.
+        OSError: it cannot be made.
+    """
+    check_folder(path)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder that a run cannot go into.
 
     Raises:
         RunFolderError: it is there and somebody else's, or is not a folder.
-        OSError: it cannot be made.
+        OSError: it cannot be read.
     """
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
-    path.mkdir(parents=True, exist_ok=True)
     for name in SUBFOLDERS:
         _check_subfolder(path / name)
-    names = set(os.listdir(path))
+    names = set(os.listdir(path)) if path.exists() else set[str]()
     if RUN_FILE in names or names <= UNSTARTED:
         return
     if EPISODES_FILE in names:

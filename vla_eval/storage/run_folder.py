@@ -20,7 +20,14 @@ from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder
 from vla_eval.storage.episodes_file import parse_records, repair_records, shown_key
-from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, make_folder, not_a_run_folder
+from vla_eval.storage.folders import (
+    EPISODES_FILE,
+    LOCK_FILE,
+    TIMINGS_FILE,
+    check_folder,
+    make_folder,
+    not_a_run_folder,
+)
 from vla_eval.storage.run_file import (
     DEVICE,
     RUN_FILE,
@@ -254,3 +261,29 @@ def read_run(path: Path) -> StoredRun:
         records=tuple(records.values()),
         sessions=run_file.sessions,
     )
+
+
+def check_startable(
+    path: Path,
+    description: RunDescription,
+    *,
+    allow_environment_change: bool,
+    groups: Collection[tuple[str, str, int]],
+) -> tuple[EpisodeRecord, ...]:
+    """Refuse what `RunFolder.open` would refuse, and write nothing; arguments as there.
+
+    Returns:
+        The records that are there already; none for a new folder.
+
+    Raises:
+        RunChangedError, RunFolderError: see `RunFolder.open`.
+    """
+    check_folder(path)
+    run_file = continued(
+        path, description, shown=path, allow_environment_change=allow_environment_change, may_grow=True
+    )
+    planned = run_file.planned(path, groups)
+    if not (path / RUN_FILE).is_file():
+        return ()
+    data = read_lines(path / EPISODES_FILE)
+    return tuple(parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE, planned).values())

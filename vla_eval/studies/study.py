@@ -185,13 +185,13 @@ def record_tiny(study: Study, backend: Backend, *, allow_environment_change: boo
 
 @contextlib.contextmanager
 def tiny_models(study: Study) -> Iterator[None]:
-    """Build lerobot's π0 in its tiny form if the table is a tiny one."""
+    """Build policies of lerobot's in their tiny form if the table is a tiny one."""
     if not study.is_tiny:
         yield
         return
-    from vla_eval.testing.tiny_models import tiny_paligemma
+    from vla_eval.testing.tiny_models import tiny_forms
 
-    with tiny_paligemma("pi0"):
+    with tiny_forms():
         yield
 
 

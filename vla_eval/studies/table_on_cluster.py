@@ -13,6 +13,7 @@ from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered
 from vla_eval.workers.messages import Failed
+from vla_eval.workers.process import WorkerSpec
 
 MAX_TRIES = 2  # of one fine-tuning, since a machine may hiccup; each resumes from its last checkpoint
 
@@ -41,14 +42,10 @@ def finetune_on(
 
         main = tiny_finetune_main
     jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]
-    pool: Pool[FinetuneJob, Finetuned] = backend.pool(
-        main,
-        answers=(Finetuned,),
-        size=max(1, min(len(jobs), backend.n_gpus or backend.n_cores)),
-        timeouts=TimeoutConfig(setup_seconds=MAX_SECONDS),
-        logs=logs,
-        takes_gpu=True,
-    )
+    timeouts = TimeoutConfig(setup_seconds=MAX_SECONDS)
+    spec = WorkerSpec(main=main, answers=(Finetuned,), timeouts=timeouts, logs=logs)
+    size = max(1, min(len(jobs), backend.n_gpus or backend.n_cores))
+    pool: Pool[FinetuneJob, Finetuned] = backend.pool(spec, size=size, takes_gpu=True)
     failed = _run(pool, JobList(jobs), n_jobs=len(jobs), say=say, is_stopping=is_stopping)
     if failed is None:
         return False

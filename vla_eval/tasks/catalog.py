@@ -1,11 +1,17 @@
 """All task ids, one row each. Importing it starts no simulator.
 
-Horizons, phases and instructions: the paper, appendix "VLA experiments", and `docs/tasks.md`.
+Horizons, phases and instructions: the paper, appendix "VLA experiments", and `docs/tasks.md`. Other installed
+packages add rows by entry points of the group `vla_eval.tasks`, which are loaded on first use.
 """
 
+import functools
+import math
+import re
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
 
-from vla_eval.errors import unknown_name
+from vla_eval.errors import PluginError, unknown_name
 from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
     NAMESPACE_90,
@@ -17,12 +23,13 @@ from vla_eval.tasks.catalogs.spatial_catalog import SPATIAL_TASKS
 from vla_eval.tasks.families import make_families
 from vla_eval.tasks.spec import Suite, TaskSpec
 
+TASK_GROUP = "vla_eval.tasks"
+TASK_ID = re.compile(r"([A-Za-z]\w*/)?[A-Za-z]\w*(-\w+)*-v\d+", re.ASCII)
+N_MUGS = 3
 _REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."
 
 
-def _remember(
-    task: str, entry: str, key: str, *, n_items: int, kwargs: dict[str, int], what: str
-) -> TaskSpec:
+def _remember(task: str, entry: str, key: str, *, kwargs: dict[str, int], what: str) -> TaskSpec:
     return TaskSpec(
         id=task,
         version=1,
@@ -36,7 +43,8 @@ def _remember(
         oracle="vla_eval.oracles.hover:CUBES",
         oracle_sees="poses of all items and which one is right; moves once the choice has appeared",
         candidates="items",
-        chance_success=1 / n_items,
+        candidate_counts=kwargs,
+        chance_success=1 / math.prod(kwargs.values()),
         max_reward=3.0,
     )
 
@@ -47,7 +55,6 @@ _REMEMBER = (
             f"RememberColor{n}-v0",
             "RememberColorEnv",
             "RememberColor",
-            n_items=n,
             kwargs={"n_items": n},
             what=f"{n} cubes of different colours lie there: reach the one that has the colour shown.",
         )
@@ -58,7 +65,6 @@ _REMEMBER = (
             f"RememberShape{n}-v0",
             "RememberShapeEnv",
             "RememberShape",
-            n_items=n,
             kwargs={"n_items": n},
             what=f"{n} blue items of different shapes lie there: reach the one that has the shape shown.",
         )
@@ -69,7 +75,6 @@ _REMEMBER = (
             f"RememberShapeAndColor{shapes}x{colors}-v0",
             "RememberShapeAndColorEnv",
             "RememberShapeAndColor",
-            n_items=shapes * colors,
             kwargs={"n_shapes": shapes, "n_colors": colors},
             what=f"items of {shapes} shapes in {colors} colours lie there: reach the one that was shown.",
         )
@@ -78,7 +83,9 @@ _REMEMBER = (
 )
 
 
-def _shell_game(mode: str, *, asks: str, success: str, oracle: str, max_reward: float) -> TaskSpec:
+def _shell_game(
+    mode: str, *, asks: str, success: str, oracle: str, max_reward: float, turns_wrist: bool = False
+) -> TaskSpec:
     module = "shell_game" if mode == "Touch" else "shell_game_moves"
     return TaskSpec(
         id=f"ShellGame{mode}-v0",
@@ -90,10 +97,12 @@ def _shell_game(mode: str, *, asks: str, success: str, oracle: str, max_reward: 
         description=f"A ball lies at one of three places, then a mug stands on each of them: {asks}",
         success=success,
         oracle=oracle,
+        turns_wrist=turns_wrist,
         oracle_sees="poses of all mugs and which one is right; moves once the mugs have appeared",
         candidates="mugs",
+        candidate_counts={"n_mugs": N_MUGS},
         cue_marks_place=True,
-        chance_success=1 / 3,
+        chance_success=1 / N_MUGS,
         max_reward=max_reward,
     )
 
@@ -118,6 +127,7 @@ _SHELL_GAME = (
         asks="lift the mug that hides the ball.",
         success="The right mug's centre has risen by 10 cm and the arm is at rest.",
         oracle="vla_eval.oracles.pick:MUGS",
+        turns_wrist=True,
         max_reward=75.0,
     ),
 )
@@ -145,10 +155,55 @@ SUITES: dict[Suite, dict[str, TaskSpec]] = {
 }
 
 
-def find_task(task_id: str) -> TaskSpec | None:
-    """Return the row of a task or a family, or None if there is none of this id."""
-    name = task_id.removeprefix("vla_eval/")
+@functools.cache
+def installed_tasks() -> dict[str, TaskSpec]:
+    """Return the tasks that other installed packages add, by their ids.
+
+    Raises:
+        PluginError: one of them cannot be loaded, or is not a task that can be added.
+    """
+    found: dict[str, TaskSpec] = {}
+    for point in entry_points(group=TASK_GROUP):
+        for row in _rows_of(point):
+            if row.id in found or _own(row.id) is not None:
+                raise _unusable(point, f"the task id '{row.id}' is taken", "Give its task another id")
+            found[row.id] = row
+    return found
+
+
+def _rows_of(point: EntryPoint) -> Sequence[TaskSpec]:
+    try:
+        found = point.load()
+    except Exception as exc:  # whatever the code of another package raises
+        raise _unusable(point, f"{type(exc).__name__}: {exc}", "Update or uninstall it") from exc
+    rows = found if isinstance(found, list | tuple) else [found]
+    for row in rows:
+        if not isinstance(row, TaskSpec) or row.is_official or not TASK_ID.fullmatch(row.id):
+            expected = "a TaskSpec of the suite 'paper' with an id such as MyTask-v0, or a list of them"
+            raise _unusable(point, f"found {row!r:.200}", f"Let {point.value} be {expected}")
+    return rows
+
+
+def _unusable(point: EntryPoint, problem: str, advice: str) -> PluginError:
+    package = point.dist.name if point.dist else "unknown"
+    return PluginError(
+        f"the installed package '{package}' adds tasks by {point.value} (entry point '{point.name}' of the "
+        f"group {TASK_GROUP}), which cannot be used: {problem}. {advice}."
+    )
+
+
+def _own(name: str) -> TaskSpec | None:
     return TASKS.get(name) or FAMILIES.get(name) or OFFICIAL_TASKS.get(name)
+
+
+def find_task(task_id: str) -> TaskSpec | None:
+    """Return the row of a task or a family, or None if there is none of this id.
+
+    Raises:
+        PluginError: it is not one of ours, and what other packages add cannot be loaded.
+    """
+    name = task_id.removeprefix("vla_eval/")
+    return _own(name) or installed_tasks().get(name)
 
 
 def task_spec(task_id: str) -> TaskSpec:
@@ -160,10 +215,11 @@ def task_spec(task_id: str) -> TaskSpec:
 
     Raises:
         UnknownNameError: there is no such task; the message suggests the closest one.
+        PluginError: see `find_task`.
     """
     spec = find_task(task_id)
     if spec is None:
-        known = [*TASKS, *FAMILIES]
+        known = [*TASKS, *FAMILIES, *installed_tasks()]
         if task_id.startswith((NAMESPACE_90, NAMESPACE_ORIGINAL)):
             known = list(OFFICIAL_TASKS)
         raise unknown_name("task", task_id.removeprefix("vla_eval/"), known)

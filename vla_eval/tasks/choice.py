@@ -4,27 +4,20 @@ Knows where candidates may lie, which one is touched first, and when the choice 
 defines what the candidates are and how the cue is shown.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.errors import TaskArgumentError
+from vla_eval.task_state import PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
+from vla_eval.tasks.objects.bodies import to_vector
 from vla_eval.tasks.objects.layout import places_from_right
 
 NO_CHOICE = -1
-
-Place = tuple[float, float, float]
-"""x, y, z in m, world frame."""
-
-
-class CueSize(NamedTuple):
-    """A box upright on the table that holds a shown object whose place is in the middle of its base."""
-
-    half_width_m: float
-    height_m: float
 
 
 class ChoiceEnv(MemoryTableEnv):
@@ -83,14 +76,6 @@ class ChoiceEnv(MemoryTableEnv):
         """Return the length of the cue phase, the steps before the cue included."""
         return self.cue_after_steps + super().total_cue_steps(cue_steps)
 
-    def cue_places_m(self, env: int) -> list[Place]:
-        """Return where objects are shown as the cue of one environment's episode, each on the table."""
-        raise NotImplementedError
-
-    def cue_size_m(self) -> CueSize:
-        """Return a size that no object that is shown exceeds."""
-        raise NotImplementedError
-
     def candidate_positions_m(self) -> torch.Tensor:
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
         if self.gpu_sim_enabled:
@@ -104,10 +89,6 @@ class ChoiceEnv(MemoryTableEnv):
         revealed = self.response_begun()[:, None, None]
         positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
         return positions
-
-    def candidate_places(self, env: int) -> tuple[int, ...]:
-        """Return where each candidate of one environment will lie in the response phase."""
-        return places_from_right(self._slots[env, :, :2].cpu().numpy())
 
     def touch_points_m(self) -> torch.Tensor:
         """Return (B, N, 3): the points that the tool centre point must come near, world frame."""
@@ -126,11 +107,6 @@ class ChoiceEnv(MemoryTableEnv):
         step = int(self._elapsed_steps[env])
         in_view = self.cue_after_steps <= step < int(self._cue_end_step[env])
         return self.right_candidates(env) if in_view and self.show_cue else ()
-
-    def right_first_choices(self, env: int) -> tuple[int, ...]:
-        """Return the candidates that are right as a first touch."""
-        right = self.right_candidates(env)
-        return right[:1] if self.in_order else right
 
     def touched_candidates(self, env: int) -> tuple[int, ...]:
         """Return the candidates touched so far in one environment's episode, in the order of first touch."""
@@ -198,6 +174,36 @@ class ChoiceEnv(MemoryTableEnv):
             "first_choice": self._first_choice.clone(),
             "n_wrong_choices": n_wrong,
         }
+
+    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
+        """Return the status, with what was chosen and what is right."""
+        first, right = int(info["first_choice"][env]), self.right_candidates(env)
+        return replace(
+            super().status(info, env),
+            fail=bool(info["fail"][env]),
+            target=only_one(right),
+            n_candidates=len(self.candidates),
+            first_choice=None if first == NO_CHOICE else first,
+            n_wrong_choices=int(info["n_wrong_choices"][env]),
+            right_first_choices=right[:1] if self.in_order else right,
+            chance_success=self.chance_success(),
+            candidate_places=places_from_right(self._slots[env, :, :2].cpu().numpy()),
+            right_candidates=right,
+            touched_candidates=self.touched_candidates(env),
+        )
+
+    def true_state(self, info: dict[str, Any], env: int) -> PrivilegedState:
+        """Return the true state, with the candidates and which are right."""
+        right = self.right_candidates(env)
+        return replace(
+            super().true_state(info, env),
+            candidate_positions_m=to_vector(self.final_positions_m()[env]),
+            target=only_one(right),
+            right_candidates=right,
+            shown_candidates=self.shown_candidates(env),
+            in_order=self.in_order,
+            touched_candidates=self.touched_candidates(env),
+        )
 
     def oracle_info(self) -> torch.Tensor:
         """Return (B,) uint8: the index of the right candidate."""

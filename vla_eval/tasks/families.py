@@ -88,6 +88,7 @@ def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
         kwargs={name: value for name, value in row.kwargs.items() if name not in family.open_arguments},
         description=f"{row.description} Numbers as the arguments say." if is_open else row.description,
         chance_success=None if is_open else row.chance_success,
+        seen_in_one_frame=None if is_open else row.seen_in_one_frame,  # speeds are known by the row alone
         open_arguments=family.open_arguments,
         min_response_steps=family.min_response_steps,
     )

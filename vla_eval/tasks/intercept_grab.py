@@ -63,11 +63,6 @@ class InterceptGrabEnv(RollingBallEnv):
         grasped: torch.Tensor = self.agent.is_grasping(self.ball)
         return grasped
 
-    def gripper_width_m(self) -> torch.Tensor:
-        """Return the (B,) gap between the fingers."""
-        width: torch.Tensor = self.agent.robot.get_qpos()[:, -2:].sum(dim=1)
-        return width
-
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Read success: the ball is grasped, high enough, and the arm at rest; changes nothing."""
         grasped, static = self._is_grasped(), self.is_static()

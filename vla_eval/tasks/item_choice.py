@@ -13,7 +13,8 @@ from mani_skill.utils.structs import Actor
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
+from vla_eval.tasks.choice import ChoiceEnv
+from vla_eval.tasks.memory_env import CueSize, Place
 from vla_eval.tasks.objects.items import Item, build_decoy, build_item
 from vla_eval.tasks.objects.layout import Plane, jittered, slot_centres_m
 

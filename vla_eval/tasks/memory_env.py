@@ -10,7 +10,7 @@ Differences from the official code that concern every task (reasons in `docs/tas
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sapien
@@ -24,22 +24,30 @@ from mani_skill.utils.structs import Actor, Pose
 from vla_eval.errors import TaskArgumentError, unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
-from vla_eval.task_state import Phase
+from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm.arm_control import ArmControl
 from vla_eval.tasks.arm.arms import ARMS, Arm
 from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
 from vla_eval.tasks.durations import StepRange, step_range
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, checked_image_size
-from vla_eval.tasks.objects.bodies import Body, yaw_rad
-
-PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
-"""Index of a phase in tensors -> its name."""
+from vla_eval.tasks.objects.bodies import Body, to_vector
 
 QPOS_NOISE_RAD = 0.02
 FLOOR_Z_M = -0.9196429  # the height of ManiSkill's table
 PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
+
+
+Place = tuple[float, float, float]
+"""x, y, z in m, world frame."""
+
+
+class CueSize(NamedTuple):
+    """A box upright on the table that holds a shown object whose place is in the middle of its base."""
+
+    half_width_m: float
+    height_m: float
 
 
 class MemoryTableEnv(ArmControl):
@@ -282,22 +290,6 @@ class MemoryTableEnv(ArmControl):
 
     # ---------------------------------------------------------------- reading
 
-    def tcp_position_m(self) -> torch.Tensor:
-        """Return the (B, 3) tool centre point, world frame."""
-        position: torch.Tensor = self.agent.tcp.pose.p
-        return position
-
-    def is_static(self) -> torch.Tensor:
-        """Return (B,) bool: no arm joint moves faster than the threshold."""
-        static: torch.Tensor = self.agent.is_static(self.static_threshold_rad_s)
-        return static
-
-    def arm_speed(self) -> torch.Tensor:
-        """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
-        qvel = self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)]
-        speed: torch.Tensor = torch.linalg.norm(qvel, dim=1)
-        return speed
-
     def response_begun(self) -> torch.Tensor:
         """Return (B,) bool: the response phase has begun."""
         begun: torch.Tensor = self._elapsed_steps >= self._response_step
@@ -313,9 +305,35 @@ class MemoryTableEnv(ArmControl):
         """Return name -> body of the objects that an expert may see in addition to candidates."""
         return {}
 
-    def tcp_yaw_rad(self) -> torch.Tensor:
-        """Return (B,): the gripper's yaw about world z; 0 with the fingers aligned along y."""
-        return yaw_rad(self.agent.tcp.pose.q)
+    def cue_places_m(self, env: int) -> list[Place]:
+        """Return where objects are shown as the cue of one environment's episode, each on the table.
+
+        Raises:
+            TaskArgumentError: the task has no cue phase.
+        """
+        raise TaskArgumentError("cue_view: this task has no cue phase in which something could be hidden.")
+
+    def cue_size_m(self) -> CueSize:
+        """Return a size that no object that is shown exceeds."""
+        raise NotImplementedError
+
+    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
+        """Return the status of one environment's episode; `info` is that of the present step."""
+        return TaskStatus(phase=PHASES[int(info["phase"][env])], success=bool(info["success"][env]))
+
+    def true_state(self, info: dict[str, Any], env: int) -> PrivilegedState:
+        """Return what scripted controls see of one environment's episode; `info` as for `status`."""
+        return PrivilegedState(
+            phase=PHASES[int(info["phase"][env])],
+            response_step=int(self._response_step[env]),
+            tcp_position_m=to_vector(self.agent.tcp.pose.p[env]),
+            tcp_velocity_m_s=to_vector(self.agent.tcp.linear_velocity[env]),
+            gripper_width_m=float(self.gripper_width_m()[env]),
+            candidate_positions_m=np.zeros((0, 3)),
+            target=None,
+            bodies={name: body.state(env) for name, body in self.moving_bodies().items()},
+            tcp_yaw_rad=float(self.tcp_yaw_rad()[env]),
+        )
 
     def prompt(self) -> torch.Tensor:
         """Return the (B, D) numbers that come with each observation, as `PROMPT_DIMS` names them."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from mani_skill.utils.structs import Pose
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
+from vla_eval.task_state import TaskStatus
 from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
 from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive, check_range
 
@@ -189,6 +191,10 @@ class RotateEnv(WithoutCueEnv):
             "x_pos_error": shift[:, 0],
             "y_pos_error": shift[:, 1],
         }
+
+    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
+        """Return the status, with how far the peg is turned."""
+        return replace(super().status(info, env), turned_rad=float(info["relative_angle"][env]))
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `peg`, and `goal`: its first position and the target yaw."""

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.chance import chance_of_several
-from vla_eval.tasks.choice import Place
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
-from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.memory_env import Place, nearness
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
-from vla_eval.tasks.spec import total_cue_steps
+from vla_eval.tasks.spec import chance_of_several, total_cue_steps
 
 TOUCH_ABOVE_TOP_M = 0.005  # the point to touch: official 2.5 cm over the centre of a cube of 4 cm
 TOUCH_RADIUS_M = 0.02

@@ -13,8 +13,9 @@ from mani_skill.utils.structs import Pose
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.choice import ChoiceEnv, CueSize, Place
+from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.durations import StepRange
+from vla_eval.tasks.memory_env import CueSize, Place
 from vla_eval.tasks.objects import mug as mugs
 
 N_MUGS = 3

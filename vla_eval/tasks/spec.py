@@ -1,8 +1,11 @@
-"""What is known about a task without starting a simulator: one `TaskSpec` per task id."""
+"""A task without its simulator: one `TaskSpec` per task id, and the arithmetic of phases and chance."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from vla_eval.errors import TaskArgumentError
 
 MemoryType = Literal[
     "object",
@@ -20,7 +23,7 @@ MemoryType = Literal[
 have."""
 
 Suite = Literal["paper", "mikasa_vla_90", "mikasa_official"]
-"""This package's own tasks; the official package's 90 tasks; its original ones."""
+"""Own tasks, and those that other packages add; the official package's 90; its original ones."""
 
 Split = Literal["short", "medium", "long"]
 LONGEST_SHORT_STEPS, LONGEST_MEDIUM_STEPS = 200, 600  # of the official splits
@@ -30,6 +33,8 @@ PhaseSource = Literal["cue_and_delay", "cue", "none"]
 
 TrueState = Literal["items", "mugs", "ball", "peg", "cube", "none"]
 """What scripted controls can be given of an official environment: its candidates, or its moving object."""
+
+MAX_CANDIDATES = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +53,14 @@ class TaskSpec:
         success: one sentence: the success rule.
         oracle: `module:attribute` of the scripted expert.
         oracle_sees: what the expert may see, and when it acts, in words.
-        candidates: the kind of the N objects among which the policy chooses; None if there is no choice.
+        turns_wrist: the expert turns the wrist, so that it needs a control mode with rotations.
+        candidates: the kind of the N objects among which the policy chooses; None if there is no choice, and
+            for an official task.
+        candidate_counts: argument -> its default; their product is N. Empty if there is no choice, or it is
+            not known to controls. A name that is no argument of the task is a constant.
+        several_right: several candidates have to be touched; otherwise one is right.
+        seen_in_one_frame: what the control of single frames goes by: a ball that rolls (with the argument
+            `velocity_range_m_s`), or a cube dragged onto a disc whose colour is known.
         chance_success: success rate of a perfect arm that ignores the cue; None if it has to be measured
             (there is no choice among candidates), or depends on the arguments (families).
         max_reward: the dense reward at success, by which `normalized_dense` divides.
@@ -77,7 +89,11 @@ class TaskSpec:
     success: str
     oracle: str
     oracle_sees: str
+    turns_wrist: bool = False
     candidates: str | None
+    candidate_counts: Mapping[str, int] = field(default_factory=dict)
+    several_right: bool = False
+    seen_in_one_frame: Literal["ball", "cube"] | None = None
     chance_success: float | None
     max_reward: float
     idle_success: float = 0.0
@@ -98,22 +114,13 @@ class TaskSpec:
 
     @property
     def has_candidates(self) -> bool:
-        """Whether one or more of N objects have to be chosen, and which they are is known to controls.
-
-        `candidates` says so of this package's own tasks, whose phases have arguments.
-        """
-        return self.candidates is not None or self.true_state in ("items", "mugs")
+        """Whether one or more of N objects have to be chosen, and which they are is known to controls."""
+        return bool(self.candidate_counts)
 
     @property
-    def seen_in_one_frame(self) -> Literal["ball", "cube"] | None:
-        """What the control of single frames goes by: a ball that rolls, or a cube dragged onto a disc.
-
-        The official TakeItBack is left out: its state does not say which colour the disc has.
-        """
-        if "velocity_range_m_s" in self.kwargs:
-            return "ball"
-        is_dragged = self.suite == "paper" and self.oracle.startswith("vla_eval.oracles.carry:")
-        return "cube" if is_dragged else None
+    def is_official(self) -> bool:
+        """Whether it runs in the official package."""
+        return self.suite != "paper"
 
     @property
     def split(self) -> Split | None:
@@ -123,6 +130,21 @@ class TaskSpec:
         if self.horizon_steps <= LONGEST_SHORT_STEPS:
             return "short"
         return "medium" if self.horizon_steps <= LONGEST_MEDIUM_STEPS else "long"
+
+    def n_candidates(self, env_kwargs: Mapping[str, object]) -> int:
+        """Return how many candidates there are with these arguments; 0 for a task without candidates.
+
+        Raises:
+            TaskArgumentError: an argument that counts them is not a number from 1 to 100.
+        """
+        given = {**self.candidate_counts, **self.kwargs, **env_kwargs}
+        counts = {name: given[name] for name in self.candidate_counts}
+        for name, count in counts.items():
+            if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= MAX_CANDIDATES:
+                raise TaskArgumentError(
+                    f"{self.id}: {name}={count!r:.80}: expected a whole number, 1 to {MAX_CANDIDATES}."
+                )
+        return math.prod(counts.values()) if counts else 0
 
     def default_horizon_steps(self, longest_wait_steps: int) -> int:
         """Return the default length of an episode, given the maximum length of cue and delay."""
@@ -140,3 +162,14 @@ def total_cue_steps(cue_steps: int, n_in_turn: int, gap_steps: int) -> int:
         gap_steps: steps between two of them.
     """
     return n_in_turn * cue_steps + (n_in_turn - 1) * gap_steps
+
+
+def chance_of_several(n_items: int, n_shown: int, *, in_order: bool) -> float:
+    """Return the success rate of a perfect arm that ignores the cue but knows how many items were shown.
+
+    Args:
+        n_items: how many items there are.
+        n_shown: how many different ones were shown.
+        in_order: whether their order must also be the one shown.
+    """
+    return 1 / (math.perm(n_items, n_shown) if in_order else math.comb(n_items, n_shown))

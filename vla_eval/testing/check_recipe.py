@@ -14,8 +14,10 @@ from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -47,12 +49,12 @@ def check_recipe(
         slots_per_worker=N_SLOTS,
         simulator="fake",
     )
-    plan = make_plan(config)
+    plan = make_plan(resolve(config))
     for line in (*(f"warning: {one}" for one in plan.warnings), *(f"note: {one}" for one in plan.notes)):
         say(line)
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
-    facts = EnvFacts(shown.spec, shown.n_candidates)
+    facts = EnvFacts(shown.spec, task_spec(task).n_candidates(config.env))
     first = make_policy(group, facts)
     made = [first]  # given to the check first: weights take long to load
     met = check_policy(
@@ -79,9 +81,7 @@ class _Shown:
     def __init__(self, settings: EnvSettings) -> None:
         self._settings = settings
         self._seen: dict[int, list[Observation]] = {}
-        env = FakeEnv(settings)
-        self.spec = env.spec
-        self.n_candidates = env.reset({0: 1}, render=False)[0].status.n_candidates
+        self.spec = FakeEnv(settings).spec
 
     def observe(self, seed: int, step: int) -> Observation:
         """Return the observation after so many control steps."""

@@ -12,6 +12,7 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls import scripted
 from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.task_state import PHASES
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_env import check_env
 from vla_eval.testing.claims import claim
@@ -43,11 +44,12 @@ def check_task(
     env = make_env(settings)
     try:
         _check_phases(env)
-        idle = _play(env, task, "hold", n_episodes)
+        n_candidates = task_spec(task).n_candidates(settings.kwargs)
+        idle = _play(env, task, "hold", n_episodes, n_candidates=n_candidates)
         idle_wins = any(record.success_once for record in idle)
         may_idle = task_spec(task).idle_success > 0
         claim(may_idle or not idle_wins, f"{task}: doing nothing never succeeds.")
-        expert = _play(env, task, "oracle", n_episodes)
+        expert = _play(env, task, "oracle", n_episodes, n_candidates=n_candidates)
         rate = sum(bool(record.success_once) for record in expert) / n_episodes
         claim(rate >= MIN_ORACLE_SUCCESS, f"{task}: the oracle succeeds.", f"{rate:.2f} of {n_episodes}")
         right = all(record.first_choice_success is not False for record in expert if record.success_once)
@@ -57,20 +59,18 @@ def check_task(
 
 
 def _check_phases(env: SimEnv) -> None:
-    order = ("cue", "delay", "response")
     result = env.reset({0: 1}, render=False)[0]
     seen = [result.status.phase]
     for _ in range(env.spec.horizon_steps):
         result = env.step({0: env.hold_action(0)}, render=frozenset())[0]
         seen.append(result.status.phase)
-    ranks = [order.index(phase) for phase in seen]
-    claim(ranks == sorted(ranks), f"{env.spec.task}: phases come in the order {', '.join(order)}.")
+    ranks = [PHASES.index(phase) for phase in seen if phase is not None]
+    claim(ranks == sorted(ranks), f"{env.spec.task}: phases come in the order {', '.join(PHASES)}.")
     claim(seen[-1] == "response", f"{env.spec.task}: the response phase begins before the horizon.")
 
 
-def _play(env: SimEnv, task: str, policy: str, n_episodes: int) -> list[EpisodeRecord]:
+def _play(env: SimEnv, task: str, policy: str, n_episodes: int, *, n_candidates: int) -> list[EpisodeRecord]:
     chunking = ChunkingSpec(n_action_steps=1)
-    n_candidates = int(getattr(env, "n_candidates", 0))
     context = PolicyContext(name=policy, env=env.spec, chunking=chunking, n_candidates=n_candidates)
     made = scripted.make_hold(context) if policy == "hold" else scripted.make_oracle(context)
     records = []

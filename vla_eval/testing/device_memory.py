@@ -9,9 +9,6 @@ def reset_device_peak(device: str) -> None:
     """Free what nothing uses any more, and let the peak begin from what is left; on a CPU, do nothing.
 
     Without it, a small model that is measured after a large one reports the large one's memory.
-
-    Args:
-        device: `cpu`, `cuda` …
     """
     if torch.device(device).type == "cuda":
         gc.collect()  # a policy and its processors refer to each other
@@ -20,9 +17,5 @@ def reset_device_peak(device: str) -> None:
 
 
 def peak_device_bytes(device: str) -> int | None:
-    """Return the most memory of tensors since `reset_device_peak`; None on a CPU.
-
-    Args:
-        device: `cpu`, `cuda` …
-    """
+    """Return the most memory of tensors since `reset_device_peak`; None on a CPU."""
     return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None

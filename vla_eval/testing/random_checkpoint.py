@@ -17,55 +17,19 @@ from torch import Tensor
 
 from vla_eval.checkpoints.files import WEIGHTS_FILE, TrainingFacts, write_facts
 from vla_eval.checkpoints.foreign_code import no_foreign_code
-from vla_eval.checkpoints.loading import config_class
 from vla_eval.checkpoints.processors import save_tokenizers, save_vlm_files
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
+from vla_eval.models.families import family_of
+from vla_eval.models.family import imported
 from vla_eval.models.shared.weight_file import write_weights
-from vla_eval.testing import tiny_models
 from vla_eval.training.dry_run import assumed_config
 from vla_eval.training.model import tokenizer_from
 
 TASK = "RememberColor3-v0"
 SPREAD = 0.02  # standard deviation of random weights, as transformers initialises them
 PART = 1 << 24  # numbers that are made at once
-PI0_FAMILY = ("pi0", "pi05", "pi0_fast")
-BYTE_TOKENIZER_SIZES: Mapping[str, dict[str, int]] = {
-    "mikasa_openvla": {},
-    "mikasa_spatialvla": {"pad_token": 0, "bos_token": 1, "stop_token": 2, "newline_token": 201},
-}
-"""Numbers of tokens of the tokenizer of bytes, which stands in for the published one. They set no shape."""
-PALIGEMMA_TOKENS, FAST_TOKENS, FAST_MIN_TOKEN = 257_152, 2_048, -354
-"""Vocabularies of PaliGemma and of the FAST action tokenizer, and its lowest coefficient.
-
-Source: lerobot's `modeling_pi0_fast.py`; `processor_config.json` of physical-intelligence/fast as public
-code quotes it.
-"""
-DECODING_STEPS, TINY_DECODING_STEPS = 48, 6
-"""Tokens of π0-FAST per inference: those of 4 steps, prefix and end. Random weights do not write an end, and
-the 256 of its recipe would take minutes on a CPU. The cache of all 256 takes 5 MB."""
-PUBLISHED_SMOLVLM: Mapping[str, Mapping[str, Any]] = {
-    "vision": {
-        "hidden_size": 768,
-        "intermediate_size": 3072,
-        "num_hidden_layers": 12,
-        "num_attention_heads": 12,
-        "image_size": 512,
-        "patch_size": 16,
-    },
-    "text": {
-        "hidden_size": 960,
-        "intermediate_size": 2560,
-        "num_hidden_layers": 32,
-        "num_attention_heads": 15,
-        "num_key_value_heads": 5,
-        "head_dim": 64,
-        "vocab_size": 49280,
-    },
-    "whole": {"scale_factor": 4},
-}
-"""Sizes of SmolVLM2-500M-Video-Instruct; SmolVLA then has the published 450,046,176 parameters."""
 
 
 def stand_in_config(
@@ -73,54 +37,23 @@ def stand_in_config(
 ) -> tuple[Any, Path | None]:
     """Return the policy's configuration, and the folder of a tokenizer where its processors need one.
 
-    Tokenizers are stand-ins: a token per byte, or a few hundred; those of π0-FAST, which has to name whatever
-    token its network predicts, have the published number of tokens. Nothing is downloaded.
-
-    Args:
-        recipe: see there.
-        folder: where their files are written.
-        dtype: precision, for policies with such a setting; None: the recipe's.
-        tiny: build the π0 family and SmolVLA in their tiny form.
+    Nothing is downloaded: `stand_ins` writes what it names to a folder. Without `dtype`, the precision is the
+    recipe's; `tiny` builds families that have one in their tiny form.
     """
-    changes: dict[str, Any] = {}
+    family = family_of(recipe.type)
+    changes: dict[str, Any] = {
+        name: {**value, **recipe.policy.get(name, {})} if isinstance(value, Mapping) else value
+        for name, value in family.stand_in_fields.items()
+    }
     tokenizer: Path | None = None
-    kind = getattr(config_class(recipe.type, where="finetune.type"), "wraps", recipe.type)
-    if kind in BYTE_TOKENIZER_SIZES:
-        own = recipe.policy.get("sizes", {})
-        changes |= {"tokenizer_name": "bytes", "sizes": {**BYTE_TOKENIZER_SIZES[kind], **own}}
-    elif kind == "mikasa_octo":
-        changes |= {"tokenizer_name": "bytes"}
-    elif kind == "smolvla":
-        sizes = None if tiny else PUBLISHED_SMOLVLM
-        vlm = tiny_models.write_tiny_smolvlm(folder / "vlm", sizes=sizes)
-        changes |= {"vlm_model_name": str(vlm)}
-    elif kind in ("pi0", "pi05"):
-        tokenizer = tiny_models.write_tiny_tokenizer(folder / "tokenizer")
-        changes |= tiny_models.TINY_POLICY if tiny else {}
-    elif kind == "pi0_fast":
-        tokenizer, own = _fast_tokenizers(folder, tiny=tiny)
-        changes |= own
+    if family.stand_in:
+        made, tokenizer = imported(family.stand_in)(folder, tiny)
+        changes |= made
     if dtype is not None:
         changes["dtype"] = dtype
     base = recipe.base_checkpoint
     changed = FinetuneRecipe(type=recipe.type, policy={**recipe.policy, **changes}, base_checkpoint=base)
     return assumed_config(changed), tokenizer
-
-
-def _fast_tokenizers(folder: Path, *, tiny: bool) -> tuple[Path, dict[str, Any]]:
-    """Write the two tokenizers of π0-FAST; return the text's, and the fields of the configuration."""
-    n_text, n_actions = (tiny_models.VOCABULARY, None) if tiny else (PALIGEMMA_TOKENS, FAST_TOKENS)
-    text = tiny_models.write_tiny_tokenizer(folder / "tokenizer", n_tokens=n_text)
-    actions = tiny_models.write_tiny_fast_tokenizer(
-        folder / "action_tokenizer", n_tokens=n_actions, min_token=FAST_MIN_TOKEN
-    )
-    changes: dict[str, Any] = {"text_tokenizer_name": str(text), "action_tokenizer_name": str(actions)}
-    changes["validate_action_token_prefix"] = False  # random weights do not write `Action:`
-    changes["max_decoding_steps"] = TINY_DECODING_STEPS if tiny else DECODING_STEPS
-    if tiny:
-        changes |= tiny_models.TINY_POLICY
-        del changes["num_inference_steps"]  # it denoises nothing
-    return text, changes
 
 
 @contextlib.contextmanager
@@ -171,9 +104,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
 def random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
     """Yield a tensor's numbers in order, for `write_weights`: random, of a standard deviation of 0.02.
 
-    Args:
-        described: name -> a tensor of the shape and type; one that has memory is yielded as it is.
-        name: which.
+    `described`: name -> a tensor of the shape and type; one that has memory is yielded as it is.
     """
     tensor = described[name]
     if not tensor.is_meta:  # a buffer, whose values the constructor has computed
@@ -201,18 +132,18 @@ def plain_statistics(config: Any) -> dict[str, dict[str, Any]]:
 
 @contextlib.contextmanager
 def built_tiny(kind: str, *, tiny: bool) -> Iterator[None]:
-    """Let lerobot build the π0 family in its tiny form within the context, if that is asked for.
+    """Let lerobot build a type in its tiny form within the context, if that is asked for.
 
     Raises:
         CheckpointError: a tiny form is asked for, and the type has none but by recipes of its own.
     """
-    family: Any = getattr(config_class(kind, where="finetune.type"), "wraps", kind)
-    if tiny and family in PI0_FAMILY:
-        with tiny_models.tiny_paligemma(family):
+    family = family_of(kind)
+    if not tiny:
+        yield
+    elif family.built_tiny:
+        with imported(family.built_tiny)(family.lerobot_type):
             yield
-    elif tiny and family != "smolvla":
+    else:
         raise CheckpointError(
             f"--tiny is for the π0 family and SmolVLA; '{kind}' has recipes of its own that are tiny."
         )
-    else:
-        yield

@@ -67,12 +67,9 @@ class RehearsalOptions:
 
 
 def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
-    """Rehearse a recipe.
+    """Rehearse a recipe that has a section `finetune`.
 
-    Args:
-        name: of the recipe, which has a section `finetune`.
-        options: see there.
-        batches: also measure inferences per second of so many episodes in one forward pass.
+    `batches`: also measure inferences per second of so many episodes in one forward pass.
 
     Raises:
         CheckpointError: the folder exists, or memory is too small.
@@ -92,12 +89,9 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
 
 
 def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
-    """Load a checkpoint that is there, and let it act; its weights are those of its files.
+    """Load a checkpoint or a run that is there, and let it act; its weights are those of its files.
 
-    Args:
-        path: a LeRobot checkpoint, or a run.
-        options: `device` and `dtype` are used.
-        batches: see `rehearse`.
+    Of the options, `device` and `dtype` are used; `batches`: see `rehearse`.
 
     Raises:
         CheckpointError: it is incomplete, or memory is too small.
@@ -181,13 +175,8 @@ def _estimate(policy: Any, device: str, before: int, *, trained: int | None) -> 
     """Estimate from shapes what is about to be measured.
 
     While it writes, a process holds a part of the numbers, in float32 and in the file's type. Loaded, it
-    holds the weights. An inference adds what the largest layer reads and writes for one sample.
-
-    Args:
-        policy: its weights need no memory.
-        device: on which it will act.
-        before: see `Rehearsed`.
-        trained: what the recipe trains; None: nothing is written.
+    holds the weights. An inference adds what the largest layer reads and writes for one sample. `trained` is
+    what the recipe trains; None: nothing is written.
     """
     weights = {id(x): x for x in policy.state_dict(keep_vars=True).values()}.values()
     n_bytes = sum(x.numel() * x.element_size() for x in weights)

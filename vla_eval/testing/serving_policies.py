@@ -3,20 +3,24 @@
 What they do means nothing; how long it takes and how it rounds does.
 """
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any  # lerobot is untyped
-from unittest.mock import patch
 
 import numpy as np
+import torch
+from lerobot.policies import make_pre_post_processors
 
+from vla_eval.checkpoints.loading import config_class, make_empty_policy
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, STATE_KEY, STATE_NAMES
+from vla_eval.models.families import FAMILIES, TINY_POLICY
+from vla_eval.models.shared.original import with_features
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import PolicySpec
-from vla_eval.testing.tiny_models import TINY_POLICY, Sizes, tiny_paligemma, write_tiny_tokenizer
+from vla_eval.testing.tiny_models import Sizes, tiny_paligemma, write_tiny_tokenizer
+from vla_eval.training.model import tokenizer_from
 
 SMALL = Sizes(depth=4, width=256, expert_width=128)
 SMALL_CHUNK_SIZE = 8
@@ -52,43 +56,32 @@ def make_still(context: PolicyContext) -> StillPolicy:
 
 def make_small_transformer(context: PolicyContext, **args: Any) -> LeRobotPolicy:
     """Make the small transformer from its checkpoint; an adapter."""
-    with tiny_paligemma("pi0", SMALL):
+    with tiny_paligemma(_kind(), SMALL):
         return make_lerobot(context, **args)
 
 
 def write_small_transformer(folder: Path) -> int:
-    """Save a π0 with few random weights; return how many numbers they are."""
-    lerobot_policies: Any = importlib.import_module("lerobot.policies")
-    types: Any = importlib.import_module("lerobot.configs")
-    processing: Any = importlib.import_module("lerobot.policies.pi0.processor_pi0")
-    pi0: Any = importlib.import_module("lerobot.policies.pi0.configuration_pi0")
-    torch: Any = importlib.import_module("torch")
-    loading: Any = importlib.import_module("vla_eval.checkpoints.loading")
-    image = types.PolicyFeature(types.FeatureType.VISUAL, (3, IMAGE_PX, IMAGE_PX))
+    """Save such a policy with few random weights; return how many numbers they are."""
+    kind, n_state = _kind(), len(STATE_NAMES["eef"])
     fields = {**TINY_POLICY, "image_resolution": tuple(TINY_POLICY["image_resolution"])}
     fields |= {"chunk_size": SMALL_CHUNK_SIZE, "n_action_steps": SMALL_CHUNK_SIZE}
-    config = pi0.PI0Config(device="cpu", push_to_hub=False, **fields)
-    n_state, n_action = len(STATE_NAMES["eef"]), len(ACTION_NAMES)
-    config.input_features = {
-        **{key: image for key in CAMERA_KEYS.values()},
-        STATE_KEY: types.PolicyFeature(types.FeatureType.STATE, (n_state,)),
-    }
-    config.output_features = {ACTION_KEY: types.PolicyFeature(types.FeatureType.ACTION, (n_action,))}
+    config = config_class(kind, where="type")(device="cpu", push_to_hub=False, **fields)
+    with_features(config, dict.fromkeys(CAMERA_KEYS.values(), (IMAGE_PX, IMAGE_PX)), state=n_state)
     tokenizer = write_tiny_tokenizer(folder / "tokenizer")
-    step = processing.TokenizerProcessorStep
-
-    def local(**given: Any) -> Any:
-        return step(**{**given, "tokenizer_name": str(tokenizer)})
-
     statistics = {
         key: {"mean": torch.zeros(n), "std": torch.ones(n)}
-        for key, n in ((STATE_KEY, n_state), (ACTION_KEY, n_action))
+        for key, n in ((STATE_KEY, n_state), (ACTION_KEY, len(ACTION_NAMES)))
     }
-    with patch.object(processing, "TokenizerProcessorStep", local), tiny_paligemma("pi0", SMALL):
+    with tokenizer_from(str(tokenizer), config), tiny_paligemma(kind, SMALL):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            policy = loading.make_empty_policy(config)
+            policy = make_empty_policy(config)
         policy.save_pretrained(folder)
-        for pipeline in lerobot_policies.make_pre_post_processors(config, dataset_stats=statistics):
+        for pipeline in make_pre_post_processors(config, dataset_stats=statistics):
             pipeline.save_pretrained(folder)
     return sum(parameter.numel() for parameter in policy.parameters())
+
+
+def _kind() -> str:
+    """Return the type of the small transformer: the one that tables of tiny models have lerobot build."""
+    return next(row.type for row in FAMILIES.values() if row.tiny is not None and row.built_tiny)

@@ -38,13 +38,7 @@ def write_synthetic_dataset(
 ) -> Path:
     """Write a `LeRobotDataset` of synthetic episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
 
-    Args:
-        root: the folder to create.
-        n_episodes: number of episodes.
-        n_frames: length of the shortest.
-        state: which proprioception `observation.state` is.
-        seed: of all random values.
-        instructions: they alternate.
+    `state` is which proprioception `observation.state` is; the instructions alternate.
     """
     features = dataset_features(state)
     dataset = new_dataset(root, features, encoder=EncoderSettings(), max_frames=n_frames + 2)

@@ -10,16 +10,18 @@ import json
 from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, NamedTuple  # lerobot and transformers are untyped
+from typing import Any, NamedTuple  # lerobot and transformers are untyped
 from unittest.mock import patch
 
+from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, read_json
 from vla_eval.evaluation.worker import worker_main
+from vla_eval.models.families import FAMILIES, TINY_POLICY, family_of
+from vla_eval.models.family import imported
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.training.finetune_jobs import finetune_main
 from vla_eval.workers.inside import SharedStage
 
-Family = Literal["pi0", "pi05", "pi0_fast"]
 VOCABULARY = 512
 CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
 SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
@@ -29,14 +31,6 @@ SMOLVLM_TOKENS = {
     "global_image_token": "<global-img>",
     "end_of_utterance_token": "<end_of_utterance>",
 }
-TINY_POLICY: dict[str, Any] = {
-    "chunk_size": 4,
-    "n_action_steps": 4,
-    "num_inference_steps": 2,
-    "image_resolution": [56, 56],
-    "dtype": "float32",
-}
-"""Fields of the policy's configuration for the tiny model."""
 
 
 class Sizes(NamedTuple):
@@ -48,7 +42,7 @@ class Sizes(NamedTuple):
 
 
 @contextlib.contextmanager
-def tiny_paligemma(family: Family = "pi0", made: Sizes = Sizes()) -> Iterator[None]:  # noqa: B008
+def tiny_paligemma(family: str, made: Sizes = Sizes()) -> Iterator[None]:  # noqa: B008
     """Make lerobot build a model of these sizes instead of the full one, within the context."""
     modeling: Any = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
     # 8 heads are hard-coded
@@ -97,9 +91,7 @@ def tiny_resnet() -> Iterator[None]:
 def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
     """Train a tokenizer on three sentences, save it, and return its folder.
 
-    Args:
-        folder: where.
-        n_tokens: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
+    `n_tokens`: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
     """
     _tokenizer({}, n_tokens=n_tokens).save_pretrained(str(folder))
     return folder
@@ -108,10 +100,7 @@ def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
 def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_token: int = -60) -> Path:
     """Make an action tokenizer in which each byte is a token, save it, and return its folder.
 
-    Args:
-        folder: where.
-        n_tokens: as for `write_tiny_tokenizer`.
-        min_token: the coefficient whose character is 0.
+    `min_token`: the coefficient whose character is 0.
     """
     from vla_eval.checkpoints.fast_tokens import FastActionTokenizer
 
@@ -124,9 +113,7 @@ def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_
 def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] | None = None) -> Path:
     """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot.
 
-    Args:
-        folder: where.
-        sizes: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
+    `sizes`: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
     """
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
     from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
@@ -152,23 +139,6 @@ def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] |
         video_processor=SmolVLMVideoProcessor(),
         image_seq_len=4,
     ).save_pretrained(str(folder))
-    return folder
-
-
-def write_tiny_clip(folder: Path) -> Path:
-    """Save a tiny CLIP with random weights, and its tokenizer, for the multi-task DiT; return its folder."""
-    from transformers import CLIPConfig, CLIPModel
-
-    write_tiny_tokenizer(folder)
-    sizes = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
-    config: Any = CLIPConfig
-    model: Any = CLIPModel
-    made = config(
-        text_config={**sizes, "vocab_size": VOCABULARY, "eos_token_id": SPECIAL_TOKENS.index("<eos>")},
-        vision_config={**sizes, "image_size": 32, "patch_size": 16},
-        projection_dim=16,
-    )
-    model(made).save_pretrained(str(folder))
     return folder
 
 
@@ -215,19 +185,30 @@ def _with_more_tokens(tokenizer: Any, n_tokens: int) -> Any:
     return make_model(vocab=vocabulary, merges=merges, unk_token=model["unk_token"])
 
 
-def make_tiny_pi0(context: PolicyContext, *, family: Family = "pi0", **args: Any) -> LeRobotPolicy:
-    """Make a policy from a tiny checkpoint; an adapter for recipes in tests."""
-    with tiny_paligemma(family):
-        return make_lerobot(context, **args)
+def make_tiny(context: PolicyContext, *, checkpoint: str, **args: Any) -> LeRobotPolicy:
+    """Make a policy from a checkpoint of a family that lerobot has to be made to build tiny; an adapter."""
+    family = family_of(str(read_json(find_checkpoint(Path(checkpoint)) / CONFIG_FILE).get("type")))
+    with imported(family.built_tiny)(family.lerobot_type):
+        return make_lerobot(context, checkpoint=checkpoint, **args)
+
+
+@contextlib.contextmanager
+def tiny_forms() -> Iterator[None]:
+    """Let lerobot build all families that have such a form tiny within the context."""
+    with contextlib.ExitStack() as stack:
+        for family in FAMILIES.values():
+            if family.built_tiny and not family.wraps:
+                stack.enter_context(imported(family.built_tiny)(family.type))
+        yield
 
 
 def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Run a worker of an evaluation in which π0, π0.5 and ACT are tiny; see `worker_main`."""
-    with tiny_paligemma("pi0"), tiny_paligemma("pi05"), tiny_resnet():
+    """Run a worker of an evaluation in which they are tiny, and ACT is; see `worker_main`."""
+    with tiny_forms(), tiny_resnet():
         worker_main(connection, shared, log)
 
 
 def tiny_finetune_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Run a worker that fine-tunes, in which π0 is tiny; see `finetune_main`."""
-    with tiny_paligemma("pi0"):
+    """Run a worker that fine-tunes, in which they are tiny; see `finetune_main`."""
+    with tiny_forms():
         finetune_main(connection, shared, log)

@@ -17,19 +17,11 @@ from vla_eval.config.finetuning import merge_fields
 from vla_eval.config.policy import PolicyRecipe, load_policy
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import ModelTable, TableRow
+from vla_eval.models.families import FAMILIES, family_of
 from vla_eval.storage.durable import replace_file
-from vla_eval.testing.tiny_models import TINY_POLICY, write_tiny_tokenizer
+from vla_eval.testing.tiny_models import write_tiny_tokenizer
 
-TINY_RECIPES = {
-    "mikasa_octo": "octo_tiny",
-    "mikasa_openvla": "openvla_oft_tiny",
-    "mikasa_spatialvla": "spatialvla_tiny",
-}
-"""Type of a policy -> recipe of its tiny form."""
-TINY_UNET: dict[str, Any] = {"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}
-SMALL = ("act", "diffusion", "mikasa_memory", "mikasa_offline_rl", "mikasa_sequence")
-"""Types whose own recipes are small enough; the U-Net of a diffusion policy is not."""
-TINY_PI0_ADAPTER = "vla_eval.testing.tiny_models:make_tiny_pi0"
+TINY_ADAPTER = "vla_eval.testing.tiny_models:make_tiny"
 N_EPISODES = 2
 N_STEPS = 2
 SHORT = {
@@ -84,31 +76,24 @@ def tiny_dataset(table: ModelTable) -> DatasetRecipe:
 def _tiny_recipe(row: TableRow, folder: Path) -> tuple[dict[str, Any], str]:
     real = load_policy(row.policy).value.finetune
     kind = None if real is None else real.type
-    longest = max(row.n_action_steps)
-    chunk = {"chunk_size": longest, "n_action_steps": longest}
-    if kind == "pi0":
-        policy = {**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": N_STEPS, **chunk}
-        tokenizer = str(write_tiny_tokenizer(folder / "tokenizer"))
-        section: dict[str, Any] = {"type": "pi0", "tokenizer": tokenizer, "policy": policy, **SHORT}
-        return _recipe(row, section), TINY_PI0_ADAPTER
-    if kind not in TINY_RECIPES and kind not in SMALL:
-        known = ", ".join(("pi0", *SMALL, *TINY_RECIPES))
+    family = family_of(str(kind))
+    tiny, longest = family.tiny, max(row.n_action_steps)
+    if tiny is None:
+        known = ", ".join(family.type for family in FAMILIES.values() if family.tiny is not None)
         raise RecipeError(f"row {row.name}: there is no tiny form of the type {kind}. Known: {known}.")
-    if kind in SMALL:
-        section = merge_fields(to_data(real), row.finetune or {})
+    if family.built_tiny:
+        tokenizer = str(write_tiny_tokenizer(folder / "tokenizer"))
+        section: dict[str, Any] = {"type": kind, "tokenizer": tokenizer, "policy": {}}
+    elif tiny.recipe:
+        section = to_data(load_recipe("policies", tiny.recipe, PolicyRecipe).value.finetune)
     else:
-        section = to_data(load_recipe("policies", TINY_RECIPES[kind], PolicyRecipe).value.finetune)
-    section |= SHORT
-    # The chunk of a diffusion policy follows from its horizon: keep the recipe's.
-    section["policy"] = {**section["policy"], **(TINY_UNET if kind == "diffusion" else chunk)}
-    return _recipe(row, section), LEROBOT_ADAPTER
-
-
-def _recipe(row: TableRow, section: dict[str, Any]) -> dict[str, Any]:
-    return {
+        section = merge_fields(to_data(real), row.finetune or {})
+    chunk = {"chunk_size": longest, "n_action_steps": longest} if tiny.sets_chunk else {}
+    recipe = {
         "version": 1,
         "description": f"Tiny random weights in the place of {row.policy}.",
         "adapter": LEROBOT_ADAPTER,
         "default_n_action_steps": row.n_action_steps[0],
-        "finetune": section,
+        "finetune": {**section, **SHORT, "policy": {**section["policy"], **tiny.fields, **chunk}},
     }
+    return recipe, TINY_ADAPTER if family.built_tiny else LEROBOT_ADAPTER

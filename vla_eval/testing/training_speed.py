@@ -14,12 +14,12 @@ from vla_eval.checkpoints.processors import load_processors
 from vla_eval.checkpoints.verify import random_batch
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_KEY
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.stages import EPISODE_STEPS
 from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.batches import preprocessed
 from vla_eval.training.cost.estimate import estimate
-from vla_eval.training.cost.network_stages import EPISODE_STEPS
 from vla_eval.training.loop import autocast_dtype
 from vla_eval.training.lora import peft_config
 from vla_eval.training.request import load_finetune_recipe
@@ -31,15 +31,10 @@ TINY_BATCH = 2
 def measure_steps(
     name: str, folder: Path, *, device: str, n_steps: int, batch_size: int | None = None, tiny: bool = False
 ) -> dict[str, Any]:
-    """Return seconds per step, device memory, and what was estimated.
+    """Return seconds per step of a recipe (the mean of `n_steps` after the first), memory, and the estimate.
 
-    Args:
-        name: recipe in `policies/` with a section `finetune`.
-        folder: for a checkpoint of random weights; it is removed.
-        device: `cpu`, `cuda` …
-        n_steps: steps after the first, whose mean is taken.
-        batch_size: samples per step; None: the recipe's, or two if tiny.
-        tiny: build the π0 family and SmolVLA in their tiny form.
+    A checkpoint of random weights is written to `folder`, and removed. Without `batch_size`, it is the
+    recipe's, or two if tiny.
     """
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
     n_samples = batch_size or (TINY_BATCH if tiny or name.endswith("_tiny") else recipe.batch_size)

@@ -18,7 +18,7 @@ from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
 
 Batch = dict[str, Any]
 

@@ -1,6 +1,6 @@
 """`finetune --dry-run`: what would run, and what it takes. Writes nothing; loads no weights."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -9,7 +9,6 @@ import draccus
 from lerobot.configs import FeatureType, PolicyFeature
 
 from vla_eval.checkpoints.bases import how_to_get
-from vla_eval.checkpoints.conversion.octo import SIZES
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.foreign_code import only_data
 from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
@@ -18,6 +17,7 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.data.opening import OpenDataset
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
+from vla_eval.models.families import bases
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.dataset import chosen_episodes, training_dataset
@@ -27,8 +27,6 @@ from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import newest_step
 
 EEF_NUMBERS = 10  # of the state that recordings have
-PUBLISHED_SIZES: Mapping[str, Mapping[str, Any]] = {"octo_base": SIZES["base"]}
-"""Base -> fields that its `config.json` will have, where they are not the defaults of the type."""
 
 
 def assumed_config(recipe: FinetuneRecipe) -> Any:
@@ -36,8 +34,8 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     cls = config_class(recipe.type, where="finetune.type")
     known = cls.__dataclass_fields__
     closed = {name: value for name, value in NO_DOWNLOADS.items() if name in known}
-    sizes = PUBLISHED_SIZES.get(Path(str(recipe.base_checkpoint)).name, {})
-    data = {**closed, **sizes, **recipe.policy, "device": "cpu", "push_to_hub": False}
+    base = bases().get(Path(str(recipe.base_checkpoint)).name)
+    data = {**closed, **(base.fields if base else {}), **recipe.policy, "device": "cpu", "push_to_hub": False}
     if "action_grid" in known:
         data["action_grid"] = "uniform"
     try:

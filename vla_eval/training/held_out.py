@@ -21,6 +21,7 @@ from vla_eval.config.prompts import instruction_for
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import Silence, evaluate
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -85,8 +86,8 @@ class HeldOut:
         folder = self.out / EVALUATIONS_FOLDER / f"{checkpoint.name}-{self.identity}"
         # Versions may change within a training of some days; the run folder notes it.
         stops = _UntilStopped(self.is_stopping, functools.partial(self._warn, checkpoint))
-        config = self._config(checkpoint)
-        if evaluate(config, out=folder, allow_environment_change=True, observer=stops).was_stopped:
+        resolved = resolve(self._config(checkpoint), out=folder)
+        if evaluate(resolved, allow_environment_change=True, observer=stops).was_stopped:
             return
         records = read_run(folder).records
         results = [bool(record.success_once) for record in records if record.error is None]

@@ -18,7 +18,7 @@ from vla_eval.control_modes import action_spec
 from vla_eval.data.opening import OpenDataset, decoder_for
 from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
-from vla_eval.models.vla_memory.fields import SampleMemory
+from vla_eval.models.shared.earlier_frames import SampleMemory
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.held_out import check_asked, check_held_out

@@ -6,17 +6,10 @@ from lerobot.configs.default import PeftConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 
-from vla_eval.checkpoints.policy_types import wrapped_type
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import RecipeError
+from vla_eval.models.families import family_of
 from vla_eval.models.shared.trainable import check_lora
-
-LORA_TARGETS = {
-    "pi05": r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"
-    r"|model\.(action_in_proj|action_out_proj|time_mlp_in|time_mlp_out))"
-}
-"""By type, where lerobot 0.6.1 chooses wrongly: it looks for π0.5's projections of time under π0's names, and
-leaves them frozen (https://github.com/huggingface/lerobot/pull/4494)."""
 
 
 def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
@@ -27,7 +20,7 @@ def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:
     return PeftConfig(
         r=lora.rank,
         lora_alpha=lora.alpha or lora.rank,
-        target_modules=lora.target_modules or LORA_TARGETS.get(wrapped_type(policy)),
+        target_modules=lora.target_modules or family_of(policy.type).lora_targets,
         full_training_modules=list(lora.full_modules) or None,
     )
 
@@ -56,6 +49,6 @@ def check_adapters(model: Any, recipe: FinetuneRecipe, policy: Any) -> None:
             "finetune.lora.full_modules: [memory_tokens]"
         )
     own = policy.lora_defaults() if hasattr(policy, "lora_defaults") else {}
-    target = recipe.lora.target_modules or LORA_TARGETS.get(wrapped_type(policy)) or own.get("target_modules")
+    target = recipe.lora.target_modules or family_of(policy.type).lora_targets or own.get("target_modules")
     if target is not None:
         check_lora(model, target, tuple(recipe.lora.full_modules or own.get("modules_to_save") or ()))

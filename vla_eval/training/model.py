@@ -25,6 +25,7 @@ from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
 from vla_eval.checkpoints.processors import step_names, tokenizer_overrides
 from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.errors import RecipeError, TrainingError
+from vla_eval.models.families import family_of
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
 from vla_eval.training.lora import check_adapters, peft_config
@@ -164,9 +165,9 @@ def tokenizer_from(folder: str | None, policy: Any) -> Iterator[None]:
     if folder is None:
         yield
         return
-    cls = type(policy)
-    if hasattr(cls, "wraps"):  # whose processors it takes
-        cls = config_class(cls.wraps, where="finetune.type")
+    cls, family = type(policy), family_of(policy.type)
+    if family.wraps:  # whose processors it takes
+        cls = config_class(family.wraps, where="finetune.type")
     name = cls.__module__.replace("configuration_", "processor_")
     processing: Any = importlib.import_module(name)
     if not Path(folder).is_dir() or not hasattr(processing, TOKENIZER_STEP):

@@ -36,6 +36,7 @@ from vla_eval.errors import (
     did_you_mean,
 )
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.models.families import family_of
 
 PADDING_KEYS = (ACTION_PADDING_KEY, "ACTION_PADDING_KEY")  # as lerobot's code writes it, as ours does
 
@@ -182,7 +183,7 @@ def _base_config(recipe: FinetuneRecipe, cls: Any, folder: Path) -> dict[str, An
         read_saved_processor(folder / name)
     data = read_json(folder / CONFIG_FILE)
     kind = data.pop("type", None)
-    expected = dict.fromkeys((getattr(cls, "wraps", recipe.type), recipe.type))
+    expected = dict.fromkeys((family_of(recipe.type).lerobot_type, recipe.type))
     if kind not in expected:
         raise RecipeError(
             f"finetune.base_checkpoint: {recipe.base_checkpoint} holds a '{kind}', expected a "

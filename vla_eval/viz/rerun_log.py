@@ -22,14 +22,13 @@ from vla_eval.core import FloatArray
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import capture_stem
-from vla_eval.task_state import Phase
+from vla_eval.task_state import PHASES
 from vla_eval.tasks.objects.item_names import item_names
 from vla_eval.viz.arm_figure import ROBOT_BASE_M, arm_points_m
 from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step
 from vla_eval.viz.rerun_layout import layout
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
-PHASES: tuple[Phase, ...] = ("cue", "delay", "response")
 TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
 JPEG_QUALITY = 90
 COLORS = {

@@ -24,7 +24,7 @@ class NamedServer(NamedTuple):
 
 
 def named_server(name: str) -> NamedServer | None:
-    """Return recipe and address of `ws://…` or `RECIPE@ws://…`; None if the name is no address."""
+    """Return recipe and address of `ws://…` or `RECIPE@ws://…`; None if the name is not an address."""
     match = _URL.fullmatch(name)
     if match is None:
         return None
@@ -36,7 +36,7 @@ def split_urls(text: str) -> tuple[str, ...]:
     """Return the addresses of a list with commas.
 
     Raises:
-        RecipeError: one is no address of a server, or stands there twice.
+        RecipeError: one is not an address of a server, or stands there twice.
     """
     urls = tuple(url.strip().rstrip("/") for url in text.split(","))
     for url in urls:
@@ -64,10 +64,10 @@ def _check_url(url: str) -> None:
         parts = urlsplit(url)
         is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
         has_user = parts.username is not None
-    except ValueError:  # a port that is no number, or brackets that do not close
+    except ValueError:  # a port that is not a number, or brackets that do not close
         is_address = has_user = False
     if not is_address or has_user or not url.isprintable() or " " in url:
         raise RecipeError(
-            f"'{url:.{MAX_SHOWN}}' is no address of a policy server: expected ws://HOST:PORT or "
+            f"'{url:.{MAX_SHOWN}}' is not the address of a policy server: expected ws://HOST:PORT or "
             f"wss://HOST:PORT, several with commas between them."
         )

@@ -224,7 +224,7 @@ def _bad_messages(facts: Facts) -> dict[str, Any]:
     good = facts.observation(1, 0)
     image = next(iter(facts.cameras), None)
     bad: dict[str, Any] = {
-        "bytes that are no msgpack": NO_CODEC_BYTE * 8,
+        "bytes that are not msgpack": NO_CODEC_BYTE * 8,
         "a text": "infer",
         "an endpoint that does not exist": {**good, "endpoint": "jump"},
         "an episode without an instruction": {k: v for k, v in good.items() if k != facts.prompt_key},

@@ -37,7 +37,7 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class Facts:
-    """What a server says of itself, as far as it is needed here."""
+    """Server metadata, as far as it is needed here."""
 
     chunk_size: int
     n_dims: int
@@ -106,7 +106,7 @@ class Server:
         return connection
 
     def first_message(self) -> Message:
-        """Return what the server says of itself."""
+        """Return the server's metadata."""
         with self.connect() as connection:
             return connection.metadata
 

@@ -23,7 +23,7 @@ class PolicyClient(Protocol):
 
     @property
     def metadata(self) -> ServerMetadata:
-        """What the server said of itself."""
+        """Metadata of the server."""
 
     @property
     def shares_connection(self) -> bool:
@@ -62,7 +62,7 @@ class OpenpiClient:
     """openpi's words; sessions, resets and single frames only where the server announces them."""
 
     def __init__(self, connection: Connection) -> None:
-        """Read what the server says of itself.
+        """Read the server's metadata.
 
         Raises:
             RemotePolicyError: it says nothing, or something else.
@@ -80,7 +80,7 @@ class OpenpiClient:
 
     @property
     def metadata(self) -> ServerMetadata:
-        """What the server said of itself."""
+        """Metadata of the server."""
         return self._metadata
 
     @property
@@ -142,7 +142,7 @@ class OpenpiClient:
         return answer["actions"]
 
     def take_reading(self, session: str) -> Any:
-        """Return what a server of this wire said of the sentence, unchecked; None: nothing new."""
+        """Return what a server of this wire reported on the sentence, unchecked; None: nothing new."""
         return self._readings.pop(session, None) if self._metadata.is_ours else None
 
     def close(self) -> None:

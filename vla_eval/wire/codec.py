@@ -118,7 +118,7 @@ def unpackb(data: Any) -> Any:
         data: bytes, or another buffer.
 
     Raises:
-        CodecError: it is no such message, or a message that is refused.
+        CodecError: it is not such a message, or one that is refused.
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise CodecError(_too_large(len(data)))
@@ -141,7 +141,7 @@ def unpackb(data: Any) -> Any:
             f"text that is not UTF-8. Pack bytes with `use_bin_type=True`; {_EXPECTED}"
         ) from None
     except (ValueError, TypeError, OverflowError, MemoryError, msgpack.UnpackException) as exc:
-        raise CodecError(f"the bytes are no message in msgpack: {exc!s:.200}") from exc
+        raise CodecError(f"the bytes are not a message in msgpack: {exc!s:.200}") from exc
     _check_nesting(message)
     return message
 
@@ -215,7 +215,7 @@ def _check_content(data: bytes, dtype: np.dtype[Any]) -> None:
     if dtype.kind == "U" and data:
         code_points = np.frombuffer(data, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
         if code_points.max() > _MAX_CODE_POINT:
-            raise CodecError("an array: expected text, found a number that is no character")
+            raise CodecError("an array: expected text, found a number that is not a character")
 
 
 def _read_scalar(fields: dict[str, Any]) -> Any:
@@ -257,7 +257,7 @@ def _check_kind(dtype: np.dtype[Any]) -> None:
 
 
 def _check_nesting(message: Any) -> None:
-    """Refuse deep nesting, and what is no plain data; without recursion."""
+    """Refuse deep nesting, and anything but plain data; without recursion."""
     level = [message]
     for _ in range(MAX_DEPTH):
         below: list[Any] = []

@@ -77,7 +77,7 @@ class Connection:
         """Return the next message.
 
         Args:
-            accept_text: frames of text that are no error; returned as they are.
+            accept_text: frames of text, other than errors, that are returned as they are.
 
         Raises:
             RemoteTimeoutError: none came in time.

@@ -1,4 +1,4 @@
-"""What a policy server says of itself in its first message, and what a client may send it because of that.
+"""Server metadata: a policy server's first message, and what it permits the client to send.
 
 A server of openpi's says little or nothing: then a value is unknown, which is not the same as none.
 """
@@ -35,7 +35,7 @@ class CameraImage(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerMetadata:
-    """What a server says of itself and of its policy. None: it does not say.
+    """What a server reports about itself and its policy. None: it does not say.
 
     Attributes:
         protocol: `openpi+1` if it is a server of this wire; a field that is None then means: there is none.
@@ -146,11 +146,11 @@ class ServerMetadata:
             where: its address, for messages.
 
         Raises:
-            RemoteReplyError: it is no map, or a field that is known has another type.
+            RemoteReplyError: it is not a map, or a known field has another type.
         """
         if not isinstance(message, Mapping):
             raise RemoteReplyError(
-                f"{where}: expected a map as the first message (what the server says of itself), found "
+                f"{where}: expected a map as the first message (the server's metadata), found "
                 f"{shown(message)}. Check that a policy server answers at this address."
             )
         read = {
@@ -173,7 +173,7 @@ def _read(value: object, name: str, reader: "_Reader", *, where: str) -> Any:
     if read is None:
         raise RemoteReplyError(
             f"{where}: the server says '{name}': {shown(value)}; expected {reader.expected}. Correct what "
-            f"the server says of itself."
+            f"the server reports."
         )
     return read
 

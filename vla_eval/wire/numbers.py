@@ -18,7 +18,7 @@ MAX_LENGTH_ERROR = 0.01  # of a length of 1: float32 rounds to 1e-7, and no roun
 
 
 class NumbersError(ValueError):
-    """A vector is no state."""
+    """A vector is not a state."""
 
 
 def as_state(value: Any, names: Sequence[str]) -> np.ndarray[Any, Any]:

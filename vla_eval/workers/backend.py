@@ -1,6 +1,6 @@
 """Where jobs run: what the process pool of this machine and a cluster have in common.
 
-Evaluations, audits, probes, recordings and replays take a `Backend` and do not know which. Whoever plans
+Evaluations, audits, probes, recordings and replays take a `Backend` and do not know which. Code that plans
 the jobs is the only one that writes results.
 """
 
@@ -9,10 +9,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.jobs import Event, Job, JobSource
 from vla_eval.workers.load import Load
-from vla_eval.workers.process import WorkerMain
+from vla_eval.workers.process import WorkerMain, WorkerSpec
 
 
 class Pool[J: Job, A](Protocol):
@@ -60,7 +59,7 @@ class Service(Protocol):
         Raises:
             EOFError: it has ended, and all that it sent has been returned.
             OSError: the connection is broken.
-            BrokenMessageError: what has come is no message.
+            BrokenMessageError: what has come is not a message.
         """
 
     def has_ended(self) -> bool:
@@ -93,28 +92,8 @@ class Backend(Protocol):
     def n_gpus(self) -> int:
         """How many GPUs there are."""
 
-    def pool[J: Job, A](
-        self,
-        main: WorkerMain,
-        *,
-        answers: tuple[type, ...],
-        size: int,
-        timeouts: TimeoutConfig,
-        logs: Path,
-        preload: Sequence[str] = (),
-        takes_gpu: bool = False,
-    ) -> Pool[J, A]:
-        """Return workers.
-
-        Args:
-            main: what a worker process runs: it answers each job `J` by an `A` or a `Failed`.
-            answers: the classes of `A`; anything else that a worker sends is an error.
-            size: how many workers at most.
-            timeouts: how long a worker may be busy with one thing.
-            logs: folder for what workers of this machine write to standard output and error.
-            preload: modules that the workers need and that take long to import.
-            takes_gpu: a worker takes a whole GPU, where there are GPUs.
-        """
+    def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> Pool[J, A]:
+        """Return at most `size` workers; each takes a whole GPU, where there are some and it `takes_gpu`."""
 
     def services(self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()) -> Sequence[Service]:
         """Return services that are not started yet: one per GPU; one, where there is no GPU.

@@ -20,7 +20,7 @@ MAX_READS = 64  # at once, so that a worker that writes without end does not kee
 
 
 class BrokenMessageError(VlaEvalError):
-    """A worker has sent something that is no message."""
+    """A worker has sent something that is not a message."""
 
 
 def send_message(connection: Connection, message: object) -> None:
@@ -48,7 +48,7 @@ class Inbox:
         Raises:
             EOFError: the worker has closed its end, and all that it sent has been returned.
             OSError: the connection is broken.
-            BrokenMessageError: what has come is no message.
+            BrokenMessageError: what has come is not a message.
         """
         messages: list[object] = []
         for _ in range(MAX_READS):

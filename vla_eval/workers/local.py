@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.jobs import Job
 from vla_eval.workers.pool import WorkerPool
-from vla_eval.workers.process import WorkerMain, WorkerProcess
+from vla_eval.workers.process import WorkerMain, WorkerProcess, WorkerSpec
 from vla_eval.workers.start import available_cores, visible_gpus, worker_context
 
 LOOPBACK = "127.0.0.1"
@@ -38,20 +37,9 @@ class LocalBackend:
         """How many GPUs this process may use."""
         return len(visible_gpus())
 
-    def pool[J: Job, A](
-        self,
-        main: WorkerMain,
-        *,
-        answers: tuple[type, ...],
-        size: int,
-        timeouts: TimeoutConfig,
-        logs: Path,
-        preload: Sequence[str] = (),
-        takes_gpu: bool = False,
-    ) -> WorkerPool[J, A]:
+    def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> WorkerPool[J, A]:
         """Return worker processes; those that take a GPU each share all of them, so there is one."""
-        size = 1 if takes_gpu else size
-        return WorkerPool(main, answers=answers, size=size, timeouts=timeouts, logs=logs, preload=preload)
+        return WorkerPool(spec, size=1 if takes_gpu else size)
 
     def services(
         self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()

@@ -1,4 +1,4 @@
-"""Messages of a worker beside its answers: failed, found out something. Knows nothing of what a job is."""
+"""Messages of a worker other than its answers: failed, found out something. Does not know what a job is."""
 
 import traceback
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """Worker processes with a watchdog: every job gets an answer, whatever a worker does.
 
-Ours, since neither `multiprocessing.Pool` nor `concurrent.futures` limits the time of a job or survives the
-death of a worker with the other jobs unharmed.
+Ours: `multiprocessing.Pool`, `concurrent.futures` and loky do not limit the time of a job, pebble does not
+limit it by stage, and none of them ends what a policy has started.
 
 A worker that exceeds a time limit writes its stack to its log and is killed; one that dies is replaced.
 Both give an `EpisodeError` with the cause. A process does the jobs of one setup key
@@ -12,21 +12,19 @@ inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording.
 
 import signal
 import time
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import wait
-from pathlib import Path
 from types import TracebackType
 from typing import Self, cast
 
-from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.core import Stage
 from vla_eval.records import EpisodeError
 from vla_eval.workers.framing import BrokenMessageError
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import Failed, Notice
-from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain, WorkerProcess
+from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerProcess, WorkerSpec
 from vla_eval.workers.start import end_server, server_is_stopped, worker_context
 
 TICK_SECONDS = 0.2
@@ -46,39 +44,16 @@ class WorkerPool[J: Job, A]:
     """Some worker processes; a context manager that leaves none behind.
 
     Args:
-        main: what a process runs: it answers each job `J` by an `A` or a `Failed`.
-        answers: the classes of `A`; anything else that a worker sends is an error.
+        spec: what the workers are made of.
         size: how many processes at most.
-        timeouts: how long a worker may be busy with one thing.
-        logs: folder for what the workers write to standard output and error.
-        preload: modules that the workers need and that take long to import; see `worker_context`.
         first_index: what logs and messages call the first worker.
     """
 
-    def __init__(
-        self,
-        main: WorkerMain,
-        *,
-        answers: tuple[type, ...],
-        size: int,
-        timeouts: TimeoutConfig,
-        logs: Path,
-        preload: Sequence[str] = (),
-        first_index: int = 0,
-    ) -> None:
+    def __init__(self, spec: WorkerSpec, *, size: int, first_index: int = 0) -> None:
         """Start nothing yet: processes start when there is work for them."""
-        self._main = main
-        self._answers = (*answers, Failed)
-        self._size = size
-        self._limits: dict[Stage, float] = {
-            "setup": timeouts.setup_seconds,
-            "reset": timeouts.reset_seconds,
-            "step": timeouts.step_seconds,
-            "inference": timeouts.inference_seconds,
-        }
-        self._logs = logs
-        self._first_index = first_index
-        self._context = worker_context(preload=preload)
+        self._spec, self._size, self._first_index = spec, size, first_index
+        self._answers = (*spec.answers, Failed)
+        self._context = worker_context(preload=spec.preload)
         self._workers: dict[int, _Worker[J]] = {}
 
     def __enter__(self) -> Self:
@@ -132,11 +107,12 @@ class WorkerPool[J: Job, A]:
             job = queue.take(worker.loaded if worker else None, taken=taken)
             assert job is not None  # the queue was not empty
             if worker is None or worker.loaded != job.setup_key:
+                number = self._first_index + index
                 process = WorkerProcess(
-                    self._main,
+                    self._spec.main,
                     self._context,
-                    index=self._first_index + index,
-                    log=self._logs / f"worker-{self._first_index + index}.log",
+                    index=number,
+                    log=self._spec.logs / f"worker-{number}.log",
                     predecessor=worker.process if worker else None,
                 )
                 worker = self._workers[index] = _Worker(process=process, loaded=job.setup_key, job=None)
@@ -188,7 +164,7 @@ class WorkerPool[J: Job, A]:
             end_server()  # the worker's start is then tried again, from another server
             return None
         busy = process.busy()
-        limit_seconds = self._limits[busy.stage]
+        limit_seconds = float(getattr(self._spec.timeouts, f"{busy.stage}_seconds"))
         if time.monotonic() - busy.since <= limit_seconds:
             return None
         process.ask_where()  # it writes the stack of every thread to its log

@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess, SpawnContext, SpawnProcess
 from pathlib import Path
 
+from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.core import Stage
 from vla_eval.workers.framing import BrokenMessageError, Inbox
 from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
@@ -28,6 +29,26 @@ START_ATTEMPTS = 2  # the process that workers are forked from may have been kil
 
 WorkerMain = Callable[[Connection, SharedStage, Path], None]
 """Entry point of a worker process: pipe, shared memory for its stage, its log."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerSpec:
+    """What the workers of a pool are made of, wherever they run.
+
+    Attributes:
+        main: what a process runs: it answers each job `J` by an `A` or a `Failed`.
+        answers: the classes of `A`; anything else that a worker sends is an error.
+        timeouts: how long a worker may be busy with one thing.
+        logs: folder for what workers of this machine write to standard output and error.
+        preload: modules that they need and that take long to import; see `worker_context`.
+    """
+
+    main: WorkerMain
+    answers: tuple[type, ...]
+    timeouts: TimeoutConfig
+    logs: Path
+    preload: tuple[str, ...] = ()
+
 
 logger = logging.getLogger(__name__)
 

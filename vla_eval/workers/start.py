@@ -166,7 +166,7 @@ def _start_all() -> None:
         try:
             start()
             done.set_result(None)
-        except BaseException as exc:  # whoever waits raises it
+        except BaseException as exc:  # raised where it is awaited
             done.set_exception(exc)
 
 

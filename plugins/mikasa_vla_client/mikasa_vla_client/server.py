@@ -103,7 +103,7 @@ class PolicyServer:
             raise SpecError(f"api_key: {problem}.")
         self._spec, self._api_key, self._debug = spec, api_key, debug
         self._metadata = spec.metadata()
-        # Nothing is known of whether the policy may run in two threads.
+        # It is unknown whether the policy may run in two threads.
         self._one_at_a_time = threading.Lock()
         self._sessions: dict[ServerConnection, dict[str, Session]] = {}
         options: dict[str, Any] = {

@@ -17,7 +17,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, UnknownNameError
-from vla_eval.models.episodes.eef_state import POSITION_SCALE
+from vla_eval.models.episodes.config import POSITION_SCALE
 from vla_eval.models.episodes.samples import episodes_of
 from vla_eval.models.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone, goals_missed
 from vla_eval.models.memory.network import Answer

@@ -13,8 +13,7 @@ from tests.models import golden_folder
 from tests.models.octo.tiny_octo import GOLDEN
 from vla_eval.models.octo.diffusion_head import HeadSizes
 from vla_eval.models.octo.flax_names import from_flax
-from vla_eval.models.octo.network import OctoNetwork
-from vla_eval.models.octo.transformer import TransformerSizes, Window
+from vla_eval.models.octo.transformer import OctoNetwork, TransformerSizes, Window
 
 CONFIG: dict[str, Any] = json.loads((GOLDEN / "config.json").read_text())
 TIGHT = 1e-5  # readouts, noise, samples, losses; absolute, float32 on CPU; from the README

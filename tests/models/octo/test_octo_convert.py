@@ -11,14 +11,12 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from tests.models.octo.tiny_octo import GOLDEN, TINY
-from vla_eval.checkpoints.conversion.octo import convert
-from vla_eval.checkpoints.conversion.octo_original import unpack
+from tests.models.octo.tiny_octo import GOLDEN, TINY, convert, our_name
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
-from vla_eval.models.octo.flax_names import our_name
+from vla_eval.models.octo.original import unpack
 from vla_eval.training.finetune import finetune
 
 N_BYTES = 260  # 256, three special tokens, and one to spare

@@ -22,12 +22,12 @@ from tests.models.octo.octo_golden import (
     values,
     window,
 )
+from tests.models.octo.tiny_octo import our_name
 from vla_eval.errors import CheckpointError
 from vla_eval.models.octo import diffusion_head, transformer
 from vla_eval.models.octo.diffusion_head import Draws, HeadSizes, Targets, cosine_schedule
-from vla_eval.models.octo.flax_names import from_flax, our_name
-from vla_eval.models.octo.network import OctoNetwork
-from vla_eval.models.octo.transformer import Outputs, TransformerSizes, Window
+from vla_eval.models.octo.flax_names import from_flax
+from vla_eval.models.octo.transformer import OctoNetwork, Outputs, TransformerSizes, Window
 
 GROUPS = 3e-5  # absolute, as `TIGHT`: image tokens and observation groups
 WITH_LANGUAGE = [case for case in CONFIG["cases"] if case != "w2_nolang"]

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from tests.models.golden_values import GoldenValues
 from tests.models.octo.tiny_octo import GOLDEN, TINY
-from vla_eval.checkpoints.conversion.octo import octo_config
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
@@ -29,6 +28,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError, MissingInstructionError
 from vla_eval.features import ACTION_NAMES
 from vla_eval.models.octo.configuration_octo import TRAINED, MikasaOctoConfig
+from vla_eval.models.octo.conversion import octo_config
 from vla_eval.models.octo.language import PromptEmbeddings
 from vla_eval.models.octo.modeling_octo import MikasaOctoPolicy
 from vla_eval.models.shared.trainable import trainable

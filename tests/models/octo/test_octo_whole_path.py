@@ -11,9 +11,8 @@ from torch import Tensor
 from tests.models.golden_values import GoldenValues
 from tests.models.octo.test_octo_convert import golden_fields
 from tests.models.octo.test_octo_parity import CONFIG, sampling_noise
-from tests.models.octo.tiny_octo import GOLDEN
+from tests.models.octo.tiny_octo import GOLDEN, convert
 from tests.models.stored_frames import StoredFrames, context, executed
-from vla_eval.checkpoints.conversion.octo import convert
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk, FloatArray, ObservationWindow
 from vla_eval.policies.lerobot import policy as lerobot

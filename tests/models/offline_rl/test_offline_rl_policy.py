@@ -11,8 +11,7 @@ from torch import Tensor
 from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, UnknownNameError
-from vla_eval.models.offline_rl.algorithms import ALGORITHMS
-from vla_eval.models.offline_rl.configuration_offline_rl import MikasaOfflineRLConfig
+from vla_eval.models.offline_rl.configuration_offline_rl import ALGORITHMS, MikasaOfflineRLConfig
 from vla_eval.models.offline_rl.modeling_offline_rl import MikasaOfflineRLPolicy
 from vla_eval.models.offline_rl.network import OfflineRLNetwork
 from vla_eval.models.offline_rl.objectives import OBJECTIVES

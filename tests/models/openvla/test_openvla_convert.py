@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from tests.models.openvla import openvla_golden as golden
-from vla_eval.checkpoints.conversion.openvla import STATISTICS_FILE, ConvertOptions, convert_openvla
+from vla_eval.checkpoints.conversion import convert
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
 from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError
+from vla_eval.models.openvla.conversion import STATISTICS_FILE
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.models.openvla.network import Inputs
 
-OFT = ConvertOptions(
+OFT = OpenVLAOptions(
     head="l1",
     chunk_size=golden.CHUNK,
     proprio=golden.PROPRIO,
@@ -40,7 +42,7 @@ def published(_published: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(_published, tmp_path / "published"))
 
 
-def options(**changes: Any) -> ConvertOptions:
+def options(**changes: Any) -> OpenVLAOptions:
     return dataclasses.replace(OFT, **changes)
 
 
@@ -56,7 +58,7 @@ def changed_statistics(folder: Path, field: str, **statistics: Any) -> None:
 def test_a_converted_checkpoint_has_the_originals_weights_and_statistics(
     published: Path, tmp_path: Path
 ) -> None:
-    out = convert_openvla(published, tmp_path / "ours", OFT)
+    out = convert("mikasa_openvla", published, tmp_path / "ours", OFT)
     loaded, values = load_checkpoint(out, LoadOptions(device="cpu")), golden.values()
     inputs = Inputs(golden.images(2)[1:], golden.prompts("prompt2"), values["in.proprio"][1:])
     with torch.no_grad():
@@ -71,7 +73,9 @@ def test_a_converted_checkpoint_has_the_originals_weights_and_statistics(
 def test_normalised_numbers_become_the_originals_actions_and_the_gripper_maniskills(
     published: Path, tmp_path: Path
 ) -> None:
-    loaded = load_checkpoint(convert_openvla(published, tmp_path / "ours", OFT), LoadOptions(device="cpu"))
+    loaded = load_checkpoint(
+        convert("mikasa_openvla", published, tmp_path / "ours", OFT), LoadOptions(device="cpu")
+    )
     values = golden.values()
     actions = loaded.postprocessor(values["unnorm.normalized"][None].float())[0]
     expected = values["unnorm.actions"].float().clone()
@@ -82,7 +86,9 @@ def test_normalised_numbers_become_the_originals_actions_and_the_gripper_maniski
 
 def test_the_state_is_normalised_by_the_originals_mask(published: Path, tmp_path: Path) -> None:
     assert False in golden.config()["proprio_statistics"]["mask"]  # and what it leaves alone is cut, too
-    loaded = load_checkpoint(convert_openvla(published, tmp_path / "ours", OFT), LoadOptions(device="cpu"))
+    loaded = load_checkpoint(
+        convert("mikasa_openvla", published, tmp_path / "ours", OFT), LoadOptions(device="cpu")
+    )
     values = golden.values()
     images = golden.images(2)
     batch = loaded.preprocessor(
@@ -98,7 +104,9 @@ def test_the_state_is_normalised_by_the_originals_mask(published: Path, tmp_path
 
 def test_a_mask_of_actions_leaves_alone_what_it_says(published: Path, tmp_path: Path) -> None:
     changed_statistics(published, "action", mask=[True, False, *[True] * (golden.ACTION - 3), False])
-    loaded = load_checkpoint(convert_openvla(published, tmp_path / "ours", OFT), LoadOptions(device="cpu"))
+    loaded = load_checkpoint(
+        convert("mikasa_openvla", published, tmp_path / "ours", OFT), LoadOptions(device="cpu")
+    )
     actions = loaded.postprocessor(torch.full((1, golden.CHUNK, golden.ACTION), 0.5))[0, 0]
     q01, q99 = (torch.tensor(golden.config()["action_statistics"][name]) for name in ("q01", "q99"))
     expected = q01 + 0.75 * (q99 - q01)  # 0.5 is three quarters of the way from -1 to 1
@@ -123,7 +131,7 @@ def test_statistics_that_cannot_be_used_are_an_error(
 ) -> None:
     changed_statistics(published, "action", **changes)
     with pytest.raises(CheckpointError, match=message):
-        convert_openvla(published, tmp_path / "ours", OFT)
+        convert("mikasa_openvla", published, tmp_path / "ours", OFT)
 
 
 class TestWhatNoFileSays:
@@ -134,7 +142,7 @@ class TestWhatNoFileSays:
         self, published: Path, tmp_path: Path, stated: str | None, message: str
     ) -> None:
         with pytest.raises(CheckpointError, match=rf"encode the gripper \(--gripper\), found {message}"):
-            convert_openvla(published, tmp_path / "ours", options(gripper=stated))
+            convert("mikasa_openvla", published, tmp_path / "ours", options(gripper=stated))
 
     def test_the_command_line_says_so_in_one_message(
         self, published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -159,7 +167,7 @@ class TestWhatNoFileSays:
         self, published: Path, tmp_path: Path, name: str, stated: bool | None, expected: bool
     ) -> None:
         published = published.rename(tmp_path / name)
-        out = convert_openvla(published, tmp_path / "ours", options(image_augmentation=stated))
+        out = convert("mikasa_openvla", published, tmp_path / "ours", options(image_augmentation=stated))
         assert json.loads((out / "config.json").read_text())["image_augmentation"] is expected
 
     @pytest.mark.parametrize(
@@ -174,7 +182,7 @@ class TestWhatNoFileSays:
     ) -> None:
         published = published.rename(tmp_path / name)
         with pytest.raises(CheckpointError, match=message):
-            convert_openvla(published, tmp_path / "ours", options(image_augmentation=stated))
+            convert("mikasa_openvla", published, tmp_path / "ours", options(image_augmentation=stated))
 
 
 @pytest.mark.parametrize(
@@ -191,11 +199,11 @@ def test_what_does_not_fit_is_an_error(
     published: Path, tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CheckpointError, match=message):
-        convert_openvla(published, tmp_path / "ours", options(**changes))
+        convert("mikasa_openvla", published, tmp_path / "ours", options(**changes))
     assert not (tmp_path / "ours").exists()
 
 
 def test_a_plain_openvla_has_no_continuous_head(published: Path, tmp_path: Path) -> None:
     (published / "action_head--50000_checkpoint.pt").unlink()
     with pytest.raises(CheckpointError, match="convert it with head `tokens`"):
-        convert_openvla(published, tmp_path / "ours", OFT)
+        convert("mikasa_openvla", published, tmp_path / "ours", OFT)

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.models.openvla import openvla_golden as golden
 from vla_eval.core import ActionChunk, Observation, ObservationWindow
 from vla_eval.errors import UnknownNameError
-from vla_eval.policies.lerobot.openvla_paper import PaperCompatPolicy, jpeg_round_trip, make_openvla
+from vla_eval.policies.lerobot.paper_compat import PaperCompatPolicy, jpeg_round_trip, make_paper_compat
 from vla_eval.specs import PolicySpec
 
 
@@ -75,4 +75,4 @@ def test_a_plain_image_survives_jpeg() -> None:
 def test_a_mistyped_switch_is_named() -> None:
     context: Any = None
     with pytest.raises(UnknownNameError, match="Did you mean 'gripper_sign'"):
-        make_openvla(context, paper_compat=["gripper_sing"])
+        make_paper_compat(context, paper_compat=["gripper_sing"])

@@ -12,14 +12,15 @@ from torch import Tensor
 
 from tests.models.openvla import openvla_golden as golden
 from tests.models.stored_frames import StoredFrames, context, executed
-from vla_eval.checkpoints.conversion.openvla import ConvertOptions, convert_openvla
+from vla_eval.checkpoints.conversion import convert
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.policies.lerobot import inputs as lerobot_inputs
-from vla_eval.policies.lerobot.openvla_paper import make_openvla
+from vla_eval.policies.lerobot.paper_compat import make_paper_compat
 
 # The stored images have the model's size, and the original ran without the crop.
-OPTIONS = ConvertOptions(
+OPTIONS = OpenVLAOptions(
     chunk_size=golden.CHUNK,
     camera_px=golden.SIZES.image_px,
     sizes=golden.SMALL,
@@ -52,7 +53,7 @@ def converted(published: Path, tmp_path: Path, case: str, **changes: Any) -> Pat
         proprio=golden.PROPRIO if "proprio" in case else 0,
         **changes,
     )
-    return convert_openvla(published, tmp_path / "ours", options)
+    return convert("mikasa_openvla", published, tmp_path / "ours", options)
 
 
 def loaded(published: Path, tmp_path: Path, case: str, **changes: Any) -> LoadedPolicy:
@@ -73,7 +74,7 @@ def test_an_episode_executes_what_the_original_predicts(
     monkeypatch.setattr(lerobot_inputs, "STATE_NAMES", {"libero": names})
     monkeypatch.setattr(lerobot_inputs, "proprioception", lambda _state: {"libero": state})
     checkpoint = converted(published, tmp_path, case)
-    policy: Any = make_openvla(context(env, golden.CHUNK), checkpoint=str(checkpoint), device="cpu")
+    policy: Any = make_paper_compat(context(env, golden.CHUNK), checkpoint=str(checkpoint), device="cpu")
     n_steps = golden.CHUNK
     found = executed(env, policy, SENTENCES[prompt], n_action_steps=n_steps, n_steps=n_steps)
     expected = values[f"infer.{case}.actions"].numpy().copy()

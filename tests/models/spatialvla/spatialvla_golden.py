@@ -12,12 +12,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from tests.models import golden_folder
-from vla_eval.checkpoints.conversion.spatialvla_described import GRID_PARTS
 from vla_eval.models.shared.prompts import Prompts
 from vla_eval.models.shared.weights import put_weights
 from vla_eval.models.spatialvla.action_grid import AXES, ActionGrid, Gaussian, gaussian_grid
 from vla_eval.models.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.models.spatialvla.depth import zoe_config, zoe_depth
+from vla_eval.models.spatialvla.described import GRID_PARTS
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.models.spatialvla.sizes import NetworkSizes
 from vla_eval.models.spatialvla.weight_names import to_ours

@@ -17,18 +17,19 @@ from tests.models.golden_values import GoldenFields
 from tests.models.spatialvla import spatialvla_golden as golden
 from tests.models.stored_frames import StoredFrames, context, executed
 from tests.training.fitted_policies import policy_config
-from vla_eval.checkpoints.conversion.spatialvla import ConvertOptions, convert_spatialvla
-from vla_eval.checkpoints.conversion.spatialvla_described import _NOT_OF_ENCODER, _NOT_OF_ZOE, check_described
-from vla_eval.checkpoints.conversion.spatialvla_sections import OF_NO_EFFECT
+from vla_eval.checkpoints.conversion import convert
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
 from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import CheckpointError
 from vla_eval.models.spatialvla.action_tokens import from_tokens
+from vla_eval.models.spatialvla.conversion_options import SpatialVLAOptions
 from vla_eval.models.spatialvla.depth import PAD_PX
+from vla_eval.models.spatialvla.described import _NOT_OF_ENCODER, _NOT_OF_ZOE, check_described
 from vla_eval.models.spatialvla.ego3d import CENTRE_M
 from vla_eval.models.spatialvla.network import FIRST_PLACE
+from vla_eval.models.spatialvla.sections import OF_NO_EFFECT
 from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, NetworkSizes
 from vla_eval.models.spatialvla.weight_names import EMBEDDINGS, HEAD
 from vla_eval.policies.lerobot.policy import make_lerobot
@@ -36,7 +37,7 @@ from vla_eval.training.dataset import training_dataset
 
 SMALL = {**golden.SMALL, **golden.DEPTH}
 (UNNORM_KEY,) = golden.config()["statistics"]
-OPTIONS = ConvertOptions(sizes=SMALL, dtype="float32", unnorm_key=UNNORM_KEY)
+OPTIONS = SpatialVLAOptions(sizes=SMALL, dtype="float32", unnorm_key=UNNORM_KEY)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def changed_weights(folder: Path, **tensors: torch.Tensor | None) -> None:
 @pytest.fixture(scope="module")
 def converted(_published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = dataclasses.replace(OPTIONS, camera_px=golden.SIZES.image_px)
-    return convert_spatialvla(_published, tmp_path_factory.mktemp("converted") / "ours", options)
+    return convert("mikasa_spatialvla", _published, tmp_path_factory.mktemp("converted") / "ours", options)
 
 
 class StoredDepth(torch.nn.Module):
@@ -134,7 +135,7 @@ def test_what_is_fine_tuned_on_it_predicts_as_it_was_trained(converted: Path, re
 
 
 def test_tokens_become_the_actions_of_the_original(published: Path, tmp_path: Path) -> None:
-    out = convert_spatialvla(published, tmp_path / "ours", OPTIONS)
+    out = convert("mikasa_spatialvla", published, tmp_path / "ours", OPTIONS)
     loaded, values = load_checkpoint(out, LoadOptions(device="cpu")), golden.values()
     ids = values["unnorm.ids"].reshape(1, golden.CHUNK, -1)
     actions = loaded.postprocessor(from_tokens(ids, loaded.policy.grid, golden.SIZES).float())
@@ -256,7 +257,7 @@ def test_what_does_not_fit_the_options_is_an_error(
     published: Path, tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CheckpointError, match=message):
-        convert_spatialvla(published, tmp_path / "ours", dataclasses.replace(OPTIONS, **changes))
+        convert("mikasa_spatialvla", published, tmp_path / "ours", dataclasses.replace(OPTIONS, **changes))
     assert not (tmp_path / "ours").exists()
 
 
@@ -268,10 +269,10 @@ def test_weights_that_are_not_those_of_the_network_are_an_error(
 ) -> None:
     changed_weights(published, **{EMBEDDINGS: tensor})
     with pytest.raises(CheckpointError, match=message):
-        convert_spatialvla(published, tmp_path / "ours", OPTIONS)
+        convert("mikasa_spatialvla", published, tmp_path / "ours", OPTIONS)
     changed_weights(published, **{"language_model.model.norm2.weight": torch.zeros(3)})
     with pytest.raises(CheckpointError, match="unexpected"):
-        convert_spatialvla(published, tmp_path / "ours", OPTIONS)
+        convert("mikasa_spatialvla", published, tmp_path / "ours", OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -288,7 +289,7 @@ def test_files_that_say_something_else_are_an_error(
 ) -> None:
     changed_json(published / file, **fields)
     with pytest.raises(CheckpointError, match=message):
-        convert_spatialvla(published, tmp_path / "ours", OPTIONS)
+        convert("mikasa_spatialvla", published, tmp_path / "ours", OPTIONS)
 
 
 def test_a_tokenizer_that_does_not_end_prompts_as_the_models_is_refused(
@@ -296,21 +297,21 @@ def test_a_tokenizer_that_does_not_end_prompts_as_the_models_is_refused(
 ) -> None:
     sizes = {**SMALL, "newline_token": 5}
     with pytest.raises(CheckpointError, match="end with the token 5"):
-        convert_spatialvla(published, tmp_path / "ours", dataclasses.replace(OPTIONS, sizes=sizes))
+        convert("mikasa_spatialvla", published, tmp_path / "ours", dataclasses.replace(OPTIONS, sizes=sizes))
 
 
 def test_an_output_matrix_of_its_own_is_used_left_out_or_asked_about(published: Path, tmp_path: Path) -> None:
     embeddings, ours = golden.original_weights()[EMBEDDINGS], "network.lm_head.weight"
     changed_weights(published, **{HEAD: embeddings.clone()})
-    same = convert_spatialvla(published, tmp_path / "same", OPTIONS)
+    same = convert("mikasa_spatialvla", published, tmp_path / "same", OPTIONS)
     assert ours not in load_file(same / "model.safetensors")
     changed_weights(published, **{HEAD: embeddings + 1})
     with pytest.raises(CheckpointError, match="Choose with `--head`"):
-        convert_spatialvla(published, tmp_path / "none", OPTIONS)
+        convert("mikasa_spatialvla", published, tmp_path / "none", OPTIONS)
     # As the published config.json has it.
     text = golden.published_files(golden.config(), SMALL)["config.json"]["text_config"]
     changed_json(published / "config.json", text_config={**text, "tie_word_embeddings": False})
-    own = convert_spatialvla(published, tmp_path / "own", OPTIONS)
+    own = convert("mikasa_spatialvla", published, tmp_path / "own", OPTIONS)
     assert torch.equal(load_file(own / "model.safetensors")[ours], embeddings + 1)
     assert verify_checkpoint(own, LoadOptions(device="cpu")).chunk == (1, 4, 7)
 

@@ -18,8 +18,8 @@ from vla_eval.errors import (
     RecipeError,
     SpecMismatchError,
 )
-from vla_eval.models.shared.byte_tokenizer import byte_tokenizer
 from vla_eval.models.shared.images import Size, resize_bicubic
+from vla_eval.models.shared.language_processors import byte_tokenizer
 from vla_eval.models.shared.trainable import check_lora, trainable
 from vla_eval.models.spatialvla.action_grid import uniform_grid
 from vla_eval.models.spatialvla.action_tokens import to_tokens

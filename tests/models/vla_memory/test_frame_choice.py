@@ -8,7 +8,7 @@ import pytest
 
 from vla_eval.core import ImageArray
 from vla_eval.errors import RecipeError, UnknownNameError
-from vla_eval.models.vla_memory.frame_choice import BLOCKS, FrameChoice, Seen, blocks_of, novelty
+from vla_eval.models.shared.frame_choice import BLOCKS, FrameChoice, Seen, blocks_of, novelty
 
 N_PX = 64
 

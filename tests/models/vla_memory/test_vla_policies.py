@@ -9,7 +9,7 @@ import torch
 
 from tests.models.vla_memory.tiny_vlas import BASE, FAMILIES, batch_of, loss_of, made, noise_of
 from vla_eval.errors import RecipeError, SpecMismatchError
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY, mask_field
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY, mask_field
 
 N_TOKENS = 3
 FRAMES = {"memory_places": 2}

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vla_eval.checkpoints.loading import config_class, make_empty_policy
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY
-from vla_eval.models.vla_memory.fields import mask_field
+from vla_eval.models.shared.earlier_frames import mask_field
 from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma, write_tiny_smolvlm
 
 FAMILIES = ("smolvla", "pi0", "pi05")

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.checkpoints.bases import BASES, find_base
+from vla_eval.models.families import bases
 
 FETCH = "fetch"
 DESCRIPTION = """Fetch a published checkpoint that recipes start from, check every file, and convert it where
@@ -18,7 +18,7 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
     fetch = actions.add_parser(
         FETCH,
         help="get a published base from the Hub",
-        description=f"{DESCRIPTION}{', '.join(BASES)}.",
+        description=f"{DESCRIPTION}{', '.join(bases())}.",
         allow_abbrev=False,
     )
     fetch.add_argument("name", metavar="NAME", help="of a base, or of a recipe that starts from it")
@@ -28,10 +28,12 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
 
 def run(args: argparse.Namespace) -> list[str]:
     """Do it; return lines for standard output."""
+    # Here and not above: `mikasa-vla --help` need not wait for the Hub's client.
+    from vla_eval.checkpoints.bases import find_base
+    from vla_eval.checkpoints.fetching import fetch_base
+
     base = find_base(args.name)
     out = args.out or Path("checkpoints") / base.name
-    # Here and not above: `mikasa-vla --help` need not wait for the Hub's client.
-    from vla_eval.checkpoints.fetching import fetch_base
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)

@@ -3,7 +3,7 @@
 import argparse
 import itertools
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from vla_eval.cli.terminal import progress
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import FolderInUseError
 from vla_eval.evaluation.evaluate import EvaluationSummary
-from vla_eval.policies.entries import PolicyEntry
+from vla_eval.evaluation.resolve import ResolvedEvaluation, resolve
 from vla_eval.workers.backend import Backend
 
 
@@ -29,31 +29,19 @@ class Evaluations(NamedTuple):
 
 
 def evaluate_one(
-    config: EvalConfig,
-    out: Path,
-    args: argparse.Namespace,
-    *,
-    stop: progress.StopRequest,
-    backend: Backend,
-    policies: Sequence[PolicyEntry] | None = None,
+    resolved: ResolvedEvaluation, args: argparse.Namespace, *, stop: progress.StopRequest
 ) -> EvaluationSummary:
-    """Run or resume an evaluation as the command line asks, with progress; arguments as for `evaluate_each`.
-
-    `policies`: see `evaluate`.
+    """Run or resume an evaluation as the command line asks, with progress; `args` as for `evaluate_each`.
 
     Raises:
         VlaEvalError: see `evaluate`.
     """
     return progress.evaluate_with_progress(
-        config,
-        out=out,
+        resolved,
         command=typed_command(),
         stop=stop,
         allow_environment_change=args.allow_environment_change,
-        shard=args.shard,
-        backend=backend,
         json_progress=args.json_progress,
-        policies=policies,
     )
 
 
@@ -78,7 +66,8 @@ def evaluate_each(
     with progress.stop_on_signals() as stop:
         for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
             try:
-                summary = evaluate_one(config, out, args, stop=stop, backend=backend)
+                resolved = resolve(config, backend=backend, out=out, shard=args.shard)
+                summary = evaluate_one(resolved, args, stop=stop)
             except FolderInUseError:
                 if (out, config) in put_off:
                     raise

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 
 from vla_eval.cli.terminal.screen import print_markdown, screen_width
 from vla_eval.errors import unknown_name
+from vla_eval.results.formats import FORMATS, PRESETS
 from vla_eval.storage.shard import Shard
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
 
 
-# Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
-FORMATS = ("markdown", "csv", "json", "latex", "html-table")
-PRESETS = ("paper",)
 DEFAULT_BOARD = "leaderboard_mikasa"
 
 

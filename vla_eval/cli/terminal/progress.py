@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +12,11 @@ from typing import Any
 from vla_eval.cli.terminal.episode_bar import EpisodeBar
 from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines
 from vla_eval.config.capture import CaptureConfig
-from vla_eval.config.evaluation import EvalConfig
 from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
-from vla_eval.policies.entries import PolicyEntry
+from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.shard import Shard
-from vla_eval.workers.backend import Backend
 from vla_eval.workers.load import Load
-from vla_eval.workers.local import LOCAL
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 STDERR = 2
@@ -81,35 +77,28 @@ def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
 
 
 def evaluate_with_progress(
-    config: EvalConfig,
+    resolved: ResolvedEvaluation,
     *,
-    out: Path,
     command: str,
     stop: StopRequest,
-    allow_environment_change: bool = False,
-    shard: Shard | None = None,
-    backend: Backend = LOCAL,
-    json_progress: int | None = None,
-    policies: Sequence[PolicyEntry] | None = None,
+    allow_environment_change: bool,
+    json_progress: int | None,
 ) -> EvaluationSummary:
     """Run an evaluation with progress on standard error, and end early if asked to stop.
 
-    `json_progress` is the file descriptor of lines for other programs; `policies`: see `evaluate`.
+    `json_progress` is the file descriptor of lines for other programs.
 
     Raises:
         VlaEvalError: see `evaluate`.
     """
-    progress = Progress(stop, out=out, capture=config.capture, json_progress=json_progress)
+    capture = resolved.config.capture
+    progress = Progress(stop, out=resolved.out, capture=capture, json_progress=json_progress)
     try:
         return evaluate(
-            config,
-            out=out,
+            resolved,
             command=command,
             allow_environment_change=allow_environment_change,
             observer=progress,
-            shard=shard,
-            backend=backend,
-            policies=policies,
         )
     finally:
         progress.close()

@@ -12,14 +12,14 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset, Sample
-from vla_eval.models.vla_memory.fields import (
+from vla_eval.models.shared.earlier_frames import (
     SEGMENT_PADDING_KEY,
     SampleMemory,
     Segments,
     in_places,
     place_fields,
 )
-from vla_eval.models.vla_memory.frame_choice import FrameChoice, Seen
+from vla_eval.models.shared.frame_choice import FrameChoice, Seen
 
 NO_ROW = -1
 

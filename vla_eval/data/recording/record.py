@@ -45,6 +45,7 @@ from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
+from vla_eval.workers.process import WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording.worker"
@@ -185,14 +186,14 @@ def record(
     parts: list[RecordedPart] = []
     n_workers = backend.n_cores if recipe.workers == "auto" else recipe.workers
     with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
-        pool: RecordingPool = backend.pool(
-            recording_main,
+        spec = WorkerSpec(
+            main=recording_main,
             answers=(Attempt, ShardWritten, DatasetWritten),
-            size=n_workers,
             timeouts=recipe.timeouts,
             logs=folder.logs(),
             preload=(WORKER_MODULE, *simulator_modules(recipe.simulator)),
         )
+        pool: RecordingPool = backend.pool(spec, size=n_workers)
         with pool as running:
             recorder = _Recorder(
                 plan=plan,

@@ -40,6 +40,7 @@ from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
+from vla_eval.workers.process import WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.replaying.worker"
@@ -131,14 +132,11 @@ def replay(
     observer.on_phase(facts.task, "replaying", n_done=0, n_total=len(jobs))
     size = max(1, min(len(jobs), backend.n_cores if workers == "auto" else workers))
     replayed: list[EpisodeReplayed] = []
-    pool: Pool[ReplayJob, EpisodeReplayed] = backend.pool(
-        replay_main,
-        answers=(EpisodeReplayed,),
-        size=size,
-        timeouts=TimeoutConfig(),
-        logs=logs,
-        preload=(WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ())),
+    preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
+    spec = WorkerSpec(
+        main=replay_main, answers=(EpisodeReplayed,), timeouts=TimeoutConfig(), logs=logs, preload=preload
     )
+    pool: Pool[ReplayJob, EpisodeReplayed] = backend.pool(spec, size=size)
     with pool as running:
         for event in running.run(JobList(jobs)):
             if isinstance(event, Answered):

@@ -64,11 +64,7 @@ def _widened(mask: Mask) -> Mask:
 
 
 class Empty:
-    """What a camera sees before there is anything to choose from.
-
-    Args:
-        image: (3, H, W).
-    """
+    """What a camera sees, (3, H, W), before there is anything to choose from."""
 
     def __init__(self, image: Bytes) -> None:
         self.image = image
@@ -83,8 +79,7 @@ class Empty:
 class SeenThings:
     """Finds things, and keeps what it found: a demonstration is sampled again and again.
 
-    Args:
-        most: images; then the one that was not asked for the longest is forgotten.
+    Of more than `most` images, the one that was not asked for the longest is forgotten.
     """
 
     def __init__(self, most: int) -> None:

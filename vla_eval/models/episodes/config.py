@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar  # lerobot is untyped
 
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.models.episodes.eef_state import STATE
+from vla_eval.features import STATE_NAMES
 from vla_eval.models.shared.ported_config import PortedConfig
 
+STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
+POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
+SPACE = 3  # numbers of a position, and of the translation with which an action begins
 SENTENCES = ("none", "words")
 """`words`: which words are in it, see `sentence.SentenceEncoder`."""
 

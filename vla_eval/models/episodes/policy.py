@@ -47,9 +47,7 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
     def set_memory(self, begin: Any, *, remembers: bool) -> None:
         """Give the policy the methods by which the harness knows that it remembers, if it does.
 
-        Args:
-            begin: of the network: returns the memory of so many episodes before their first frame.
-            remembers: whether there is more than the present frame.
+        `begin`: of the network: returns the memory of so many episodes before their first frame.
         """
         self._remembers = remembers
         if remembers:

@@ -16,12 +16,8 @@ REWARD_PADDING_KEY = f"{REWARD_KEY}_is_pad"
 def rewards_in(batch: Mapping[str, Tensor], kind: RewardKind) -> Tensor:
     """Return the rewards (B, T) at the steps that the policy's `reward_delta_indices` name, 0 in padding.
 
-    Args:
-        batch: of lerobot's loader.
-        kind: which rewards the policy is trained on.
-
     Raises:
-        ValueError: there are none, or they are of the other kind.
+        ValueError: the batch has none, or they are not of the kind that the policy is trained on.
     """
     if REWARD_PADDING_KEY not in batch:
         raise ValueError(
@@ -40,13 +36,9 @@ def rewards_in(batch: Mapping[str, Tensor], kind: RewardKind) -> Tensor:
 
 
 def returns_to_go(rewards: Tensor, *, discount: float = 1.0) -> Tensor:
-    """Return (B, T): at each step, the sum of its reward and those after it.
+    """Return (B, T): at each step, the discounted sum of its reward (B, T) and those after it.
 
     Chen et al. 2021, "Decision Transformer", section 3.
-
-    Args:
-        rewards: (B, T).
-        discount: weight of a step's reward in the return of the step before.
     """
     steps = torch.arange(rewards.shape[1], device=rewards.device)
     lag = steps[None, :] - steps[:, None]

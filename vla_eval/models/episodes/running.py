@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vla_eval.core import EpisodeStart
 from vla_eval.errors import InvalidActionError
-from vla_eval.models.vla_memory.fields import FrameMemory
+from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.seeding import Stream, generator
 
 Frame = Mapping[str, Tensor]

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.episodes.color_objects import changed_things
-from vla_eval.models.episodes.config import EpisodeConfig
-from vla_eval.models.episodes.eef_state import SPACE
+from vla_eval.models.episodes.config import SPACE, EpisodeConfig
 from vla_eval.models.shared.levels import in_bytes, in_numbers
 
 LEAST_VARIANCE_M2 = 1e-6
@@ -152,13 +151,9 @@ def _first(steps: Tensor, is_there: Tensor) -> Tensor:
 def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
     """Return (B, T) the steps that are shown, in order, and how much each of them counts; padding nothing.
 
-    A decision that is shown several times counts as much as one that is shown once: else the motion behind
-    it, of which there is one frame each, would be learned less.
-
-    Args:
-        kept: (B, steps) those that are trained on.
-        begins: (B, steps) decisions.
-        late_steps: a decision is shown up to so many times again, drawn by torch's generator.
+    A decision among the steps `kept` (B, steps) is shown up to `late_steps` times again, and counts as much
+    as one that is shown once: else the motion behind it, of which there is one frame each, would be learned
+    less.
     """
     times = kept.long()
     if late_steps:
@@ -174,9 +169,7 @@ def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tenso
 def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
     """Return chunks (B, T, chunk, action) that continue with the last action before a decision.
 
-    Args:
-        actions: of each step and those behind it.
-        before: (B, T, chunk) whether an action is before the next decision; the first of a chunk always is.
+    `before` (B, T, chunk): whether an action is before the next decision; the first of a chunk always is.
     """
     last = (before.sum(dim=-1, keepdim=True) - 1)[..., None].expand(-1, -1, 1, actions.shape[-1])
     return torch.where(before[..., None], actions, actions.gather(2, last))
@@ -206,12 +199,9 @@ def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_epi
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
-    """Return by how much a goal is missed, squared, in units of what the mean of the batch's would miss.
+    """Return by how much goals (B, T, 3), by their weights (B, T), miss the right ones (B, 3).
 
-    Args:
-        goal_m: (B, T, 3) predicted at each step.
-        right_m: (B, 3).
-        weights: (B, T) of the steps.
+    Squared, in units of what the mean of the batch's would miss.
     """
     missed = (goal_m - right_m[:, None]).square().mean(dim=-1)
     return weighted_mean(missed, weights) / goal_variance(right_m)
@@ -270,13 +260,8 @@ def _with_other_things(
 ) -> Tensor:
     """Change the things in a share of the episodes, see `changed_things`.
 
-    Args:
-        images: (N, cameras, 3, H, W), one episode after the other.
-        n_frames: (B,) how many are of each.
-        n_before: (B,) how many of these are before the first decision; 0: there is none.
-        empty: (B, cameras, 3, H, W) the frames before the first decisions.
-        config: of the policy.
-        may_stay: see `changed_things`.
+    Of each of the B episodes, `n_frames` of the images (N, cameras, 3, H, W) are given, `n_before` of them
+    before its first decision (0: there is none), and `empty` (B, cameras, 3, H, W), the frame before that.
     """
     exchanges, erases = (
         (torch.rand(len(n_frames)) < share).tolist() for share in (config.exchange_share, config.erase_share)

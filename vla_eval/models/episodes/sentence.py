@@ -23,11 +23,7 @@ WORD = re.compile(r"\w+")
 
 
 class SentenceEncoder(nn.Module):
-    """The mean of learned vectors of a sentence's words, through a linear layer.
-
-    Args:
-        outputs: numbers that are returned.
-    """
+    """The mean of learned vectors of a sentence's words, through a linear layer to so many outputs."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
@@ -35,11 +31,7 @@ class SentenceEncoder(nn.Module):
         self.said = nn.Linear(NUMBERS, outputs)
 
     def forward(self, sentences: Sequence[str]) -> Tensor:
-        """Return (B, outputs) of B sentences.
-
-        Raises:
-            MissingInstructionError: one has no word.
-        """
+        """Return (B, outputs) of B sentences; raise `MissingInstructionError` if one has no word."""
         rows = [word_rows(sentence) for sentence in sentences]
         for sentence, own in zip(sentences, rows, strict=True):
             kept = " ".join(sorted(WORD.findall(sentence.lower())))
@@ -52,11 +44,7 @@ class SentenceEncoder(nn.Module):
 
 
 def word_rows(sentence: str) -> list[int]:
-    """Return the row of each word; capitals do not matter.
-
-    Raises:
-        MissingInstructionError: there is no word.
-    """
+    """Return the row of each word, in any case; raise `MissingInstructionError` if there is no word."""
     words = WORD.findall(sentence.lower())
     if not words:
         raise MissingInstructionError(
@@ -69,12 +57,9 @@ def word_rows(sentence: str) -> list[int]:
 def said_at_each_step(
     encoder: SentenceEncoder | None, batch: Mapping[str, Any], n_steps: int
 ) -> Tensor | None:
-    """Return (B, T, outputs) of the sentences of B episodes; None for a policy that reads none.
+    """Return (B, T, outputs) of the sentences of B episodes, the same at each step.
 
-    Args:
-        encoder: of the policy; None if it reads no sentence.
-        batch: with a list of sentences.
-        n_steps: T; a sentence is the same at each.
+    None for a policy without an encoder, which reads none.
 
     Raises:
         MissingInstructionError: the batch has no sentences, or one has no word.
@@ -94,13 +79,7 @@ def said_at_each_step(
 
 
 def with_sentence(layers: nn.Sequential, inputs: Tensor, said: Tensor | None) -> Tensor:
-    """Return what layers make of inputs; what a sentence says is added after the first of them.
-
-    Args:
-        layers: a linear map first.
-        inputs: (…, inputs of the first layer).
-        said: (…, outputs of the first layer); None: nothing is added.
-    """
+    """Return what layers, a linear map first, make of inputs; what is said is added after the first."""
     if said is None:
         alone: Tensor = layers(inputs)
         return alone

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.episodes.eef_state import SPACE
-from vla_eval.models.memory.layers import three_layers
+from vla_eval.models.episodes.config import SPACE
 
 WAY_SCALE_M = 0.1  # metres of a way to numbers of about 1
 WAY_HIDDEN = 64
@@ -21,14 +20,21 @@ WAY_SEEN = 4  # numbers that describe the way along one axis
 LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
 
 
+def three_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Return a map from numbers to numbers with two hidden layers."""
+    return nn.Sequential(
+        nn.Linear(inputs, hidden),
+        nn.GELU(),
+        nn.Linear(hidden, hidden),
+        nn.GELU(),
+        nn.Linear(hidden, outputs),
+    )
+
+
 class ActionHead(nn.Module):
     """Decides when to go, the rest of the action, and how large the error of each action will be.
 
-    Args:
-        hidden: numbers of what was decided.
-        chunk: actions.
-        action: dimensions of an action, the first three of them a translation.
-        free: whether a part of the translation does not depend on the goal.
+    With `free`, a part of the translation (an action's first three numbers) does not depend on the goal.
     """
 
     upright: Tensor
@@ -48,9 +54,7 @@ class ActionHead(nn.Module):
     def forward(self, decided: Tensor, way_m: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions (N, chunk, action), and the squared error expected of each (N, chunk) > 0.
 
-        Args:
-            decided: (N, hidden).
-            way_m: (N, 3) from the tool centre point to the goal.
+        They are of what was decided (N, hidden), and the way (N, 3) from the tool centre point to the goal.
         """
         goes = self.goes(decided).sigmoid()[..., None]  # (N, chunk, 1)
         ways = self.way(self._along_each_axis(way_m)).transpose(1, 2)  # (N, chunk, 3)

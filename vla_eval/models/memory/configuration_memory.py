@@ -1,6 +1,7 @@
 """lerobot's configuration of the positive control; `docs/positive_control.md` explains it."""
 
 from dataclasses import dataclass, field
+from typing import Any  # lerobot is untyped
 
 from lerobot.configs import PreTrainedConfig
 
@@ -9,6 +10,7 @@ from vla_eval.errors import RecipeError, SpecMismatchError, check_names
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.models.episodes.config import EpisodeConfig
 from vla_eval.models.memory.sizes import SPOTS
+from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, VISION, Stage, Stages, image_shape
 
 TYPE = "mikasa_memory"
 LEARNED_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_POS)
@@ -56,11 +58,7 @@ class MikasaMemoryConfig(EpisodeConfig):
             )
 
     def fit_to_control_mode(self, mode: str) -> None:
-        """Take the control mode of a dataset.
-
-        Raises:
-            SpecMismatchError: this network does not learn its actions.
-        """
+        """Take the control mode of a dataset; raise `SpecMismatchError` for actions that are not learned."""
         if mode not in LEARNED_MODES:
             raise SpecMismatchError(
                 f"'{TYPE}' learns actions of {', '.join(LEARNED_MODES)}; the dataset's are for {mode}. "
@@ -90,3 +88,13 @@ class MikasaMemoryConfig(EpisodeConfig):
                 f"'{TYPE}' needs square images whose edge is a multiple of patch_px ({self.patch_px}), "
                 f"found {height_px}×{width_px}"
             )
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the places and steps of a sample that pass through each."""
+    n_steps = config.window_steps or EPISODE_STEPS
+    n_places = (image_shape(config)[-1] // config.patch_px) ** 2
+    return (
+        Stage(r"network\.(eyes|keys)\.", n_steps * n_places, VISION),
+        Stage(r"network\.", n_steps, HEAD),
+    )

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
-from vla_eval.models.memory.layers import three_layers
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
+from vla_eval.models.memory.action_head import three_layers
 from vla_eval.models.memory.sizes import PLACE
 
 MAP_HIDDEN = 64
@@ -125,12 +125,9 @@ class GoalLayer(nn.Module):
 
     @torch.no_grad()
     def note_errors(self, missed_m: Tensor, evidence: Tensor, state: Tensor) -> None:
-        """Keep in mind how far off each camera was at N steps, and by which evidence.
+        """Keep in mind how far off each camera was at N steps, and by which evidence, see `Goals`.
 
-        Args:
-            missed_m: (N, cameras, 3) goals of each camera alone, minus what they should have been.
-            evidence: (N, cameras, 3), see `Goals`.
-            state: (N, state).
+        `missed_m` (N, cameras, 3): goals of each camera alone, minus what they should have been.
         """
         squared = missed_m.square().sum(dim=-1) / self._squared_length(state)
         for usual, now in (

@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
-from vla_eval.models.memory.layers import three_layers
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
+from vla_eval.models.memory.action_head import three_layers
 
 N_JOINTS = 7
 JOINT_UNIT_RAD = 0.1  # joints to numbers that change by about 1 in a step, as actions of the other modes do

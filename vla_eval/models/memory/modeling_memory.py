@@ -23,6 +23,7 @@ from vla_eval.models.memory.joint_layer import action_units
 from vla_eval.models.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.models.memory.sizes import NetworkSizes
 from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.network_sizes import sizes_from
 
 SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still
 UNFORESEEN = 0.05  # root of a mean squared error of actions in [-1, 1]
@@ -156,19 +157,11 @@ def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor,
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:
     """Return the sizes that a configuration and its fields ask for."""
     images = config.image_features
-    return NetworkSizes(
+    return sizes_from(
+        NetworkSizes,
+        config,
         on_arm=tuple(name in config.arm_cameras for name in images),
         image_px=int(next(iter(images.values())).shape[-1]),
         action=int(config.action_feature.shape[0]),
         chunk=config.chunk_size,
-        channels=config.channels,
-        patch_px=config.patch_px,
-        heads=config.heads,
-        key=config.key,
-        memory=config.memory,
-        hidden=config.hidden,
-        longest_span_steps=config.longest_span_steps,
-        free_translation=config.free_translation,
-        joint_targets=config.joint_targets,
-        reads_sentence=config.reads_sentence,
     )

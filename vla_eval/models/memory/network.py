@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE, STATE
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE, STATE
 from vla_eval.models.episodes.samples import last_of
 from vla_eval.models.episodes.sentence import SentenceEncoder, with_sentence
 from vla_eval.models.memory.action_head import WAY_SCALE_M, ActionHead
@@ -90,12 +90,7 @@ class Memory(NamedTuple):
 
 
 class MemoryNetwork(nn.Module):
-    """See the module's text.
-
-    Args:
-        sizes: of all layers.
-        remembers: False for the twin, whose memory is reset at each step.
-    """
+    """See the module's text; the twin, which does not remember, resets its memory at each step."""
 
     def __init__(self, sizes: NetworkSizes, *, remembers: bool) -> None:
         super().__init__()
@@ -146,15 +141,10 @@ class MemoryNetwork(nn.Module):
         return Memory(things, nothing, like.expand(n_episodes, -1))
 
     def see(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Sight:
-        """Return what is seen at each step.
+        """Return what is seen at each step in images (N, cameras, 3, H, W) in [0, 1].
 
-        What an instruction says is in the summary: so it has a part in what is kept, in what is asked of the
-        images, and in the action.
-
-        Args:
-            images: (N, cameras, 3, H, W) in [0, 1].
-            state: (N, state) in SI units.
-            said: (N, hidden) by `sentence`; None where no instruction is read.
+        What an instruction says, (N, hidden) by `sentence`, is in the summary: so it has a part in what is
+        kept, in what is asked of the images, and in the action.
         """
         return self._sight([eye(images[:, index]) for index, eye in enumerate(self.eyes)], state, said)
 
@@ -168,13 +158,7 @@ class MemoryNetwork(nn.Module):
         return Sight(places, keys, things, with_sentence(self.summary, known, said))
 
     def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
-        """Return the memories (B, T, …) after each step of what was seen at B · T steps.
-
-        Args:
-            sight: of all steps, episode by episode.
-            shape: (B, T).
-            memory: before the first of these steps.
-        """
+        """Return the memories (B, T, …) after each of B · T steps, episode by episode; `shape` is (B, T)."""
         return self._written(by_episode(sight.things, shape), by_episode(sight.summary, shape), memory)
 
     @in_float32
@@ -202,10 +186,7 @@ class MemoryNetwork(nn.Module):
     def act(self, sight: Sight, memory: Memory, state: Tensor) -> Answer:
         """Return actions (N, chunk, action), doubts (N, chunk) and goal (N, 3) for N steps.
 
-        Args:
-            sight: of these steps.
-            memory: with these steps written into it.
-            state: (N, state) in SI units, the tool centre point's position first.
+        `memory` has these steps written into it; the state (N, state) begins with the tool's position.
         """
         sizes = self.sizes
         # Of the learned numbers alone: a thing is looked for as it was seen, in its colour and at its place.
@@ -246,13 +227,7 @@ class MemoryNetwork(nn.Module):
         )
 
     def forward(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Answer:
-        """Answer for each step of episodes from their beginning.
-
-        Args:
-            images: (B, T, cameras, 3, H, W) in [0, 1].
-            state: (B, T, state) in SI units.
-            said: (B, T, hidden), see `see`.
-        """
+        """Answer for each step of episodes from their beginning, images (B, T, cameras, 3, H, W)."""
         every = torch.ones(state.shape[:2], dtype=torch.bool, device=state.device)
         return self.answers(images.flatten(0, 1), state, said, first=every, real=every)
 

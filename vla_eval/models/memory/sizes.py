@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from vla_eval.models.episodes.eef_state import SPACE
+from vla_eval.models.episodes.config import SPACE
 
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in an image
 APART = 1  # one number: how much a place stands out

@@ -147,13 +147,7 @@ class Likeness(nn.Module):
             self.counts[sizes.heads // 2 :, color + RGB :] = COUNT_LOOKS
 
     def forward(self, places: Places, keys: Tensor, asked: Tensor) -> Found:
-        """Look for what is asked for.
-
-        Args:
-            places: P places of each of N images.
-            keys: (N, P · QUARTERS, key + KNOWN) of their spots.
-            asked: (N, heads, key + KNOWN).
-        """
+        """Look for what is asked, (N, heads, key + KNOWN), among keys (N, P · QUARTERS, key + KNOWN)."""
         counts = functional.softplus(self.counts)
         # Minus the squared distance, without what all places have in common.
         scores = keys @ (2 * asked * counts).transpose(1, 2) - keys.square() @ counts.T

@@ -12,8 +12,10 @@ from vla_eval.models.octo.language import T5Sizes
 from vla_eval.models.octo.transformer import PATCH_PX, TransformerSizes
 from vla_eval.models.shared.gripper import Gripper, GripperDecoding, GripperEncoding
 from vla_eval.models.shared.images import Augmentation
+from vla_eval.models.shared.network_sizes import sizes_from
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.ported_config import PortedConfig
+from vla_eval.models.shared.stages import HEAD, LANGUAGE, VISION, Stage, Stages
 
 TYPE = "mikasa_octo"
 BYTES_TOKENIZER = "bytes"
@@ -137,31 +139,25 @@ class MikasaOctoConfig(PortedConfig):
     @property
     def transformer_sizes(self) -> TransformerSizes:
         """What the transformer is made of."""
-        return TransformerSizes(
-            image_px=dict(self.image_px),
-            max_window=self.max_window,
-            language_tokens=self.language_tokens,
+        return sizes_from(
+            TransformerSizes,
+            self,
             language_width=self.t5_sizes.width,
-            width=self.width,
-            layers=self.layers,
-            heads=self.heads,
-            mlp_width=self.mlp_width,
             stem_channels=tuple(self.stem_channels),
-            stem_features=self.stem_features,
         )
 
     @property
     def head_sizes(self) -> HeadSizes:
         """What the head is made of."""
-        return HeadSizes(
+        return sizes_from(
+            HeadSizes,
+            self,
             condition=self.width,
             chunk=self.chunk_size,
             action=int(self.action_feature.shape[0]),
             hidden=self.head_hidden,
             blocks=self.head_blocks,
             time=self.head_time,
-            diffusion_steps=self.diffusion_steps,
-            max_action=self.max_action,
         )
 
     @property
@@ -211,3 +207,15 @@ class MikasaOctoConfig(PortedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
         return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=0.0)
+
+
+PROMPT_TOKENS, FRAME_TOKENS = 16, 337  # docs/octo.md
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    return (
+        Stage(r"language\.", PROMPT_TOKENS, VISION - 1),
+        Stage(r"head\.", config.window, HEAD),
+        Stage(r"transformer\.", PROMPT_TOKENS + FRAME_TOKENS * config.window, LANGUAGE),
+    )

@@ -104,12 +104,9 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def forward(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
-        """Return the noise (…, F) that it believes to be in noisy actions.
+        """Return the noise (…, F) that it believes to be in noisy actions (…, F).
 
-        Args:
-            condition: (…, readout).
-            noisy: (…, F).
-            time: (…, 1), the diffusion step, 0 to T - 1.
+        `condition` is the readout (…, width), `time` (…, 1) the diffusion step, 0 to T - 1.
         """
         angles = 2 * math.pi * time.to(noisy.dtype) @ self.frequencies.T
         waves = torch.cat([angles.cos(), angles.sin()], dim=-1)
@@ -133,11 +130,9 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def sample(self, condition_BD: Tensor, noise: Tensor) -> Tensor:
-        """Return chunks (B, chunk, action), normalised.
+        """Return chunks (B, chunk, action), normalised, from the readout of the newest step.
 
-        Args:
-            condition_BD: the readout of the newest step.
-            noise: (B, T + 1, F): the start, then what each of the T steps adds; the last is not used.
+        `noise` (B, T + 1, F): the start, then what each of the T steps adds; the last is not used.
         """
         schedule = self.schedule()
         x = noise[:, 0]

@@ -122,14 +122,7 @@ _COMPILED = tuple((re.compile(rule.pattern), rule) for rule in _RULES)
 
 
 def from_flax(tree: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the policy's tensors by our names.
-
-    Args:
-        tree: the original's parameters, flat.
-
-    Raises:
-        CheckpointError: there are tensors that this architecture does not have.
-    """
+    """Return the policy's tensors by our names, of the original's flat tree; raise if one is unknown."""
     converted, unknown = {}, []
     for key, values in tree.items():
         rule = _rule(key)
@@ -143,18 +136,6 @@ def from_flax(tree: Mapping[str, Tensor]) -> dict[str, Tensor]:
             f"head): {listed(unknown)}."
         )
     return converted
-
-
-def our_name(key: str) -> str:
-    """Return our name of one tensor of the original.
-
-    Raises:
-        CheckpointError: this architecture has no such tensor.
-    """
-    found = _rule(key)
-    if found is None:
-        raise CheckpointError(f"'{key}' is no tensor of the Octo that is built here.")
-    return found.name
 
 
 def is_kernel(name: str) -> bool:

@@ -59,12 +59,7 @@ class PromptEmbeddings:
 
     @torch.no_grad()
     def __call__(self, encoder: nn.Module, tokens_BL: Tensor, mask_BL: Tensor) -> Tensor:
-        """Return (B, L, width).
-
-        Args:
-            encoder: what `make_text_encoder` returned.
-            tokens_BL: ids.
-            mask_BL: True for tokens that are no padding.
+        """Return (B, L, width) of tokens, whose mask is True where they are not padding.
 
         Raises:
             MissingInstructionError: a row has no token.

@@ -18,8 +18,7 @@ from vla_eval.models.octo.configuration_octo import TRAINED, TYPE, MikasaOctoCon
 from vla_eval.models.octo.diffusion_head import Targets, draw
 from vla_eval.models.octo.flax_names import is_kernel
 from vla_eval.models.octo.language import PromptEmbeddings, make_text_encoder
-from vla_eval.models.octo.network import OctoNetwork
-from vla_eval.models.octo.transformer import Window
+from vla_eval.models.octo.transformer import OctoNetwork, Window
 from vla_eval.models.shared.images import (
     Size,
     augment,

@@ -23,12 +23,8 @@ def make_mikasa_octo_pre_post_processors(
 ) -> tuple[Any, Any]:
     """Return pre- and postprocessor; lerobot finds this function by its name.
 
-    Args:
-        config: the policy's.
-        dataset_stats: statistics of the data that it is trained on.
-
     Raises:
-        CheckpointError: there are none, and so nothing that actions could be normalised by.
+        CheckpointError: there are no statistics that actions could be normalised by.
     """
     if not dataset_stats:
         raise CheckpointError(

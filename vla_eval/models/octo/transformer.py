@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from vla_eval.models.octo.diffusion_head import DiffusionHead, HeadSizes
+
 NORM_EPSILON = 1e-6  # flax's default, of layer and group norms; torch's is 1e-5
 STANDARDIZATION_EPSILON = 1e-5  # vit_encoders.py: StdConv
 N_NORM_GROUPS = 32  # flax's default of GroupNorm
@@ -228,3 +230,12 @@ def attention_mask(keys_BN: Tensor, n_task: int, n_steps: int) -> Tensor:
 
 def _positions(*shape: int) -> nn.Parameter:
     return nn.Parameter(torch.randn(shape) * POSITION_STD)
+
+
+class OctoNetwork(nn.Module):
+    """The parts that the original trains; the text encoder, which it never trains, is beside it."""
+
+    def __init__(self, transformer: TransformerSizes, head: HeadSizes) -> None:
+        super().__init__()
+        self.transformer = OctoTransformer(transformer)
+        self.head = DiffusionHead(head)

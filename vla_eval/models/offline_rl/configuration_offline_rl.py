@@ -8,12 +8,37 @@ from lerobot.configs import PreTrainedConfig
 from vla_eval.control_modes import ABSOLUTE_MODES, CONTROL_MODE, JOINT_DELTA_POS
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.features import RewardKind
-from vla_eval.models.offline_rl.algorithms import ALGORITHMS
+from vla_eval.models.sequence.sizes import encoder_stages
 from vla_eval.models.shared.ported_config import PortedConfig
+from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
 
 TYPE = "mikasa_offline_rl"
 REWARDS: tuple[str, ...] = get_args(RewardKind)
 UNIT_INTERVAL = ("dropout", "discount", "expectile", "target_rate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlgorithmRow:
+    """What has to be known of an algorithm before its network is made.
+
+    Attributes:
+        reads_rewards: it is more than imitation.
+        draws_actions: the actor is a distribution, whose mean acts.
+        has_value: there is a network of values beside those of action values.
+        has_targets: networks of action values follow slowly, for the right side of Bellman's equation.
+    """
+
+    reads_rewards: bool = True
+    draws_actions: bool = False
+    has_value: bool = False
+    has_targets: bool = True
+
+
+ALGORITHMS = {
+    "cql": AlgorithmRow(draws_actions=True),
+    "cql_published": AlgorithmRow(reads_rewards=False, has_targets=False),
+    "iql": AlgorithmRow(has_value=True),
+}
 
 
 @PreTrainedConfig.register_subclass(TYPE)
@@ -86,11 +111,7 @@ class MikasaOfflineRLConfig(PortedConfig):
                 raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
 
     def fit_to_control_mode(self, mode: str) -> None:
-        """Check that the actions lie in [-1, 1], where those of the actor do.
-
-        Raises:
-            RecipeError: they do not.
-        """
+        """Raise `RecipeError` unless the actions lie in [-1, 1], as those of the actor do."""
         if mode in ABSOLUTE_MODES:
             raise RecipeError(
                 f"'{TYPE}' acts in [-1, 1], found a dataset of {mode}, whose actions are m and rad: record "
@@ -123,3 +144,9 @@ class MikasaOfflineRLConfig(PortedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return lerobot's configuration of the schedule."""
         return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the places of a sample that pass through each."""
+    encoder = encoder_stages(image_shape(config)[-1], 1, nature=True)
+    return (*encoder, Stage(r"network\.targets\.", 0, HEAD))

@@ -37,12 +37,8 @@ def conservative_penalty(sampled: Tensor, log_densities: Tensor, recorded: Tenso
 def published_penalty(sampled: Tensor, recorded: Tensor) -> Tensor:
     """Return the penalty in the code of the paper's authors: one drawn action per transition.
 
-    The maximum is taken over the batch, not over the actions of a state:
+    The maximum is taken over the batch of values (Q, B), not over the actions of a state:
     https://github.com/CognitiveAISystems/RATE/blob/5aa88f0/offline_rl_baselines/CQL.py
-
-    Args:
-        sampled: (Q, B) values of drawn actions.
-        recorded: (Q, B) values of the recorded actions.
     """
     return (sampled.logsumexp(dim=-1) - recorded.mean(dim=-1)).sum()
 
@@ -55,9 +51,7 @@ def uniform_log_density(n_dims: int) -> float:
 def expectile_loss(advantages: Tensor, *, expectile: float) -> Tensor:
     """Return the loss whose minimum is an expectile: Kostrikov et al. 2021, IQL, equation 5.
 
-    Args:
-        advantages: (B,) by how much the action values are above the values.
-        expectile: share of the weight that those above have.
+    Advantages (B,) above 0 have the share `expectile` of the weight.
     """
     weights = torch.where(advantages < 0, 1 - expectile, expectile)
     return (weights * advantages.square()).mean()
@@ -74,14 +68,9 @@ def squared_distance(actions: Tensor, recorded: Tensor) -> Tensor:
 
 
 def squashed_log_density(mean: Tensor, log_std: Tensor, before: Tensor) -> Tensor:
-    """Return the log density (…,) of the hyperbolic tangent of normal draws (…, A).
+    """Return the log density (…,) of the hyperbolic tangent of normal draws `before` (…, A).
 
     Haarnoja et al. 2018, "Soft Actor-Critic", appendix C; log(1 - tanh²) in a form that stays finite.
-
-    Args:
-        mean: of the normal distribution, (…, A).
-        log_std: of it, likewise.
-        before: the draws, likewise.
     """
     normal = -0.5 * ((before - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
     stretched = 2 * (math.log(2) - before - functional.softplus(-2 * before))

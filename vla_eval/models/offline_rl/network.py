@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn import functional
 
-from vla_eval.models.offline_rl.algorithms import ALGORITHMS
-from vla_eval.models.offline_rl.configuration_offline_rl import MikasaOfflineRLConfig
+from vla_eval.models.offline_rl.configuration_offline_rl import ALGORITHMS, MikasaOfflineRLConfig
 from vla_eval.models.offline_rl.losses import squashed_log_density
 from vla_eval.models.sequence.encoders import RGB, Nature
 
@@ -28,14 +27,7 @@ class Drawn(NamedTuple):
 
 
 class Perceptron(nn.Module):
-    """Two layers of rectified units, and a linear one.
-
-    Args:
-        inputs: numbers that are read.
-        hidden: units of a layer.
-        outputs: numbers that are returned.
-        dropout: of the units in training.
-    """
+    """Two layers of rectified units with dropout in training, and a linear one."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int, *, dropout: float) -> None:
         super().__init__()
@@ -65,11 +57,7 @@ class Critics(nn.Module):
 
 
 class OfflineRLNetwork(nn.Module):
-    """All parts; those that the algorithm does not have are absent.
-
-    Args:
-        config: sizes, and the algorithm.
-    """
+    """All parts; those that the algorithm does not have are absent."""
 
     def __init__(self, config: MikasaOfflineRLConfig) -> None:
         super().__init__()

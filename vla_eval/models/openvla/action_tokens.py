@@ -14,21 +14,14 @@ from vla_eval.models.openvla.sizes import N_BINS
 def to_tokens(actions: Tensor, text_vocabulary: int) -> Tensor:
     """Return the tokens (…) int64 of normalised actions (…); what is beyond [-1, 1] takes the outermost.
 
-    Args:
-        actions: of any shape, normalised.
-        text_vocabulary: tokens of the tokenizer: the first bin is the last of them.
+    `text_vocabulary`: tokens of the tokenizer: the first bin is the last of them.
     """
     edges = torch.linspace(-1, 1, N_BINS, dtype=torch.float64, device=actions.device)
     return text_vocabulary - torch.bucketize(actions.double().clamp(-1, 1), edges, right=True)
 
 
 def from_tokens(tokens: Tensor, text_vocabulary: int) -> Tensor:
-    """Return the normalised actions float32, the middles of the bins; a token that is none is the nearest.
-
-    Args:
-        tokens: of any shape.
-        text_vocabulary: see `to_tokens`.
-    """
+    """Return the normalised actions float32, the middles of the bins; a token that is none is the nearest."""
     edges = torch.linspace(-1, 1, N_BINS, dtype=torch.float64, device=tokens.device)
     middles = (edges[:-1] + edges[1:]) / 2
     # The value 1 alone is in a bin of its own, number 256; it shares the last middle.

@@ -10,15 +10,43 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import STATE_KEY
-from vla_eval.models.openvla.lora import FULL_MODULES, LORA_TARGETS
 from vla_eval.models.openvla.sizes import Head, NetworkOptions, NetworkSizes
 from vla_eval.models.shared.images import Augmentation
 from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.ported_config import PromptedConfig
+from vla_eval.models.shared.stages import (
+    HEAD,
+    LANGUAGE,
+    PATCHES,
+    PROMPT_TOKENS,
+    VISION,
+    Stage,
+    Stages,
+    n_images,
+)
 
 TYPE = "mikasa_openvla"
 HEADS: tuple[Head, ...] = ("l1", "parallel_tokens", "tokens")
+# What LoRA trains of OpenVLA, by name. The original says `all-linear` of a transformers model, which spares
+# its output embeddings: all linear layers of both vision encoders, the projector and Llama, but not
+# `lm_head`. The heads are outside of it and trained in full. For a whole policy `all-linear` would take
+# `lm_head` and the heads, too; hence names. Source:
+# https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
+# vla-scripts/finetune.py#L846-L860. It also puts adapters on blocks whose output is not used; ours are not
+# there. Its encoders have one matrix for query, key and value, ours have three: the same rank makes ours
+# freer.
+_DINO = (
+    r"vision\.dino\.encoder\.layer\.\d+\."
+    r"(attention\.attention\.(query|key|value)|attention\.output\.dense|mlp\.fc[12])"
+)
+_SIGLIP = r"vision\.siglip\.encoder\.layers\.\d+\.(self_attn\.(q_proj|k_proj|v_proj|out_proj)|mlp\.fc[12])"
+_PROJECTOR = r"projector\.fc[123]"
+_LLAMA = r"llm\.model\.layers\.\d+\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+LORA_TARGETS = rf"network\.({_DINO}|{_SIGLIP}|{_PROJECTOR}|{_LLAMA})"
+"""Regular expression of the modules that get an adapter; it has to match a whole name."""
+FULL_MODULES = ("action_head", "proprio_projector")
+"""Modules that are new in fine-tuning and trained in full."""
 # Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
 # prismatic/vla/datasets/datasets.py#L152-L166
 AUGMENTATION = Augmentation(
@@ -29,12 +57,7 @@ AUGMENTATION = Augmentation(
 @LRSchedulerConfig.register_subclass("mikasa_step_decay")
 @dataclass
 class StepDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
-    """Divides the learning rate by ten once, after so many steps; 0: never.
-
-    Attributes:
-        num_decay_steps: so many.
-        num_warmup_steps: linear, from nothing.
-    """
+    """Divides the learning rate by ten once, after `num_decay_steps` (0: never), after a linear warm-up."""
 
     num_decay_steps: int = 0
     num_warmup_steps: int | None = 0
@@ -137,3 +160,18 @@ class MikasaOpenVLAConfig(PromptedConfig):
         return StepDecaySchedulerConfig(
             num_decay_steps=self.scheduler_decay_steps, num_warmup_steps=self.scheduler_warmup_steps
         )
+
+
+DINO_EXTRA = 5  # class token and registers
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    patches, actions = n_images(config) * PATCHES, config.chunk_size * config.action_feature.shape[0]
+    return (
+        Stage(r"lm_head", 0 if config.head == "l1" else actions, HEAD),
+        Stage(r"vision\.dino", patches + n_images(config) * DINO_EXTRA, VISION),
+        Stage(r"vision\.|projector", patches, VISION),
+        Stage(r"\.llm\.", patches + PROMPT_TOKENS + actions, LANGUAGE),
+        Stage(r"action_head", config.chunk_size, HEAD),
+    )

@@ -3,22 +3,18 @@
 Legend as in `network`. Decoding is greedy, as the original's.
 """
 
-from typing import Any  # transformers is untyped here
-
 import torch
 from torch import Tensor
-from torch.nn import functional
-from transformers import DynamicCache
 
 from vla_eval.models.openvla.action_tokens import from_tokens, to_tokens
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
-from vla_eval.models.shared.greedy import Prefix, greedy_tokens
+from vla_eval.models.shared.greedy import Prefix, greedy_tokens, token_cross_entropy
 
 
 def parallel_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
     """Return normalised actions (B, K, A) of the tokens that are predicted for the placeholders."""
     hidden = network.action_states(network.sequence(inputs))
-    tokens = network.llm.lm_head(hidden).argmax(dim=-1)
+    tokens = network.logits(hidden).argmax(dim=-1)
     return _chunk(network, tokens)
 
 
@@ -30,7 +26,7 @@ def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
     seen = torch.arange(n, device=lengths.device) < lengths[:, None]
     causal = torch.ones(n, n, dtype=torch.bool, device=lengths.device).tril()
     prefix = Prefix(sequence.embeddings[:, :n], seen[:, None, :] & causal, lengths)
-    decoded = greedy_tokens(_Llama(network.llm), prefix, network.options.n_action_tokens)
+    decoded = greedy_tokens(network, prefix, network.options.n_action_tokens)
     return _chunk(network, decoded.tokens)
 
 
@@ -53,34 +49,7 @@ def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts:
     ids = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
     weights = counts.repeat_interleave(network.options.action, dim=1)
     weights = torch.cat([weights, weights[:, -1:]], dim=1)
-    logits = network.llm.lm_head(hidden).float()
-    losses = functional.cross_entropy(logits.flatten(0, 1), ids.flatten(), reduction="none")
-    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
-
-
-class _Llama:
-    """OpenVLA's Llama, for greedy decoding."""
-
-    def __init__(self, llm: Any) -> None:
-        self._llm = llm
-
-    def embed(self, tokens: Tensor) -> Tensor:
-        embeddings: Tensor = self._llm.model.embed_tokens(tokens)
-        return embeddings
-
-    def read(self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None) -> Tensor:
-        hidden: Tensor = self._llm.model(
-            inputs_embeds=embeddings,
-            attention_mask=mask[:, None],
-            position_ids=places,
-            past_key_values=cache,
-            use_cache=cache is not None,
-        ).last_hidden_state
-        return hidden
-
-    def logits(self, hidden: Tensor) -> Tensor:
-        logits: Tensor = self._llm.lm_head(hidden)
-        return logits
+    return token_cross_entropy(network.logits(hidden).float(), ids, weights)
 
 
 def _chunk(network: OpenVLANetwork, tokens: Tensor) -> Tensor:

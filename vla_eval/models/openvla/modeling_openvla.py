@@ -7,9 +7,13 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.models.openvla.configuration_openvla import AUGMENTATION, TYPE, MikasaOpenVLAConfig
+from vla_eval.models.openvla.configuration_openvla import (
+    AUGMENTATION,
+    FULL_MODULES,
+    TYPE,
+    MikasaOpenVLAConfig,
+)
 from vla_eval.models.openvla.generation import generated_actions, parallel_actions, token_loss
-from vla_eval.models.openvla.lora import FULL_MODULES
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.models.openvla.prompt import finished
 from vla_eval.models.shared.chunks import PromptedChunks

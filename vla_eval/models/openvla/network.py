@@ -17,11 +17,12 @@ from typing import Any, NamedTuple  # transformers is untyped here
 
 import torch
 from torch import Tensor, nn
-from transformers import LlamaConfig, LlamaForCausalLM
+from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
 from vla_eval.models.openvla.heads import L1Head, ProprioProjector
 from vla_eval.models.openvla.sizes import NetworkOptions, NetworkSizes
 from vla_eval.models.openvla.vision import FusedVision, Projector
+from vla_eval.models.shared.greedy import places_from
 from vla_eval.models.shared.prompts import Prompts
 
 RMS_NORM_EPS = 1e-6  # of OpenVLA; Llama-2's own is 1e-5
@@ -57,12 +58,7 @@ class Sequence(NamedTuple):
 
 
 class OpenVLANetwork(nn.Module):
-    """See the module's text.
-
-    Args:
-        sizes: of all parts.
-        options: head, chunk, proprioception.
-    """
+    """See the module's text; also the `LanguageModel` of `shared.greedy`."""
 
     def __init__(self, sizes: NetworkSizes, options: NetworkOptions) -> None:
         super().__init__()
@@ -77,14 +73,9 @@ class OpenVLANetwork(nn.Module):
             self.action_head = L1Head(llm_width=sizes.llm_width, chunk=options.chunk, action=options.action)
 
     def sequence(self, inputs: Inputs, action_ids: Tensor | None = None) -> Sequence:
-        """Return the sequence of each sample.
-
-        Args:
-            inputs: see there.
-            action_ids: (B, K · A) tokens of the actions; None: placeholders.
-        """
+        """Return the sequence of each sample; `action_ids` (B, K · A) are tokens, None: placeholders."""
         ids, is_action, mask = self._text(inputs.prompts, action_ids)
-        embeddings = self.llm.model.embed_tokens(ids)
+        embeddings = self.embed(ids)
         if action_ids is None:
             embeddings = embeddings.masked_fill(is_action[..., None], 0.0)
         middle = self.projector(self.vision(inputs.images))
@@ -100,29 +91,45 @@ class OpenVLANetwork(nn.Module):
             first_action=inputs.prompts.mask.sum(dim=1) + n_middle,
         )
 
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Return the embeddings (…, D) of tokens."""
+        embeddings: Tensor = self.llm.model.embed_tokens(tokens)
+        return embeddings
+
+    def read(
+        self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None = None
+    ) -> Tensor:
+        """Return Llama's last hidden states (B, T, D); see `shared.greedy.LanguageModel`."""
+        hidden: Tensor = self.llm.model(
+            inputs_embeds=embeddings,
+            # Four dimensions: transformers takes such a mask as it is and adds no causal one.
+            attention_mask=mask[:, None],
+            position_ids=places,
+            past_key_values=cache,
+            use_cache=cache is not None,
+        ).last_hidden_state
+        return hidden
+
+    def logits(self, hidden: Tensor) -> Tensor:
+        """Return (…, vocabulary)."""
+        logits: Tensor = self.llm.lm_head(hidden)
+        return logits
+
     def hidden(self, sequence: Sequence, *, causal: bool = False) -> Tensor:
         """Return Llama's last hidden states (B, N, D).
 
-        Args:
-            sequence: see there.
-            causal: whether a token attends to no later one; False: to all that are no padding.
+        Causal: a token attends to no later one; else to all that are not padding.
         """
         n = sequence.mask.shape[1]
-        # Four dimensions: transformers takes such a mask as it is and adds no causal one.
-        mask = sequence.mask[:, None, None, :].expand(-1, 1, n, -1)
+        mask = sequence.mask[:, None, :].expand(-1, n, -1)
         if causal:
             mask = mask & torch.ones(n, n, dtype=torch.bool, device=mask.device).tril()
-        positions = torch.arange(n, device=mask.device)[None]
-        answer = self.llm.model(
-            inputs_embeds=sequence.embeddings, attention_mask=mask, position_ids=positions, use_cache=False
-        )
-        last: Tensor = answer.last_hidden_state
-        return last
+        return self.read(sequence.embeddings, mask, torch.arange(n, device=mask.device)[None])
 
     def action_states(self, sequence: Sequence, *, causal: bool = False, n_more: int = 0) -> Tensor:
         """Return the hidden states (B, K · A + n_more, D) that predict the action tokens and what follows."""
         n_tokens = self.options.n_action_tokens + n_more
-        return _from(self.hidden(sequence, causal=causal), sequence.first_action - 1, n_tokens)
+        return places_from(self.hidden(sequence, causal=causal), sequence.first_action - 1, n_tokens)
 
     def actions(self, inputs: Inputs) -> Tensor:
         """Return normalised actions (B, K, A), float32, by the `l1` head."""
@@ -143,12 +150,6 @@ class OpenVLANetwork(nn.Module):
         if action_ids is not None:
             ids = ids.masked_scatter(is_action, action_ids)
         return ids, is_action, places <= lengths + n_tokens
-
-
-def _from(values: Tensor, first: Tensor, n: int) -> Tensor:
-    """Return (B, n, D): of each row of (B, N, D), n places from `first` (B,) on."""
-    places = first[:, None] + torch.arange(n, device=values.device)
-    return values.take_along_dim(places[..., None], dim=1)
 
 
 def _llama_config(sizes: NetworkSizes) -> Any:

@@ -30,11 +30,5 @@ def make_mikasa_openvla_pre_post_processors(
     *,
     fields: Mapping[str, Normalization] | None = None,
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor; lerobot finds this function by its name.
-
-    Args:
-        config: of the policy.
-        dataset_stats: field -> statistics; None: they come from a checkpoint.
-        fields: how fields are normalised with foreign statistics; None: as the configuration says.
-    """
+    """Return pre- and postprocessor, see `language_processors`; lerobot finds this function by its name."""
     return language_processors(config, OpenVLAPromptStep(), dataset_stats, fields=fields)

@@ -16,11 +16,7 @@ TEMPLATE = "In: What action should the robot take to {instruction}?\nOut:"
 
 
 def prompt_text(instruction: str) -> str:
-    """Return the prompt of an instruction.
-
-    Raises:
-        MissingInstructionError: there are no words.
-    """
+    """Return the prompt of an instruction."""
     return TEMPLATE.format(instruction=instruction_words(instruction, model="OpenVLA"))
 
 

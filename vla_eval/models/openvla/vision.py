@@ -46,11 +46,7 @@ class FusedVision(nn.Module):
         return (images - self.mean) / self.std
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (B, C · P, D), the patches of a sample's images one after the other.
-
-        Args:
-            images: (B, C, 3, H, W) in [0, 1].
-        """
+        """Return (B, C · P, D) of images (B, C, 3, H, W) in [0, 1]: patches, one image after the other."""
         for_dino, for_siglip = self.normalised(images.flatten(0, 1)).to(self.dino.dtype).unbind()
         seen = self.dino(for_dino).last_hidden_state[:, self.n_prefix_tokens :]
         features = torch.cat([seen, self.siglip(for_siglip).last_hidden_state], dim=-1)

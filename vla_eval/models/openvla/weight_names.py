@@ -50,12 +50,9 @@ def unused(name: str, sizes: NetworkSizes) -> bool:
 
 
 def to_ours(weights: Mapping[str, Tensor], sizes: NetworkSizes) -> dict[str, Tensor]:
-    """Return the original's tensors under our names and in our layouts.
+    """Return the original's tensors under our names and in our layouts; the depths say which are not used.
 
-    Args:
-        weights: by the original's names. A name that is not known is kept as it is, for whoever loads
-            the result to refuse it.
-        sizes: of the network, whose depths say what is not used.
+    A name that is not known is kept as it is: loading the result refuses it.
     """
     ours: dict[str, Tensor] = {}
     for name, tensor in weights.items():

@@ -17,8 +17,10 @@ from vla_eval.models.sequence.sizes import (
     HEADS,
     TOKENS,
     TransformerXLOptions,
+    encoder_stages,
     options_of,
 )
+from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, LANGUAGE, Stage, Stages, image_shape
 
 TYPE = "mikasa_sequence"
 
@@ -110,11 +112,7 @@ class MikasaSequenceConfig(EpisodeConfig):
         return self.target_return
 
     def fit_to_rewards(self, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Take the target return from a dataset, where it is not given.
-
-        Args:
-            columns: field -> (N,) of the dataset's frames.
-        """
+        """Take the target return from a dataset's frames, by field (N,), where it is not given."""
         key = REWARD_KEY if self.reward == "dense" else SUCCESS_KEY
         if self.reward is None or self.target_return is not None or key not in columns:
             return
@@ -147,3 +145,17 @@ class MikasaSequenceConfig(EpisodeConfig):
             )
         if self.reward == "sparse" and self.target_return is None:
             self.target_return = 1.0
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the places and steps of a sample that pass through each."""
+    n_steps = config.window_steps or EPISODE_STEPS
+    # Decision Transformer reads its window again at every step.
+    n_reads = config.context_steps if config.core == "decision_transformer" else 1
+    nature = config.encoder.startswith("nature")
+    return (
+        *encoder_stages(image_shape(config)[-1], n_steps, nature=nature),
+        Stage(r"network\.core\.", n_steps * config.tokens_per_step * n_reads, LANGUAGE),
+        Stage(r"network\.sentence\.", 1, HEAD),
+        Stage(r"network\.", n_steps, HEAD),
+    )

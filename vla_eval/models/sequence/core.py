@@ -2,6 +2,10 @@
 
 Every core answers a token from that token and those before it alone. It gives the same answers, up to
 rounding, whether it is given the tokens of an episode at once or one after the other.
+
+What cores and their layers are made from has the same name everywhere: `width` of tokens, `layers` one above
+the other, `heads` of attention, `dropout` of the outputs of sublayers (and of tokens), `attention_dropout` of
+attention's weights, `segment`: tokens of a segment, `options`: the other sizes.
 """
 
 import abc

@@ -40,15 +40,7 @@ class PerStep(Core):
 
 
 class Recurrent(Core):
-    """torch's GRU or LSTM, whose state is the memory.
-
-    Args:
-        kind: `nn.GRU` or `nn.LSTM`.
-        width: of tokens and states.
-        layers: one above the other.
-        dropout: between them.
-        options: how it remembers.
-    """
+    """torch's GRU or LSTM (`kind`), whose state is the memory; dropout is between its layers."""
 
     def __init__(
         self,
@@ -93,13 +85,6 @@ class CausalTransformer(Core):
     The memory is the tokens that were read, not what the layers made of them: reading all of them again at
     each step costs little beside the images, and needs no code of ours in the layers. A layer sees the
     last `context_steps` steps of the one below, so that the memory is so much longer where there are more.
-
-    Args:
-        width: of tokens.
-        layers: one above the other.
-        heads: of attention.
-        context_steps: steps, the newest among them, that a layer sees; older ones are forgotten.
-        dropout: of torch's layers.
     """
 
     frequencies: Tensor
@@ -160,17 +145,10 @@ def make_core(
     tokens_per_step: int = 1,
     given: Mapping[str, Any] | None = None,
 ) -> Core:
-    """Return the core of that name in `CORES`.
+    """Return the core of that name in `CORES`; see `core` for the sizes.
 
-    Args:
-        name: of the core.
-        width: of tokens.
-        layers: one above the other.
-        heads: of attention.
-        context_steps: that a layer of a transformer sees, or that are in a segment.
-        dropout: of the core.
-        tokens_per_step: tokens of a step.
-        given: fields of the core's options that differ from its row.
+    A layer of a transformer sees `context_steps` steps of `tokens_per_step` tokens, or a segment has so many.
+    `given`: fields of the core's options that differ from its row.
     """
     options, n_tokens = options_of(name, given or {}), context_steps * tokens_per_step
     stack: dict[str, Any] = {"width": width, "layers": layers, "dropout": dropout}

@@ -31,14 +31,7 @@ EMPTY = -1  # when a slot was written that never was
 
 
 class CrossAttention(nn.Module):
-    """Attention of queries to keys with a bias for each pair and head.
-
-    Args:
-        width: of tokens.
-        heads: of attention.
-        dropout: of what is returned.
-        attention_dropout: of the weights.
-    """
+    """Attention of queries to keys with a bias for each pair and head."""
 
     def __init__(self, *, width: int, heads: int, dropout: float, attention_dropout: float) -> None:
         super().__init__()
@@ -62,14 +55,7 @@ class CrossAttention(nn.Module):
 
 
 class ElmurLayer(nn.Module):
-    """One layer: tokens read each other, then the slots; then a slot reads the tokens.
-
-    Args:
-        width: of tokens.
-        heads: of attention.
-        dropout: of the outputs of sublayers.
-        options: the other sizes.
-    """
+    """One layer: tokens read each other, then the slots; then a slot reads the tokens."""
 
     def __init__(self, *, width: int, heads: int, dropout: float, options: ElmurOptions) -> None:
         super().__init__()
@@ -105,13 +91,8 @@ class ElmurLayer(nn.Module):
     ) -> Tensor:
         """Return tokens (B, T, W) after they have read each other and the slots (B, S, W).
 
-        Args:
-            tokens: (B, T, W).
-            slots: (B, S, W).
-            apart: see `RelativeAttention`.
-            allowed: (1, T, T).
-            lag: (B, T, S) tokens between a token and when a slot was written.
-            biases: of self-attention.
+        `lag` (B, T, S): tokens between a token and when a slot was written. `allowed`: (1, T, T). For the
+        others, see `RelativeAttention`.
         """
         norms = self.norms
         tokens = norms["attention"](tokens + self.attention(tokens, tokens, apart, allowed, biases))
@@ -132,16 +113,7 @@ class ElmurLayer(nn.Module):
 
 
 class Elmur(Segmented):
-    """See the module's text.
-
-    Args:
-        width: of tokens.
-        layers: one above the other.
-        heads: of attention.
-        dropout: of tokens and of the outputs of sublayers.
-        segment: tokens of a segment.
-        options: the other sizes.
-    """
+    """See the module's text."""
 
     empty_slots: Tensor
 

@@ -23,11 +23,6 @@ class Nature(nn.Sequential):
 
     Sizes: Mnih et al. 2015, as in https://github.com/CognitiveAISystems/RATE (commit 5aa88f0, image encoder
     of the MIKASA-Robo configurations), which has both cameras as six channels.
-
-    Args:
-        image_px: height and width of an image.
-        outputs: numbers that are returned.
-        channels: of an image.
     """
 
     def __init__(self, *, image_px: int, outputs: int, channels: int = RGB) -> None:
@@ -100,11 +95,6 @@ class Keypoints(nn.Module):
 
     Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies", section 5.1; the strength, which
     says whether the feature is in the image at all, is ours.
-
-    Args:
-        image_px: height and width of an image, a multiple of 4.
-        outputs: numbers that are returned.
-        features: a name of `FEATURES`.
     """
 
     places: Tensor

@@ -12,14 +12,7 @@ from torch.nn import functional
 
 
 class Experts(nn.Module):
-    """See the module's text.
-
-    Args:
-        width: of tokens.
-        inner_width: of an expert.
-        experts: from which one is chosen.
-        dropout: inside of experts and of what is returned.
-    """
+    """See the module's text; one of `experts` is chosen, each of them `inner_width` wide."""
 
     def __init__(self, *, width: int, inner_width: int, experts: int, dropout: float) -> None:
         super().__init__()

@@ -15,13 +15,7 @@ from vla_eval.models.sequence.sizes import MambaOptions
 
 
 class MambaLayer(nn.Module):
-    """A block of Mamba and two layers for each token, each added to the stream.
-
-    Args:
-        width: of tokens.
-        dropout: of the layers for each token.
-        options: sizes of the block.
-    """
+    """A block of Mamba and two layers for each token, each added to the stream."""
 
     def __init__(self, *, width: int, dropout: float, options: MambaOptions) -> None:
         super().__init__()
@@ -57,14 +51,7 @@ class MambaLayer(nn.Module):
 
 
 class DecisionMamba(Core):
-    """See the module's text.
-
-    Args:
-        width: of tokens.
-        layers: one above the other.
-        dropout: of tokens and of the layers for each token.
-        options: sizes of the blocks.
-    """
+    """See the module's text."""
 
     def __init__(self, *, width: int, layers: int, dropout: float, options: MambaOptions) -> None:
         super().__init__()

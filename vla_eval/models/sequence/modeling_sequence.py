@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.features import STATE_KEY
-from vla_eval.models.episodes.eef_state import POSITION_SCALE, SPACE
+from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
 from vla_eval.models.episodes.policy import EpisodePolicy
 from vla_eval.models.episodes.returns import returns_to_go, rewards_in
 from vla_eval.models.episodes.samples import (
@@ -63,11 +63,7 @@ class Demonstrated(NamedTuple):
 
 
 class SequenceNetwork(nn.Module):
-    """Encoders of images, tokens for each step, a core over the tokens, a head.
-
-    Args:
-        config: sizes and names of the parts.
-    """
+    """Encoders of images, tokens for each step, a core over the tokens, a head."""
 
     def __init__(self, config: MikasaSequenceConfig) -> None:
         super().__init__()
@@ -106,12 +102,9 @@ class SequenceNetwork(nn.Module):
         return (*self.core.begin(n_episodes), nothing)
 
     def tokens(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Tensor:
-        """Return (B, T, width) of what is seen.
+        """Return (B, T, width) of what is seen in images (B, T, cameras, 3, H, W), in [0, 1] or bytes.
 
-        Args:
-            images: (B, T, cameras, 3, H, W) in [0, 1], or bytes.
-            state: (B, T, state).
-            said: (B, T, width) by `sentence`; None where no instruction is read.
+        `said`: (B, T, width) by `sentence`; None where no instruction is read.
         """
         return self._told(self.encoders(images), state, said)
 
@@ -123,11 +116,9 @@ class SequenceNetwork(nn.Module):
 
     @in_float32
     def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
-        """Return the core's answers (B, T, width) to the observations of whole demonstrations.
+        """Return the core's answers (B, T, width) to the observations' tokens of whole demonstrations.
 
-        Args:
-            tokens: (B, T, width) of the observations.
-            demonstrated: what the other tokens are made of, if there are others.
+        `demonstrated`: what the other tokens are made of, if there are others.
         """
         begun = self.core.begin(len(tokens))
         if demonstrated is None:

@@ -34,15 +34,7 @@ class RelativeBiases(nn.Module):
 
 
 class RelativeAttention(nn.Module):
-    """Attention of queries to keys, without a residual.
-
-    Args:
-        width: of tokens.
-        heads: of attention.
-        head_width: units of each.
-        dropout: of what is returned.
-        attention_dropout: of the weights.
-    """
+    """Attention of queries to keys, without a residual; dropout of what is returned, and of the weights."""
 
     def __init__(
         self, *, width: int, heads: int, head_width: int, dropout: float, attention_dropout: float
@@ -59,14 +51,10 @@ class RelativeAttention(nn.Module):
     def forward(
         self, queries: Tensor, keys: Tensor, apart: Tensor, allowed: Tensor, biases: RelativeBiases
     ) -> Tensor:
-        """Return (B, Q, W).
+        """Return (B, Q, W) of queries (B, Q, W), which are the last Q of the keys (B, K, W).
 
-        Args:
-            queries: (B, Q, W), the last Q keys.
-            keys: (B, K, W).
-            apart: (1 or B, D, W) of the distances from 1 - Q to K - 1, see `sinusoids`.
-            allowed: (1 or B, Q, K) bool; each query has at least one key.
-            biases: of all layers.
+        `apart` (1 or B, D, W) is of the distances from 1 - Q to K - 1, see `sinusoids`; `allowed` (1 or B, Q,
+        K) leaves each query at least one key.
         """
         n_queries, n_keys = queries.shape[1], keys.shape[1]
         query = self.query(queries).unflatten(-1, self.shape)

@@ -14,13 +14,7 @@ from vla_eval.models.sequence.core import Core, CoreMemory
 
 
 class Segmented(Core):
-    """See the module's text.
-
-    Args:
-        width: of tokens.
-        segment: tokens of a segment.
-        overlap: tokens at a segment's end that the next one begins with.
-    """
+    """See the module's text; a segment begins with the last `overlap` tokens of the one before."""
 
     anchor: Tensor
 

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any  # values of a recipe
 
 from vla_eval.errors import RecipeError, check_names
+from vla_eval.models.shared.stages import VISION, Stage, Stages
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
 
@@ -171,11 +172,7 @@ CORES = {
 
 
 def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
-    """Return the options of a core, with the values that a recipe gives.
-
-    Raises:
-        RecipeError: an option that the core does not have, or a value that it refuses.
-    """
+    """Return the options of a core, with the values that a recipe gives."""
     row, where = CORES[core], f"policy.core_options (core '{core}')"
     known = [field.name for field in fields(row.options) if field.name not in row.fixed]
     check_names("option", given, known, where=where)
@@ -184,11 +181,7 @@ def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderRow:
-    """What has to be known of an image encoder.
-
-    Attributes:
-        shared: one for all cameras, whose images are its channels; else one for each.
-    """
+    """An image encoder: `shared` by all cameras, whose images are its channels, or one for each."""
 
     shared: bool = False
 
@@ -210,6 +203,19 @@ def nature_edges(image_px: int) -> tuple[int, ...]:
         edge = (edge - kernel) // stride + 1
         edges.append(edge)
     return tuple(edges)
+
+
+def encoder_stages(image_px: int, n_images: int, *, nature: bool) -> Stages:
+    """Return the places of an image encoder: `nature`, or keypoints, which read cells of 4 x 4 pixels."""
+    encoder = r"network\.(?:encoder|encoders\.\d+)\."
+    if not nature:
+        places = Stage(encoder + r"features\.", n_images * (image_px // 4) ** 2, VISION)
+        return (places, Stage(encoder + "reads", n_images, VISION))
+    edges = enumerate(nature_edges(image_px))  # a layer of rectified units follows each convolution
+    return (
+        *(Stage(encoder + rf"{2 * index}\b", n_images * edge**2, VISION) for index, edge in edges),
+        Stage(encoder + r"7\b", n_images, VISION),
+    )
 
 
 TOKENS = {"step": 1, "return_observation": 2, "return_observation_action": 3}

@@ -55,11 +55,7 @@ class GruGate(nn.Module):
 class Layer(nn.Module):
     """A layer of the source: its attention adds its input, and so does the layer; both sums are normalised.
 
-    Args:
-        width: of tokens.
-        heads: of attention.
-        dropout: of the outputs of sublayers.
-        options: the other sizes. With `gated`, the order is that of GTrXL: norm, sublayer, ReLU, gate.
+    With `gated`, the order is that of GTrXL: norm, sublayer, ReLU, gate.
     """
 
     def __init__(self, *, width: int, heads: int, dropout: float, options: TransformerXLOptions) -> None:
@@ -111,17 +107,7 @@ class Layer(nn.Module):
 
 
 class TransformerXL(Segmented):
-    """See the module's text.
-
-    Args:
-        width: of tokens.
-        layers: one above the other.
-        heads: of attention.
-        dropout: of tokens and of the outputs of sublayers.
-        segment: tokens of a segment.
-        overlap: tokens that a segment shares with the one before.
-        options: the other sizes.
-    """
+    """See the module's text."""
 
     def __init__(
         self,

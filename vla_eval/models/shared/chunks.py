@@ -40,11 +40,7 @@ class PromptedChunks:
         return self.config.lora_defaults()  # type: ignore[no-any-return]  # lerobot is untyped
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return tokens of the prompts and their mask, (B, tokens) each.
-
-        Raises:
-            SpecMismatchError: one is longer than the policy was made for.
-        """
+        """Return tokens of the prompts and their mask, (B, tokens) each; raise if one is too long."""
         ids = batch[OBS_LANGUAGE_TOKENS]
         if ids.shape[1] > self.config.prompt_max_tokens:
             raise SpecMismatchError(
@@ -54,11 +50,7 @@ class PromptedChunks:
         return ids, batch[OBS_LANGUAGE_ATTENTION_MASK]
 
     def _levels(self, batch: dict[str, Tensor], name: str) -> Tensor:
-        """Return an image (B, 3, H, W) of the batch in levels, 0 to 255.
-
-        Raises:
-            SpecMismatchError: there is no such image.
-        """
+        """Return an image (B, 3, H, W) of the batch, which has to be there, in levels, 0 to 255."""
         if name not in batch:
             raise SpecMismatchError(f"'{self.name}': the batch has no image '{name}'.")
         return (batch[name].float() * MAX_LEVEL).round()

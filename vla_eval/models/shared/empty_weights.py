@@ -36,11 +36,6 @@ def empty_weights() -> Iterator[None]:
             nn.Module._apply = _apply  # type: ignore[method-assign]
 
 
-def has_empty_weights(module: nn.Module) -> bool:
-    """Whether a parameter has no memory yet."""
-    return any(parameter.is_meta for parameter in module.parameters())
-
-
 def _register_empty(self: nn.Module, name: str, param: nn.Parameter | None) -> None:
     _register(self, name, param)
     registered = self._parameters[name]

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 from transformers import DynamicCache
 
 
@@ -28,12 +29,7 @@ class Prefix(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """What was predicted.
-
-    Attributes:
-        tokens: (B, T) int64.
-        logits: (B, T, V) that they were chosen from.
-    """
+    """Tokens (B, T) int64 that were predicted, and the logits (B, T, V) that they were chosen from."""
 
     tokens: Tensor
     logits: Tensor
@@ -64,11 +60,7 @@ def greedy_tokens(
 ) -> Decoded:
     """Return the likeliest token, the likeliest after that, and so on, `n_tokens` of them.
 
-    Args:
-        model: see there.
-        prefix: see there.
-        n_tokens: how many to predict.
-        never: tokens that are not chosen, however likely; the logits that are returned keep them.
+    `never`: tokens that are not chosen, however likely; the logits that are returned keep them.
     """
     lengths, n = prefix.lengths, prefix.embeddings.shape[1]
     cache = DynamicCache()
@@ -83,6 +75,18 @@ def greedy_tokens(
         logits.append(model.logits(hidden))
         tokens.append(_likeliest(logits[-1], never))
     return Decoded(torch.cat(tokens, dim=1), torch.cat(logits, dim=1))
+
+
+def places_from(values: Tensor, first: Tensor, n: int) -> Tensor:
+    """Return (B, n, D): of each row of (B, N, D), n places from `first` (B,) on."""
+    places = first[:, None] + torch.arange(n, device=values.device)
+    return values.take_along_dim(places[..., None], dim=1)
+
+
+def token_cross_entropy(logits: Tensor, wanted: Tensor, weights: Tensor) -> Tensor:
+    """Return the mean of the tokens' losses (B, T) by their weights, of logits (B, T, V)."""
+    losses = functional.cross_entropy(logits.flatten(0, 1), wanted.flatten(), reduction="none")
+    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
 
 
 def _likeliest(logits: Tensor, never: tuple[int, ...]) -> Tensor:

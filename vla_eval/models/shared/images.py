@@ -36,12 +36,7 @@ class Size(NamedTuple):
 
 @in_float32
 def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
-    """Return the images in another size, rounded to whole levels; those of that size are left alone.
-
-    Args:
-        images: (…, 3, H, W) in [0, 255].
-        size: the new one.
-    """
+    """Return images (…, 3, H, W) in another size, in whole levels; those of that size are left alone."""
     if tuple(images.shape[-2:]) == size:
         return images
     return _whole_levels(_resized(images, size))
@@ -49,11 +44,7 @@ def resize_lanczos3(images: Tensor, size: Size) -> Tensor:
 
 @in_float32
 def resize_bicubic(images: Tensor, size: Size) -> Tensor:
-    """Return the images in another size, bit for bit as PIL's BICUBIC does it with whole levels.
-
-    Args:
-        images: (…, 3, H, W) whole levels in [0, 255].
-        size: the new one.
+    """Return images (…, 3, H, W) in whole levels in another size, bit for bit as PIL's BICUBIC does it.
 
     Source: Pillow 12.3.0, src/libImaging/Resample.c: first along the rows, in whole levels between, with
     weights in multiples of 2⁻²².
@@ -71,12 +62,8 @@ def resize_bicubic(images: Tensor, size: Size) -> Tensor:
 def resize_and_centre_crop(images: Tensor, size: Size, area: float) -> Tensor:
     """Resize, then crop the middle, as Octo's evaluation does: levels are rounded and cut once, at the end.
 
-    Lanczos goes beyond [0, 255] at hard edges, so that cutting before the crop gives other numbers.
-
-    Args:
-        images: (B, …, 3, H, W) in [0, 255].
-        size: the new one.
-        area: see `centre_crop`; 1: no crop.
+    Lanczos goes beyond [0, 255] at hard edges, so that cutting before the crop gives other numbers. For
+    `area`, see `centre_crop`; 1: no crop.
 
     Source: https://github.com/octo-models/octo/blob/241fb3514b7c40957a86d869fecb7c7fc353f540/octo/utils/gym_wrappers.py#L255
     """
@@ -137,11 +124,9 @@ class Boxes(NamedTuple):
 
 @in_float32
 def crop_and_resize(images: Tensor, boxes: Boxes) -> Tensor:
-    """Return the crops (B, …, 3, H, W), enlarged to the images' own size, bilinear, corners aligned.
+    """Return the crops (B, …, 3, H, W) of boxes, one for each of the B, enlarged to the images' own size.
 
-    Args:
-        images: (B, …, 3, H, W) of any range.
-        boxes: one for each of the B.
+    Bilinear, corners aligned.
     """
     n, (height, width) = len(images), images.shape[-2:]
     rows = _crop_weights(boxes.top, boxes.height, height)
@@ -218,12 +203,7 @@ class Augmentation:
 
 @in_float32
 def augment(images: Tensor, spec: Augmentation) -> Tensor:
-    """Return changed images; draws from torch's global generator, which the training loop seeds.
-
-    Args:
-        images: (B, T, 3, H, W) in [0, 255].
-        spec: what to change by how much.
-    """
+    """Return changed images (B, T, 3, H, W); draws from torch's global generator, which the loop seeds."""
     n = len(images)
     if spec.crop_area is not None:
         images = crop_and_resize(images, _random_boxes(n, spec, images.device))

@@ -14,11 +14,13 @@ from lerobot.processor import (
 )
 
 from vla_eval.errors import MissingInstructionError
-from vla_eval.models.shared.byte_tokenizer import BYTE_TOKENIZER, byte_tokenizer
 from vla_eval.models.shared.normalization import Normalization
 from vla_eval.models.shared.processor_steps import DecoderStep, EncoderStep
 
 TASK = "task"
+BYTE_TOKENIZER = "bytes"
+"""`tokenizer_name` of it in a recipe: one token per byte."""
+BYTE_SPECIAL = ("<pad>", "<s>", "</s>")  # tokens 0, 1 and 2: padding, begin and end of a text
 
 
 @dataclass
@@ -88,3 +90,23 @@ def language_processors(
         ],
     )
     return processors
+
+
+def byte_tokenizer() -> Any:
+    """Return a tokenizer of one token per byte, which begins each text with `<s>`: for tiny models."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
+    from transformers import PreTrainedTokenizerFast
+
+    pad, bos, eos = BYTE_SPECIAL
+    symbols: list[str] = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {symbol: index for index, symbol in enumerate([*BYTE_SPECIAL, *symbols])}
+    tokenizer: Any = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single=f"{bos} $A", special_tokens=[(bos, vocabulary[bos])]
+    )
+    make_fast: Any = PreTrainedTokenizerFast
+    return make_fast(
+        tokenizer_object=tokenizer, pad_token=pad, bos_token=bos, eos_token=eos, padding_side="right"
+    )

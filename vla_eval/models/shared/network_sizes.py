@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any  # lerobot's configurations
 
 from vla_eval.errors import RecipeError, check_names
 
@@ -36,13 +37,14 @@ class VisionSizes:
         return (self.image_px // self.patch_px) ** 2
 
 
-def with_changes[T: VisionSizes](published: type[T], changes: Mapping[str, int]) -> T:
-    """Return the published sizes, which are the defaults, with some of them changed.
+def sizes_from[S](sizes: type[S], config: Any, **others: Any) -> S:
+    """Return sizes that a configuration has under the same names, and others."""
+    names = {field.name for field in dataclasses.fields(sizes)} - others.keys()  # type: ignore[arg-type]
+    return sizes(**{name: getattr(config, name) for name in names}, **others)
 
-    Raises:
-        UnknownNameError: there is no such size.
-        RecipeError: a value is impossible.
-    """
+
+def with_changes[T: VisionSizes](published: type[T], changes: Mapping[str, int]) -> T:
+    """Return the published sizes, which are the defaults, with some of them changed by name."""
     known = [field.name for field in dataclasses.fields(published)]
     check_names("size", changes, known, where="finetune.policy.sizes")
     return published(**changes)

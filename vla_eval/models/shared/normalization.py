@@ -58,15 +58,10 @@ class Normalization:
 
 
 class Normalizer:
-    """A `Normalization` with its statistics.
-
-    Args:
-        spec: how.
-        statistics: name -> one number per dimension.
-        where: the field and where the statistics came from, for messages.
+    """A `Normalization` with its statistics: name -> one number per dimension.
 
     Raises:
-        CheckpointError: a statistic is missing, of another size, or not finite.
+        CheckpointError: a statistic is missing, of another size, or not finite; `where` is in the message.
     """
 
     def __init__(self, spec: Normalization, statistics: Mapping[str, Any], *, where: str) -> None:

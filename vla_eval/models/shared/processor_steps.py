@@ -149,11 +149,7 @@ class DecoderStep(_Statistics):
 
 
 def check_gripper_mask(action: Normalization | None, gripper: Gripper) -> None:
-    """Refuse to normalise a gripper that is not ManiSkill's: the dataset's statistics are of that one.
-
-    Raises:
-        RecipeError: the gripper is encoded and normalised.
-    """
+    """Raise `RecipeError` if a gripper is normalised that is not ManiSkill's, which the statistics are of."""
     if action is not None and action.mask[gripper.dim] and gripper.encoding != "maniskill":
         raise RecipeError(
             f"the gripper is encoded as '{gripper.encoding}' and normalised with statistics of ManiSkill's "

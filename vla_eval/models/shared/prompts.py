@@ -20,11 +20,7 @@ class Prompts(NamedTuple):
 
 
 def instruction_words(instruction: str, *, model: str) -> str:
-    """Return the instruction in lower case, as both originals have it.
-
-    Raises:
-        MissingInstructionError: it is empty.
-    """
+    """Return the instruction, which must not be empty, in lower case, as both originals have it."""
     words = instruction.strip().lower()
     if not words:
         raise MissingInstructionError(f"{model} needs an instruction, found an empty one.")

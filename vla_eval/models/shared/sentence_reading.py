@@ -46,11 +46,7 @@ class SentenceReading:
 
 
 def from_wire(sentence: str, said: object, *, where: str) -> SentenceReading:
-    """Return what a server has said of a sentence.
-
-    Raises:
-        RemoteReplyError: it is of another form.
-    """
+    """Return what a server reports of a sentence; raise `RemoteReplyError` if it has another form."""
     if isinstance(said, Mapping) and said.keys() == {"ids", "n_tokens", "limit", "kept"}:
         ids, n_tokens, limit, kept = (said[name] for name in ("ids", "n_tokens", "limit", "kept"))
         is_list = isinstance(ids, list) and len(ids) <= MAX_TOKENS
@@ -75,11 +71,7 @@ class ReadingPolicy(Protocol):
 
 
 class SentenceWatch:
-    """Says once of each sentence that it was cut, and once of two tasks that they became one sentence.
-
-    Args:
-        policy: name of the policy, for the lines.
-    """
+    """Reports once of each sentence that it was cut, and once of two tasks that they became one sentence."""
 
     def __init__(self, policy: str) -> None:
         self._policy = policy
@@ -88,11 +80,9 @@ class SentenceWatch:
         self._said: set[frozenset[str]] = set()
 
     def lines(self, reading: SentenceReading, task: str) -> list[str]:
-        """Return what is to be said of a sentence and has not been said.
+        """Return what is to be reported of a sentence of a task and has not been.
 
-        Args:
-            reading: of the sentence.
-            task: id of its task; empty if it is not known: then each sentence is a task of its own.
+        A task that is not known has an empty id: then each sentence is a task of its own.
         """
         said = []
         alike = self._alike.setdefault(reading.ids, [])

@@ -12,10 +12,7 @@ LAYER_NORM_EPS = 1e-6
 def siglip(sizes: VisionSizes, *, n_blocks: int, activation: str) -> Any:
     """Return the encoder with random weights, without its pooling head.
 
-    Args:
-        sizes: of all but its depth.
-        n_blocks: its depth.
-        activation: transformers' name of the blocks' activation.
+    `n_blocks` is its depth, `activation` transformers' name of the blocks' activation.
     """
     config: Any = SiglipVisionConfig
     model: Any = SiglipVisionModel(

@@ -20,13 +20,8 @@ _SAVED = re.compile(r"^(?P<module>.+)\.modules_to_save\.[^.]+\.(?P<rest>.+)$")
 def matching(names: Iterable[str], patterns: Sequence[str], *, what: str) -> tuple[str, ...]:
     """Return the names that a pattern matches as a whole.
 
-    Args:
-        names: of parameters or modules.
-        patterns: regular expressions; each has to match something.
-        what: the field, for messages.
-
     Raises:
-        TrainingError: a pattern is no regular expression, or matches nothing.
+        TrainingError: a pattern is not a regular expression, or matches nothing; `what` is the field.
     """
     known = tuple(names)
     found: dict[str, None] = {}
@@ -45,11 +40,7 @@ def matching(names: Iterable[str], patterns: Sequence[str], *, what: str) -> tup
 
 
 def set_trainable(model: nn.Module, patterns: Sequence[str], *, what: str) -> tuple[str, ...]:
-    """Train just the parameters that a pattern matches; return their names.
-
-    Raises:
-        TrainingError: see `matching`.
-    """
+    """Train just the parameters that a pattern matches, see `matching`; return their names."""
     chosen = set(matching((name for name, _ in model.named_parameters()), patterns, what=what))
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name in chosen)
@@ -62,11 +53,7 @@ def trainable(model: nn.Module) -> tuple[str, ...]:
 
 
 def check_lora_target(target: str | None) -> None:
-    """Refuse a target that names no modules.
-
-    Raises:
-        TrainingError: it is `all-linear`.
-    """
+    """Raise `TrainingError` for a target that names no modules: `all-linear`."""
     if target == ALL_LINEAR:
         raise TrainingError(
             f"finetune.lora.target_modules is '{ALL_LINEAR}', which also takes heads and embeddings of a "

@@ -31,10 +31,7 @@ ALIGNMENT = 8  # bytes; the header is filled up with spaces
 
 
 class WeightFile(Mapping[str, Tensor]):
-    """The tensors of a file by name; each access reads one.
-
-    Args:
-        path: of the file; its header is read and checked at once.
+    """The tensors of a file by name; each access reads one. Its header is read and checked at once.
 
     Raises:
         CheckpointError: it is missing or damaged, or has a type of numbers that no policy has.

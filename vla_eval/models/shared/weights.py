@@ -77,18 +77,10 @@ def check_fit(
 ) -> dict[str, str]:
     """Compare names, shapes and types of tensors with the policy's; read no values.
 
-    Args:
-        policy: see `put_weights`, as the others.
-        weights: by name.
-        where: for messages.
-        cast: whether types may differ.
-        may_be_new: what may be missing.
+    The arguments and the errors are those of `put_weights`.
 
     Returns:
         Name in the policy -> name in the weights.
-
-    Raises:
-        CheckpointError: keys are missing or unexpected, or shapes or types differ.
     """
     wanted: dict[str, Tensor] = dict(policy.state_dict(keep_vars=True))
     described = describe(weights)
@@ -109,13 +101,9 @@ def check_fit(
 def check_same(
     actual: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, where: str, partial: bool = False
 ) -> None:
-    """Raise `CheckpointError` unless the tensors are those of the file, all finite.
+    """Raise `CheckpointError` unless a model's tensors are those of the file, in its type, and all finite.
 
-    Args:
-        actual: what the model holds.
-        expected: what the file holds; compared in the model's type.
-        where: the file, for messages.
-        partial: whether the model may hold more.
+    If `partial`, the model may hold more.
     """
     problems = {
         "missing": [] if partial else [key for key in actual if key not in expected],

@@ -43,11 +43,7 @@ class Gaussian(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionGrid:
-    """Edges of the bins of each axis, ascending, in the order of `AXES`.
-
-    Attributes:
-        edges: for each axis one more than it has bins.
-    """
+    """Edges of the bins of each axis, ascending, in the order of `AXES`; one more than there are bins."""
 
     edges: tuple[tuple[float, ...], ...]
 
@@ -98,11 +94,7 @@ def gaussian_grid(gaussians: Mapping[str, Gaussian], n_bins: Sequence[int]) -> A
 
 
 def fitted_gaussians(actions: Tensor) -> dict[str, Gaussian]:
-    """Return mean and standard deviation of each axis over normalised actions.
-
-    Args:
-        actions: (N, 7) normalised; the gripper is not looked at.
-    """
+    """Return mean and standard deviation of each axis over normalised actions (N, 7), gripper aside."""
     if not len(actions):
         raise RecipeError("an action grid is fitted to the actions of a dataset, found none.")
     spherical = to_spherical(actions[:, TRANSLATION].double().clamp(-1, 1))

@@ -23,10 +23,7 @@ GRIPPER_THRESHOLD = 0.5  # open from here on
 def to_tokens(actions: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
     """Return the tokens (…, 3) int64 of normalised actions (…, 7); what is beyond [-1, 1] is cut.
 
-    Args:
-        actions: x, y, z, roll, pitch, yaw, gripper (0 to 1).
-        grid: where the bins lie.
-        sizes: numbers of tokens.
+    An action is x, y, z, roll, pitch, yaw, gripper (0 to 1).
     """
     assert actions.shape[-1] == N_ACTION
     bounded = actions.double().clamp(-1, 1)
@@ -42,12 +39,7 @@ def to_tokens(actions: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
 def from_tokens(tokens: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
     """Return normalised actions (…, 7), float64: the middles of the bins, translations cut to [-1, 1].
 
-    A token that is none of its column's is taken for the column's nearest.
-
-    Args:
-        tokens: (…, 3).
-        grid: where the bins lie.
-        sizes: numbers of tokens.
+    A token (…, 3) that is none of its column's is taken for the column's nearest.
     """
     limits = torch.tensor([sizes.n_translations, sizes.n_rotations, 2], device=tokens.device) - 1
     places = tokens - first_tokens(sizes, tokens.device)

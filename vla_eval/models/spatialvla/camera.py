@@ -15,13 +15,7 @@ from vla_eval.models.shared.precision import in_float32
 def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
     """Return the matrix (3, 3), float32, of a pinhole camera with square pixels and a centred axis.
 
-    Args:
-        height_px: of its images.
-        width_px: of its images.
-        fov_rad: vertical field of view, as ManiSkill declares it.
-
-    Raises:
-        RecipeError: the field of view is impossible.
+    `fov_rad`: vertical field of view, as ManiSkill declares it.
     """
     if not 0 < fov_rad < math.pi:
         raise RecipeError(f"camera_fov_rad is {fov_rad}, expected radians in (0, π).")

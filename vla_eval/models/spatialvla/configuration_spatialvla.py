@@ -17,32 +17,50 @@ from vla_eval.features import ACTION_KEY, CAMERA_KEYS
 from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalizer
 from vla_eval.models.shared.ported_config import PromptedConfig
+from vla_eval.models.shared.stages import (
+    HEAD,
+    LANGUAGE,
+    PATCHES,
+    PROMPT_TOKENS,
+    VISION,
+    Stage,
+    Stages,
+    n_images,
+)
 from vla_eval.models.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,
     gaussian_grid,
     uniform_grid,
 )
-from vla_eval.models.spatialvla.lora import LORA_TARGETS, SPATIAL_EMBEDDINGS
 from vla_eval.models.spatialvla.sizes import (
     ATTENTIONS,
     N_ACTION,
+    TOKENS_PER_ACTION,
     Attention,
     NetworkSizes,
 )
 
 TYPE = "mikasa_spatialvla"
 GRIDS = ("refitted", "kept", "uniform")
+# What LoRA trains of SpatialVLA, by name. The original names ends of modules (`q_proj`, `out_proj`,
+# `linear` …) in the whole model, which also hits the `out_proj` of four blocks of the frozen depth model;
+# here whole names are given, and none of those. Source: scripts/spatialvla_4b_finetune/finetune_lora.sh and
+# train/spatialvla_finetune.py of the original at
+# https://github.com/SpatialVLA/SpatialVLA/tree/e48075326a92116adaaf1232cf01471f15f09a73.
+_SIGLIP = r"vision\.encoder\.layers\.\d+\.(self_attn\.(q_proj|k_proj|v_proj|out_proj)|mlp\.fc[12])"
+_GEMMA = r"llm\.layers\.\d+\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+_PLACES = r"position_embedding_3d\.position_embedding_head\.[03]"
+LORA_TARGETS = rf"network\.({_SIGLIP}|{_GEMMA}|{_PLACES}|projector)"
+"""Regular expression of the modules that get an adapter; it has to match a whole name."""
+SPATIAL_EMBEDDINGS = "spatial_embed_tokens"
+"""Module that is trained in full beside the adapters, if it is asked for; the original leaves it as it is."""
 
 
 @LRSchedulerConfig.register_subclass("mikasa_linear_decay")
 @dataclass
 class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lerobot is untyped
-    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step.
-
-    Attributes:
-        num_warmup_steps: how long it rises.
-    """
+    """Rises from nothing for some steps, then falls in a straight line to nothing at the last step."""
 
     num_warmup_steps: int | None = 0
 
@@ -145,9 +163,6 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         Args:
             actions: (N, 7) of all frames, as the environment takes them.
             statistics: of the dataset's actions.
-
-        Raises:
-            RecipeError: the base's grid is to be kept, and there is none.
         """
         base, self.base_grid = self.grid, []
         if self.action_grid == "kept":
@@ -168,11 +183,7 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         self.grid, self.base_grid = [list(edges) for edges in chosen.edges], base
 
     def current_grid(self) -> ActionGrid:
-        """Return where the bins lie.
-
-        Raises:
-            RecipeError: it is not set, or it has other bins than the network has tokens.
-        """
+        """Return where the bins lie; raise `RecipeError` if that is not set, or for other tokens."""
         if not self.grid:
             raise RecipeError(
                 f"'{TYPE}': there is no action grid. A fine-tuning sets it (action_grid), and so does "
@@ -201,3 +212,17 @@ class MikasaSpatialVLAConfig(PromptedConfig):
     def get_scheduler_preset(self) -> Any:
         """Return the configuration of the schedule."""
         return LinearDecaySchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+
+ZOE_PATCHES = 577  # of 384 px in patches of 16, and the class token
+
+
+def network_stages(config: Any) -> Stages:
+    """Return the parts of the network, and the tokens of a sample that pass through each."""
+    images, actions = n_images(config), TOKENS_PER_ACTION * config.chunk_size
+    return (
+        Stage(r"lm_head", actions, HEAD),
+        Stage(r"depth\.", images * ZOE_PATCHES, VISION - 1),
+        Stage(r"vision|projector|position", images * PATCHES, VISION),
+        Stage(r"\.llm\.", images * PATCHES + PROMPT_TOKENS + actions, LANGUAGE),
+    )

@@ -49,11 +49,7 @@ class DepthModel(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Tensor) -> Tensor:
-        """Return depth (N, depth_px, depth_px), float32, of the padded images.
-
-        Args:
-            images: (N, 3, H, W) in [0, 1].
-        """
+        """Return depth (N, depth_px, depth_px), float32, of images (N, 3, H, W) in [0, 1], padded."""
         shown = shown_images(images, self.size_px).to(self.zoe.dtype)
         answer = self.zoe(shown)
         votes = answer.domain_logits.argmax(dim=-1)

@@ -31,12 +31,7 @@ class Ego3DEncoding(nn.Module):
         )
 
     def forward(self, depth: Tensor, matrices: Tensor) -> Tensor:
-        """Return (N, P, D).
-
-        Args:
-            depth: (N, H, W) metres, H = W = image_px.
-            matrices: (N, 3, 3) of images of that size.
-        """
+        """Return (N, P, D) of depth (N, image_px, image_px) in metres and matrices (N, 3, 3)."""
         encoded = frequencies(patch_points(depth, matrices, self.sizes))
         first: nn.Linear = self.position_embedding_head[0]  # type: ignore[assignment]  # of a Sequential
         answer: Tensor = self.position_embedding_head(encoded.to(first.weight.dtype))
@@ -55,12 +50,9 @@ def patch_points(depth: Tensor, matrices: Tensor, sizes: NetworkSizes) -> Tensor
 
 @in_float32
 def frequencies(points: Tensor) -> Tensor:
-    """Return (…, 204): each coordinate, centred and scaled, its sines and its cosines, one after the other.
+    """Return (…, 204) of points (…, 12) in metres: each coordinate, centred and scaled, its sines, cosines.
 
     In float32 whatever the network's precision: bfloat16 has no digits left of the fastest ones.
-
-    Args:
-        points: (…, 12) metres.
     """
     centre = torch.tensor(CENTRE_M * (points.shape[-1] // 3), device=points.device)
     coordinates = (points - centre) / SCALE_M

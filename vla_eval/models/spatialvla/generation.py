@@ -6,9 +6,8 @@ are predicted, and only their columns' tokens are taken for it (`action_tokens.f
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from vla_eval.models.shared.greedy import Decoded, Prefix, greedy_tokens
+from vla_eval.models.shared.greedy import Decoded, Prefix, greedy_tokens, places_from, token_cross_entropy
 from vla_eval.models.spatialvla.action_grid import ActionGrid
 from vla_eval.models.spatialvla.action_tokens import from_tokens, to_tokens
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
@@ -23,38 +22,25 @@ def token_loss(
     counts: Tensor,
     attention: Attention,
 ) -> Tensor:
-    """Return the mean cross-entropy of the action tokens and of stop.
+    """Return the mean cross-entropy of the tokens of actions (B, K, 7), gripper 0 to 1, and of stop.
 
-    Args:
-        network: see there.
-        grid: where the bins lie.
-        inputs: see there.
-        actions: (B, K, 7) normalised, with the gripper 0 to 1.
-        counts: (B, K) float, 0 for actions that are left out; stop counts as the last action does.
-        attention: what the prefix attends to.
+    `counts` (B, K) is 0 for actions that are left out; stop counts as the last action does.
     """
     ids = to_tokens(actions, grid, network.sizes).flatten(1)
     sequence = network.sequence(inputs, ids)
-    hidden = network.hidden(sequence, attention)
     # A token is predicted at the place before it.
-    places = sequence.first_action[:, None] - 1 + torch.arange(ids.shape[1] + 1, device=ids.device)
-    logits = network.logits(hidden.take_along_dim(places[..., None], dim=1))
+    hidden = places_from(network.hidden(sequence, attention), sequence.first_action - 1, ids.shape[1] + 1)
     wanted = torch.cat([ids, torch.full_like(ids[:, :1], network.sizes.stop_token)], dim=1)
     weights = torch.cat([counts.repeat_interleave(TOKENS_PER_ACTION, dim=1), counts[:, -1:]], dim=1)
-    losses = functional.cross_entropy(logits.flatten(0, 1), wanted.flatten(), reduction="none")
-    return (losses * weights.flatten()).sum() / weights.sum().clamp(min=1)
+    return token_cross_entropy(network.logits(hidden), wanted, weights)
 
 
 def generated_tokens(
     network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention
 ) -> Decoded:
-    """Return the tokens (B, 3 · K) of a chunk; stop is never predicted, whatever is likeliest.
+    """Return the tokens (B, 3 · chunk) of a chunk; stop is never predicted, whatever is likeliest.
 
-    Args:
-        network: see there.
-        inputs: see there; prompts of several lengths go together.
-        chunk: K.
-        attention: what the prefix attends to; padding is attended to in no case.
+    Prompts of several lengths go together; padding is attended to in no case.
     """
     if attention == "bidirectional_with_padding":
         attention = "bidirectional"

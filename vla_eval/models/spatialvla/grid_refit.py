@@ -18,11 +18,6 @@ from vla_eval.models.spatialvla.action_grid import ROTATION, TRANSLATION, Action
 def refitted(table: Tensor, old: ActionGrid, new: ActionGrid) -> Tensor:
     """Return the table (tokens, D) of the new grid, in the type of the old one.
 
-    Args:
-        table: rows of translations, rotations and the two grippers.
-        old: the grid of these rows.
-        new: with as many bins.
-
     Raises:
         RecipeError: the grids have other numbers of bins.
     """

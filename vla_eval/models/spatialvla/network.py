@@ -104,9 +104,6 @@ class SpatialVLANetwork(nn.Module):
         Args:
             inputs: see there.
             action_ids: (B, 3 · K) tokens of the actions, then stop follows; None: nothing follows.
-
-        Raises:
-            SpecMismatchError: it is longer than Gemma's windows.
         """
         patches = self.image_features(inputs)
         lengths, text = inputs.prompts.mask.sum(dim=1), inputs.prompts.ids

@@ -14,11 +14,7 @@ END = "\n"
 
 
 def prompt_text(instruction: str) -> str:
-    """Return the prompt of an instruction.
-
-    Raises:
-        MissingInstructionError: there are no words.
-    """
+    """Return the prompt of an instruction."""
     return f"{instruction_words(instruction, model='SpatialVLA')}{END}"
 
 

@@ -11,8 +11,8 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.features import CAMERA_KEYS
-from vla_eval.models.vla_memory.fields import SampleMemory, Segments, place_fields
-from vla_eval.models.vla_memory.frame_choice import FrameChoice
+from vla_eval.models.shared.earlier_frames import SampleMemory, Segments, place_fields
+from vla_eval.models.shared.frame_choice import FrameChoice
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
 MAX_PLACES, MAX_TOKENS = 64, 4096  # each place is an image of the prefix, up to 256 tokens
@@ -41,8 +41,6 @@ class VlaMemoryConfig:
         window_steps: length of the longest episode in training, with tokens; our `finetune` sets it.
     """
 
-    wraps: ClassVar[str]
-    """lerobot's type of the policy that gets the memory."""
     masks_padding: ClassVar[bool]
 
     memory_places: int = 0
@@ -94,8 +92,7 @@ class VlaMemoryConfig:
     def n_passes(self, window_steps: int) -> tuple[int, int]:
         """Return how many frames of a sample pass through the model: without a gradient, and with one.
 
-        Args:
-            window_steps: of the longest episode, if the configuration does not say it.
+        `window_steps`: of the longest episode, if the configuration does not say it.
         """
         if not self.memory_tokens:
             return 0, 1
@@ -136,7 +133,6 @@ def _n_segments(window_steps: int, stride: int) -> int:
 class MikasaSmolVLAConfig(VlaMemoryConfig, SmolVLAConfig):  # type: ignore[misc]  # lerobot is untyped
     """SmolVLA with memory."""
 
-    wraps: ClassVar[str] = "smolvla"
     masks_padding: ClassVar[bool] = True
 
 
@@ -145,7 +141,6 @@ class MikasaSmolVLAConfig(VlaMemoryConfig, SmolVLAConfig):  # type: ignore[misc]
 class MikasaPI0Config(VlaMemoryConfig, PI0Config):  # type: ignore[misc]  # lerobot is untyped
     """π0 with memory."""
 
-    wraps: ClassVar[str] = "pi0"
     masks_padding: ClassVar[bool] = False
 
 
@@ -154,5 +149,4 @@ class MikasaPI0Config(VlaMemoryConfig, PI0Config):  # type: ignore[misc]  # lero
 class MikasaPI05Config(VlaMemoryConfig, PI05Config):  # type: ignore[misc]  # lerobot is untyped
     """π0.5 with memory."""
 
-    wraps: ClassVar[str] = "pi05"
     masks_padding: ClassVar[bool] = False

@@ -32,12 +32,7 @@ class TokenMemory(NamedTuple):
 
 
 class MemoryTokens(nn.Module):
-    """The tokens before the first frame, and how they are written.
-
-    Args:
-        n_tokens: how many.
-        width: of the language model.
-    """
+    """The tokens, of the language model's width, before the first frame, and how they are written."""
 
     def __init__(self, n_tokens: int, width: int) -> None:
         super().__init__()
@@ -52,12 +47,7 @@ class MemoryTokens(nn.Module):
         return self.initial.expand(n_episodes, -1, -1)
 
     def forward(self, tokens: Tensor, outputs: Tensor) -> Tensor:
-        """Return the tokens (B, tokens, width) after a pass.
-
-        Args:
-            tokens: that the pass has read.
-            outputs: (B, tokens, width) of the last layer, in their places.
-        """
+        """Return the tokens (B, tokens, width) after a pass that read them, from its last layer's outputs."""
         outputs = self.norm(outputs.to(tokens.dtype))
         kept = self.gate(outputs).sigmoid()
         after: Tensor = kept * tokens + (1 - kept) * self.value(outputs)

@@ -11,12 +11,12 @@ from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from torch import Tensor
 
 from vla_eval.errors import SpecMismatchError
+from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY, mask_field
 from vla_eval.models.vla_memory.configuration_vla_memory import (
     MikasaPI0Config,
     MikasaPI05Config,
     MikasaSmolVLAConfig,
 )
-from vla_eval.models.vla_memory.fields import SEGMENT_PADDING_KEY, mask_field
 from vla_eval.models.vla_memory.memory_tokens import (
     CatchesPrefix,
     MemoryTokens,

@@ -27,6 +27,15 @@ def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArra
     return rows
 
 
+def check_has(condition: bool, context: PolicyContext, does: str, lacks: str) -> None:
+    """Raise `SpecMismatchError` unless the task has what the policy needs."""
+    if not condition:
+        raise SpecMismatchError(
+            f"policy '{context.name}' {does}; {context.env.task} {lacks}. Leave this task out for this "
+            "policy."
+        )
+
+
 def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts have a protocol of their own
     """Return the scripted expert that the catalogue names for the task of the context.
 

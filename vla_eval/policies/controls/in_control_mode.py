@@ -9,7 +9,8 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.translation import translated
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.controls.base import ScriptedPolicy, task_expert
+from vla_eval.policies.controls.base import ScriptedPolicy
+from vla_eval.tasks.catalog import task_spec
 
 JOINT_STATES = ("qpos", "qvel")
 
@@ -60,8 +61,7 @@ def in_any_control_mode(make: ScriptedMaker) -> Callable[[PolicyContext], Script
         if mode == EE_DELTA_POSE:
             return make(context)
         planner = make(replace(context, env=replace(context.env, action=action_spec(EE_DELTA_POSE))))
-        turns_wrist = planner.privileged and getattr(task_expert(context), "turns_wrist", False)
-        if mode == EE_DELTA_POS and turns_wrist:
+        if mode == EE_DELTA_POS and planner.privileged and task_spec(context.env.task).turns_wrist:
             raise SpecMismatchError(
                 f"policy '{context.name}': the expert of {context.env.task} turns the wrist, and the control "
                 f"mode {mode} has no rotation. Choose another env.control_mode, or leave this task out."

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
-from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.controls.base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.policies.controls.base import ScriptedPolicy, check_has, hold_rows, task_expert
 from vla_eval.policies.controls.candidate_controls import (
     CandidateExpert,
     ChoicePolicy,
@@ -32,6 +31,7 @@ from vla_eval.policies.controls.candidate_controls import (
 )
 from vla_eval.policies.controls.in_control_mode import in_any_control_mode
 from vla_eval.task_state import PrivilegedState
+from vla_eval.tasks.catalog import task_spec
 
 
 class BallExpert(Protocol):
@@ -125,11 +125,7 @@ def make_tour(context: PolicyContext) -> ScriptedPolicy:
     Raises:
         SpecMismatchError: the task has no candidates to tour.
     """
-    if context.n_candidates == 0:
-        raise SpecMismatchError(
-            f"policy '{context.name}' touches one candidate after another; {context.env.task} has none. "
-            "Leave this task out for this policy."
-        )
+    check_has(context.n_candidates > 0, context, "touches one candidate after another", "has none")
     return _make_expert_policy(context, "tour")
 
 
@@ -140,18 +136,14 @@ def make_cue_reader(context: PolicyContext) -> ScriptedPolicy:
     Raises:
         SpecMismatchError: the task has no candidates, so that no cue names one.
     """
-    if context.n_candidates == 0:
-        raise SpecMismatchError(
-            f"policy '{context.name}' reads which candidate the cue shows; {context.env.task} has none. "
-            "Leave this task out for this policy."
-        )
+    check_has(context.n_candidates > 0, context, "reads which candidate the cue shows", "has none")
     return _make_expert_policy(context, "cue_reader")
 
 
 def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
     expert = task_expert(context)
-    if hasattr(expert, "plan_visits"):
+    if context.n_candidates == 0:
+        return BallPolicy(context, cast(BallExpertFactory, expert), imagined=mode == "cue_blind")
+    if task_spec(context.env.task).several_right:
         return VisitPolicy(context, cast(VisitExpert, expert), mode)
-    if context.n_candidates > 0:
-        return ChoicePolicy(context, cast(CandidateExpert, expert), mode)
-    return BallPolicy(context, cast(BallExpertFactory, expert), imagined=mode == "cue_blind")
+    return ChoicePolicy(context, cast(CandidateExpert, expert), mode)

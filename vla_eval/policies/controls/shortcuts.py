@@ -28,7 +28,7 @@ from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.controls.base import ScriptedPolicy, hold_rows, task_expert
+from vla_eval.policies.controls.base import ScriptedPolicy, check_has, hold_rows, task_expert
 from vla_eval.policies.controls.candidate_controls import CandidateExpert
 from vla_eval.policies.controls.in_control_mode import in_any_control_mode
 from vla_eval.policies.controls.scripted import BallExpertFactory
@@ -73,11 +73,9 @@ def make_body_memory(context: PolicyContext) -> ScriptedPolicy:
         SpecMismatchError: the task has no candidates, or several have to be touched.
     """
     expert = task_expert(context)
-    if context.n_candidates == 0 or hasattr(expert, "plan_visits"):
-        raise SpecMismatchError(
-            f"policy '{context.name}' keeps in its gripper which one of several candidates is right; "
-            f"{context.env.task} has no such choice. Leave this task out for this policy."
-        )
+    one_is_right = context.n_candidates > 0 and not task_spec(context.env.task).several_right
+    does = "keeps in its gripper which one of several candidates is right"
+    check_has(one_is_right, context, does, "has no such choice")
     return BodyMemoryPolicy(context, cast(CandidateExpert, expert))
 
 
@@ -121,11 +119,8 @@ def make_cue_touch(context: PolicyContext) -> ScriptedPolicy:
     Raises:
         SpecMismatchError: the task has no candidates, so no place where one is shown.
     """
-    if context.n_candidates == 0:
-        raise SpecMismatchError(
-            f"policy '{context.name}' goes to where the cue is shown; {context.env.task} shows none at a "
-            "place of its own. Leave this task out for this policy."
-        )
+    lacks = "shows none at a place of its own"
+    check_has(context.n_candidates > 0, context, "goes to where the cue is shown", lacks)
     return CueTouchPolicy(context)
 
 
@@ -183,12 +178,9 @@ def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
         SpecMismatchError: no ball rolls in the task, and it is not TakeItBack.
     """
     task = task_spec(context.env.task)
+    does = "is for tasks in which a ball rolls and for TakeItBack-v0"
+    check_has(task.seen_in_one_frame is not None, context, does, "is neither")
     if task.seen_in_one_frame == "ball":
         expert = cast(BallExpertFactory, task_expert(context))
         return OneFrameOfBallPolicy(context, expert, task.kwargs["velocity_range_m_s"])
-    if task.seen_in_one_frame == "cube":
-        return OneFrameOfCubePolicy(context)
-    raise SpecMismatchError(
-        f"policy '{context.name}' is for tasks in which a ball rolls and for TakeItBack-v0; "
-        f"{context.env.task} is neither. Leave this task out for this policy."
-    )
+    return OneFrameOfCubePolicy(context)

@@ -9,11 +9,7 @@ from vla_eval.errors import SpecMismatchError
 
 
 def choose_device(device: str) -> str:
-    """Return the device that `auto` means here; anything else is left as it is.
-
-    Raises:
-        SpecMismatchError: a GPU is asked for that is not there.
-    """
+    """Return the device that `auto` means here; raise `SpecMismatchError` for a GPU that is not there."""
     has_cuda = torch.cuda.is_available()
     if device == "auto":
         return "cuda" if has_cuda else "cpu"

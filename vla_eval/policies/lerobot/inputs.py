@@ -65,7 +65,7 @@ class InputMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputOptions:
-    """What a recipe says of the inputs.
+    """The recipe's fields about inputs.
 
     Attributes:
         cameras: camera of the environment -> field of the dataset.
@@ -81,14 +81,7 @@ class InputOptions:
 def input_map(
     loaded_config: Any, preprocessor: Any, options: InputOptions, env: EnvSpec, *, policy: str
 ) -> InputMap:
-    """Return how observations of the environment become inputs of the policy.
-
-    Args:
-        loaded_config: lerobot's configuration of the policy.
-        preprocessor: lerobot's pipeline; what it renames is taken into account.
-        options: what the recipe says.
-        env: what the environment offers.
-        policy: its name, for messages.
+    """Return how observations of an environment become inputs of a policy; what it renames is considered.
 
     Raises:
         SpecMismatchError: a camera, its size, the state or the action does not fit.
@@ -132,13 +125,8 @@ def check_training(
 ) -> None:
     """Compare what the policy saw in training with what it will see.
 
-    Args:
-        facts: what a fine-tuning of ours has noted; None for a checkpoint of another program, of which
-            only what its configuration and statistics say is compared.
-        inputs: how observations become inputs.
-        loaded: the policy, whose configuration, statistics and gripper are looked at.
-        env: what the environment offers.
-        policy: its name, for messages.
+    Without `facts`, which a fine-tuning of ours notes, only what its configuration and statistics say is
+    compared.
 
     Raises:
         SpecMismatchError: expected and found, for each thing that differs.

@@ -19,7 +19,7 @@ Three kinds of policies, told apart by their configuration:
 Any of them may be shown earlier frames as further images: see `vla_memory/`.
 
 Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
-they are asked for one action at each control step, with queues of each episode; see `checkpoints.select_step`.
+they are asked for one action at each control step, with queues for each episode (`checkpoints.select_step`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,8 +36,7 @@ from vla_eval.checkpoints.files import read_facts
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.checkpoints.policy_types import (
-    ASKED_FOR_STEPS,
-    DETERMINISTIC,
+    asked_for_steps,
     chunk_size,
     history,
     noise_shape,
@@ -62,9 +61,10 @@ from vla_eval.models.episodes.running import (
     given_noise,
     in_rows,
 )
+from vla_eval.models.families import family_of
+from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.models.shared.tokens_read import Readings
-from vla_eval.models.vla_memory.fields import FrameMemory
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.device import autocast, choose_device, cuda_devices
 from vla_eval.policies.lerobot.inputs import (
@@ -110,12 +110,14 @@ class LeRobotPolicy:
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
         self._remembers = remembers(loaded.policy)
-        self._by_step = loaded.config.type in ASKED_FOR_STEPS
+        self._by_step = asked_for_steps(loaded.config.type)
         self._earlier = _earlier_frames(loaded.config)
         self._deltas = history(loaded.config)
         self._masks_history = bool(getattr(loaded.config, "masks_history", False))
         self._noise_shape = noise_shape(loaded.config)
-        draws_nothing = loaded.config.type in DETERMINISTIC or getattr(loaded.policy, "draws_nothing", False)
+        draws_nothing = family_of(loaded.config.type).draws_nothing or getattr(
+            loaded.policy, "draws_nothing", False
+        )
         can_batch = draws_nothing or self._noise_shape is not None
         if batch and not can_batch:
             raise SpecMismatchError(

@@ -43,16 +43,7 @@ def as_rows(actions: Any) -> Any:
 
 
 def converted(rows: FloatArray, settings: ActionSettings, spec: ActionSpec) -> FloatArray:
-    """Return actions as this environment means them.
-
-    Args:
-        rows: (T, 7) float32, as the server means them.
-        settings: what they mean there.
-        spec: what they mean here.
-
-    Returns:
-        (T, 7) float32.
-    """
+    """Return actions (T, 7) float32, which the settings describe, as this environment means them."""
     made = rows.astype(np.float64)
     if settings.position_unit_m is not None:
         made[:, :3] *= settings.position_unit_m / POSITION_UNIT_M

@@ -30,15 +30,11 @@ class Connected(NamedTuple):
 def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_seconds: float) -> Connected:
     """Connect to the server with the fewest sessions; of several with as few, the process number decides.
 
-    A worker of a cluster takes one of its own machine, if there is one.
-
-    Args:
-        urls: the servers; all are of the same policy, so that no result depends on the choice.
-        settings: timeouts, the API key, the words.
-        connect_seconds: how long to wait for each that does not listen yet.
+    A worker of a cluster takes one of its own machine, if there is one. All servers are of the same policy,
+    so that no result depends on the choice.
 
     Raises:
-        RemotePolicyError: one of them is no policy server, or is not there.
+        RemotePolicyError: one of them is not a policy server, or is not there after `connect_seconds`.
     """
     near = [url for url in urls if urlsplit(url).hostname == os.environ.get(NEAR_VARIABLE)]
     connected = connect_all(near or urls, settings, connect_seconds=connect_seconds)
@@ -52,11 +48,7 @@ def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_sec
 
 
 def connect_all(urls: Sequence[str], settings: RemoteSettings, *, connect_seconds: float) -> list[Connected]:
-    """Connect to each server.
-
-    Raises:
-        RemotePolicyError: see `connect_client`; none stays connected then.
-    """
+    """Connect to each server, or to none; see `connect_client`."""
     connected: list[Connected] = []
     try:
         for url in urls:

@@ -76,13 +76,7 @@ class Fit:
 
 
 def fit(settings: RemoteSettings, server: ServerMetadata, env: EnvSpec, *, where: str) -> Fit:
-    """Bring recipe, server and environment together.
-
-    Args:
-        settings: the recipe.
-        server: what the server says of itself.
-        env: what there is.
-        where: policy and address, for messages.
+    """Bring a recipe's settings, a server and an environment together.
 
     Raises:
         SpecMismatchError: they do not fit together, or none of them says something that has to be known.

@@ -11,16 +11,9 @@ Resize = Literal["pad", "plain"]
 
 
 def resized(image: ImageArray, *, height_px: int, width_px: int, how: Resize) -> ImageArray:
-    """Return an image of another size, interpolated bilinearly.
+    """Return an image (H, W, 3) uint8 of another size, interpolated bilinearly; itself if it has that size.
 
-    Args:
-        image: (H, W, 3) uint8.
-        height_px: the new height.
-        width_px: the new width.
-        how: `pad` keeps the proportions and fills with black, the image in the middle; `plain` does not.
-
-    Returns:
-        (height_px, width_px, 3) uint8; the image itself if it has that size.
+    `pad` keeps the proportions and fills with black, the image in the middle; `plain` does not.
 
     Source of `pad` (the method): https://github.com/Physical-Intelligence/openpi/blob/15a9616a00943ada6c20a0f158e3adb39df2ccac/packages/openpi-client/src/openpi_client/image_tools.py
     """

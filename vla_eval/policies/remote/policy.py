@@ -125,12 +125,12 @@ def make_remote(
     Args:
         context: what every adapter gets.
         url: `ws://HOST:PORT`; of several with commas, the one with the fewest sessions is taken.
-        identity_sha256: digest of what the server said of itself when the run was planned.
+        identity_sha256: digest of what the server reported when the run was planned.
         **args: the other fields of `RemoteSettings`.
 
     Raises:
         RecipeError: an argument is unknown or wrong.
-        RemotePolicyError: there is no server, or it is none of a policy.
+        RemotePolicyError: there is no server, or it does not serve a policy.
         RemoteChangedError: the server is not what it was when the run was planned.
         SpecMismatchError: server, recipe and environment do not fit together.
     """

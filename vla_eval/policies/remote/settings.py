@@ -125,11 +125,7 @@ class RemoteSettings:
 
 
 def remote_settings(args: Mapping[str, Any], *, where: str) -> RemoteSettings:
-    """Read the arguments of a recipe strictly.
-
-    Raises:
-        RecipeError: a field is unknown, missing, or has a value that is not allowed.
-    """
+    """Read the arguments of a recipe strictly."""
     return decode(RemoteSettings, args, where=where)
 
 

@@ -34,15 +34,10 @@ class StateLayout(NamedTuple):
 
 
 def state_layout(name: str, env: EnvSpec, *, where: str) -> StateLayout:
-    """Return a layout by its name.
-
-    Args:
-        name: `joints`, or `tcp_pose+qpos`.
-        env: what there is.
-        where: the recipe or server that wants it, for messages.
+    """Return a layout by its name: `joints`, or `tcp_pose+qpos`.
 
     Raises:
-        SpecMismatchError: there is no such layout, or the environment has not what it is computed from.
+        SpecMismatchError: there is no such layout, or the environment lacks what it is computed from.
     """
     offered = {state.name: len(state.dims) for state in env.states}
     found = LAYOUTS.get(name)

@@ -28,26 +28,18 @@ class SurveyedPolicy(NamedTuple):
 
 
 def survey(args: Mapping[str, Any], *, policy: str) -> ServerMetadata:
-    """Return what the servers of a policy say of themselves; several have to say the same.
-
-    Args:
-        args: the arguments of a recipe with the adapter `remote`.
-        policy: its name, for messages.
+    """Return what the servers of a policy report, which has to be the same; `args` are the recipe's.
 
     Raises:
         RecipeError: an argument is wrong.
-        RemotePolicyError: a server is not there, or is none of a policy.
+        RemotePolicyError: a server is not there, or does not serve a policy.
         RemoteChangedError: two servers are not of the same policy.
     """
     return _survey(remote_settings(args, where=f"policy '{policy}'"))
 
 
 def survey_address(urls: str) -> SurveyedPolicy:
-    """Return a recipe for the policy at an address: everything is as the server says, which is asked once.
-
-    Raises:
-        RecipeError, RemotePolicyError: see `survey`.
-    """
+    """Return a recipe for the policy at an address: everything is as the server says, which is asked once."""
     settings = remote_settings({"url": urls}, where=f"policy '{urls:.200}'")
     metadata = _survey(settings)
     # What the server calls itself becomes a part of files' names.
@@ -68,11 +60,7 @@ def survey_address(urls: str) -> SurveyedPolicy:
 
 
 def moved(recipe: Recipe[PolicyRecipe], urls: str) -> PolicyRecipe:
-    """Return what a recipe says, for a server at another address.
-
-    Raises:
-        RecipeError: it is not the recipe of a policy behind a socket.
-    """
+    """Return what a recipe of a policy behind a socket says, for a server at another address."""
     if recipe.value.adapter != ADAPTER:
         raise RecipeError(
             f"{recipe.name}@{urls:.200}: expected a recipe with the adapter '{ADAPTER}', found the adapter "

@@ -5,20 +5,21 @@ from collections.abc import Sequence
 from vla_eval.page.charts import Chart, curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
 from vla_eval.page.probe_section import PairMatrix, ProbeSection
-from vla_eval.page.rates import Plots, Sign
-from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable, page_table
-from vla_eval.probe import grid_text, probe_text
+from vla_eval.page.rates import Plots, Sign, printed_on_page
+from vla_eval.page.tables import DARKEST, UNKNOWN, MatrixCell, PageTable, page_table
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.find_worlds import FoundGridWorld, FoundProbe, find_probes
 from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
+from vla_eval.probe.grid_text import printed_grid
 from vla_eval.probe.page.films import film_pairs
 from vla_eval.probe.page.heat_maps import heat_maps
 from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, retention_lines
+from vla_eval.probe.probe_text import printed_probe
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
-from vla_eval.results.folding import folded
+from vla_eval.results.printed_table import PrintedTable
 from vla_eval.storage.run_folder import StoredRun
 
 
@@ -37,12 +38,7 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
     table, pairs = found_table(probe.worlds), found_pairs(probe.worlds)
     return ProbeSection(
         title=str(probe.folder),
-        table=_page_table(
-            probe_text.TITLES,
-            probe_text.probe_cells(table),
-            text_titles=probe_text.TEXT_TITLES,
-            folds=probe_text.FOLDS,
-        ),
+        table=_page_table(printed_probe(table)),
         sentences=tuple(sentences(table)),
         notes=(*notes(table), *probe.doubles),
         plots=_retention_plots(table) if table.retention else None,
@@ -56,12 +52,7 @@ def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
     table = found_grid(worlds)
     return ProbeSection(
         title=title,
-        table=_page_table(
-            grid_text.TITLES,
-            grid_text.grid_cells(table),
-            text_titles=grid_text.TEXT_TITLES,
-            folds=grid_text.FOLDS,
-        ),
+        table=_page_table(printed_grid(table)),
         sentences=tuple(grid_sentences(table)),
         notes=tuple(grid_notes(table)),
         heat=tuple(
@@ -71,15 +62,8 @@ def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
     )
 
 
-def _page_table(
-    titles: Sequence[str], rows: Sequence[Sequence[str]], *, text_titles: Sequence[str], folds: Sequence[str]
-) -> PageTable:
-    shown = folded(titles, rows, folds=folds)
-    return PageTable(
-        columns=tuple(Column(title, "text" if title in text_titles else "number") for title in shown.titles),
-        rows=shown.rows,
-        caption=shown.sentence or "Every row",
-    )
+def _page_table(table: PrintedTable) -> PageTable:
+    return printed_on_page(table, table.sentence or "Every row")
 
 
 def _retention_plots(table: ProbeTable) -> Plots:

@@ -12,23 +12,11 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
 from vla_eval.config.protocol import Protocol, load_protocol
 from vla_eval.errors import RecipeError, UnknownNameError, some_of
-from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import Interval, estimate_runs, mean_interval
-from vla_eval.results.grouping import TASK_VERSIONS, VARIANT_FIELDS, Grouping, RowEpisodes, Run
-from vla_eval.results.success_table import ProtocolRow, SummaryInterval
+from vla_eval.results.estimates import estimate_runs, mean_interval
+from vla_eval.results.grouping import TASK_VERSIONS, VARIANT_FIELDS, Grouping, RowEpisodes, RowKey
+from vla_eval.results.success_table import ProtocolRow
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
-
-RunKey = tuple[int, int]
-"""Index and copy of a run."""
-
-
-class _Label(NamedTuple):
-    """The key that rows of one policy on several tasks share."""
-
-    policy: str
-    n_action_steps: int
-    variant: str | None
 
 
 class Summaries(NamedTuple):
@@ -71,11 +59,10 @@ def summarize(protocol: Protocol, grouping: Grouping) -> tuple[ProtocolRow, ...]
         protocol: whose figure.
         grouping: all episodes of the table.
     """
-    by_label: dict[_Label, dict[str, RowEpisodes]] = {}
+    by_label: dict[RowKey, dict[str, RowEpisodes]] = {}
     for key, group in grouping.groups.items():
         if key.task in protocol.tasks:
-            label = _Label(key.policy, key.n_action_steps, key.variant)
-            by_label.setdefault(label, {})[key.task] = group
+            by_label.setdefault(key.of_all_tasks, {})[key.task] = group
     parts: list[tuple[str | None, tuple[str, ...]]] = [*protocol.groups.items()]
     parts = parts or [(None, tuple(protocol.tasks))]
     return tuple(
@@ -89,7 +76,7 @@ def summarize(protocol: Protocol, grouping: Grouping) -> tuple[ProtocolRow, ...]
 def _row(
     protocol: Protocol,
     part: str | None,
-    label: _Label,
+    label: RowKey,
     found: Mapping[str, RowEpisodes],
     tasks: Sequence[str],
     grouping: Grouping,
@@ -102,7 +89,9 @@ def _row(
         protocol=protocol.name,
         version=protocol.version,
         group=part,
-        **label._asdict(),
+        policy=label.policy,
+        n_action_steps=label.n_action_steps,
+        variant=label.variant,
         n_tasks=len(found),
         n_runs=max(len(group.runs) for group in found.values()),
         departures=departures,
@@ -112,13 +101,12 @@ def _row(
 
 def _with_figure(row: ProtocolRow, groups: Sequence[RowEpisodes]) -> ProtocolRow:
     """Return the row with its figure; every task has the same runs and seeds."""
-    keys = [_key(run) for run in groups[0].runs]
-    rates = [{_key(run): _rate(run) for run in group.runs} for group in groups]
-    means = [math.fsum(rate[key] for rate in rates) / len(rates) for key in keys]
-    estimate = estimate_runs(means)
+    rates = [{run.key: run.rate for run in group.runs} for group in groups]
+    estimate = estimate_runs([math.fsum(rate[key] for rate in rates) / len(rates) for key in rates[0]])
     assert estimate is not None  # no departure: each task has a run
-    kind: SummaryInterval = "t_over_runs" if estimate.sem else "wilson_over_tasks"
-    interval = estimate.interval if kind == "t_over_runs" else _over_tasks(groups)
+    # Of one run, or of several without a spread: from the episodes of one run of each task.
+    counts = [(group.runs[0].n_success, len(group.runs[0].results)) for group in groups]
+    interval = estimate.interval if estimate.sem else mean_interval(counts)
     assert interval is not None
     of_tasks = [math.fsum(rate.values()) / len(rate) for rate in rates]
     return replace(
@@ -126,24 +114,15 @@ def _with_figure(row: ProtocolRow, groups: Sequence[RowEpisodes]) -> ProtocolRow
         mean=estimate.mean,
         ci_low=interval.low,
         ci_high=interval.high,
-        interval=kind,
+        interval="t_over_runs" if estimate.sem else "wilson_over_tasks",
         sem=estimate.sem,
         lowest=min(of_tasks),
         highest=max(of_tasks),
     )
 
 
-def _over_tasks(groups: Sequence[RowEpisodes]) -> Interval:
-    """Return the interval from the episodes of one run of each task."""
-    counts = []
-    for group in groups:
-        records = group.runs[0].results.values()
-        counts.append((sum(_once(record) for record in records), len(records)))
-    return mean_interval(counts)
-
-
 def _departures(
-    protocol: Protocol, label: _Label, found: Mapping[str, RowEpisodes], tasks: Sequence[str]
+    protocol: Protocol, label: RowKey, found: Mapping[str, RowEpisodes], tasks: Sequence[str]
 ) -> Iterator[str]:
     """Yield what is missing or too much of tasks, K, runs and seeds."""
     absent = [task for task in tasks if task not in found]
@@ -162,7 +141,7 @@ def _departures(
 
 
 def _run_departures(protocol: Protocol, found: Mapping[str, RowEpisodes]) -> Iterator[str]:
-    runs_of = {task: {_key(run) for run in group.runs} for task, group in found.items()}
+    runs_of = {task: {run.key for run in group.runs} for task, group in found.items()}
     counts = sorted({len(runs) for runs in runs_of.values()})
     if protocol.runs is not None and counts != [protocol.runs]:
         yield f"{some_of(counts)} of {protocol.runs} runs"
@@ -215,15 +194,3 @@ def _settings(protocol: Protocol, run: StoredRun) -> Iterator[str]:
     for path, text in own.items():
         if text != expected.get(path) and not protocol.is_free(path):
             yield f"{path}={text.strip('"')}"
-
-
-def _key(run: Run) -> RunKey:
-    return run.index, run.copy
-
-
-def _rate(run: Run) -> float:
-    return sum(_once(record) for record in run.results.values()) / len(run.results)
-
-
-def _once(record: EpisodeRecord) -> bool:
-    return record.outcome == "success"

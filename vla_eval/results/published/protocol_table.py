@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from vla_eval.results.side_table import SideTable
+from vla_eval.results.own_statistics import rate
+from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
 from vla_eval.results.success_table import ProtocolRow, Table
-from vla_eval.results.table_columns import UNDEFINED, rate
 
 NOT_THE_PROTOCOL = "not the protocol"
 
@@ -14,39 +14,28 @@ NOT_THE_PROTOCOL = "not the protocol"
 def protocol_side_table(table: Table) -> SideTable:
     """Return the summary figures of the protocols; a row that departs from its protocol has none."""
     rows = table.protocols
-    has_groups = any(row.group is not None for row in rows)
-    has_variants = any(row.variant is not None for row in rows)
-    return SideTable(
+    columns: list[Column[ProtocolRow]] = [
+        Column("protocol", lambda row: f"{row.protocol} v{row.version}", is_number=False),
+        Column("tasks of", lambda row: row.group or UNDEFINED, is_number=False),
+        Column("policy", lambda row: row.policy, is_number=False),
+        Column("K", lambda row: str(row.n_action_steps)),
+        Column("variant", lambda row: row.variant or UNDEFINED, is_number=False),
+        Column("mean", _mean),
+        Column("lowest, highest task", _spread),
+        Column("runs", lambda row: str(row.n_runs)),
+        Column("departs from the protocol", lambda row: "; ".join(row.departures) or "no", is_number=False),
+    ]
+    whole = SideTable(
         title="Summary figures of protocols: mean of success once over the tasks",
-        titles=[
-            "protocol",
-            *(["tasks of"] if has_groups else []),
-            *("policy", "K"),
-            *(["variant"] if has_variants else []),
-            *("mean", "lowest, highest task", "runs", "departs from the protocol"),
-        ],
-        rows=[
-            [
-                f"{row.protocol} v{row.version}",
-                *([row.group or UNDEFINED] if has_groups else []),
-                *(row.policy, str(row.n_action_steps)),
-                *([row.variant or UNDEFINED] if has_variants else []),
-                *(_mean(row), _spread(row), str(row.n_runs), "; ".join(row.departures) or "no"),
-            ]
-            for row in rows
-        ],
-        is_number=[
-            False,
-            *([False] if has_groups else []),
-            *(False, True),
-            *([False] if has_variants else []),
-            *(True, True, True, False),
-        ],
+        columns=columns,
+        rows=cells_of(columns, rows),
         notes=_protocol_notes(rows),
         csv_columns=("departures",),
         csv_rows=[_csv_row(row) for row in rows],
         json={"protocols": [asdict(row) for row in rows]},
     )
+    # The other columns are there even where no row has a value.
+    return whole.without(lambda one, cells: one.title in ("tasks of", "variant") and cells == {UNDEFINED})
 
 
 def _mean(row: ProtocolRow) -> str:

@@ -2,12 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 
 from vla_eval.config.files import to_data
-from vla_eval.results.published.literature import Published, PublishedResult, load_published, paper_figures
-from vla_eval.results.side_table import SideTable
+from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
+from vla_eval.results.published.literature import (
+    PaperFigure,
+    Published,
+    PublishedResult,
+    load_published,
+    paper_figures,
+)
 from vla_eval.results.success_table import Table
-from vla_eval.results.table_columns import UNDEFINED
 
 CONTESTED, COMPUTED = "‡", "(computed)"
 PAPER_SOURCE = "“Memory, Benchmark & Robots” (ICLR 2026), appendix “VLA baselines”, table of VLA models"
@@ -23,19 +29,16 @@ def published_side_tables(board: str) -> list[SideTable]:
     published = load_published()
     results = published.of_board(board)
     tasks = published.boards[board].tasks
+    columns: list[Column[PublishedResult]] = [
+        Column("method (published)", lambda one: one.label, is_number=False),
+        Column("K", lambda one: _text(one.n_action_steps)),
+        *(Column(task.removesuffix("-v0"), partial(_rate, task)) for task in tasks),
+        Column("mean", partial(_mean, published)),
+    ]
     rates = SideTable(
         title=f"Published results, not measured here unless marked: {published.boards[board].title}",
-        titles=["method (published)", "K", *(task.removesuffix("-v0") for task in tasks), "mean"],
-        rows=[
-            [
-                one.label,
-                _text(one.n_action_steps),
-                *(_rate(one, task) for task in tasks),
-                _mean(published, one),
-            ]
-            for one in results
-        ],
-        is_number=[False, True, *(True for _ in tasks), True],
+        columns=columns,
+        rows=cells_of(columns, results),
         notes=list(_notes(published, results)),
         csv_columns=("reference", "contested"),
         csv_rows=[row for one in results for row in _csv_rows(published, one)],
@@ -52,12 +55,8 @@ def paper_side_table(table: Table) -> SideTable:
     fields = [asdict(one) for one in figures]
     return SideTable(
         title=f"The paper's figures, not measured here ({PAPER_PROTOCOL})",
-        titles=["task", "model (paper)", "K", "success once (paper)"],
-        rows=[
-            [one.task, one.model, str(one.n_action_steps), f"{one.success_once:.2f} ± {one.sem:.2f}"]
-            for one in figures
-        ],
-        is_number=[False, False, True, True],
+        columns=_PAPER_COLUMNS,
+        rows=cells_of(_PAPER_COLUMNS, figures),
         notes=[
             f"Source: {PAPER_SOURCE}."
             if figures
@@ -65,34 +64,41 @@ def paper_side_table(table: Table) -> SideTable:
         ],
         csv_rows=[{"source": "paper", "policy": one["model"], **one} for one in fields],
         json={"paper": {"source": PAPER_SOURCE, "protocol": PAPER_PROTOCOL, "rows": fields}},
-        ruled_by_first=True,
     )
+
+
+_PAPER_COLUMNS: tuple[Column[PaperFigure], ...] = (
+    Column("task", lambda one: one.task, is_number=False),
+    Column("model (paper)", lambda one: one.model, is_number=False),
+    Column("K", lambda one: str(one.n_action_steps)),
+    Column("success once (paper)", lambda one: f"{one.success_once:.2f} ± {one.sem:.2f}"),
+)
 
 
 def _how_measured(published: Published, results: Sequence[PublishedResult]) -> SideTable:
+    columns: list[Column[PublishedResult]] = [
+        Column("method", lambda one: one.label, is_number=False),
+        Column("kind", lambda one: one.family, is_number=False),
+        Column("source", partial(_source, published), is_number=False),
+        Column("control mode", lambda one: one.control_mode or UNDEFINED, is_number=False),
+        Column("image", lambda one: f"{one.image_px} px" if one.image_px else UNDEFINED, is_number=False),
+        Column("models", lambda one: one.training or UNDEFINED, is_number=False),
+        Column("runs", lambda one: _text(one.runs)),
+        Column("episodes", lambda one: _text(one.episodes)),
+        Column("seeds", lambda one: one.seeds or UNDEFINED, is_number=False),
+    ]
     return SideTable(
         title="How the published results were measured, as far as the sources say",
-        titles=["method", "kind", "source", "control mode", "image", "models", "runs", "episodes", "seeds"],
-        rows=[
-            [
-                one.label,
-                one.family,
-                ", ".join(filter(None, (published.sources[one.source].title, one.where))),
-                one.control_mode or UNDEFINED,
-                UNDEFINED if one.image_px is None else f"{one.image_px} px",
-                one.training or UNDEFINED,
-                _text(one.runs),
-                _text(one.episodes),
-                one.seeds or UNDEFINED,
-            ]
-            for one in results
-        ],
-        is_number=[False] * 6 + [True, True, False],
-        notes=[],
+        columns=columns,
+        rows=cells_of(columns, results),
     )
 
 
-def _rate(result: PublishedResult, task: str) -> str:
+def _source(published: Published, result: PublishedResult) -> str:
+    return ", ".join(filter(None, (published.sources[result.source].title, result.where)))
+
+
+def _rate(task: str, result: PublishedResult) -> str:
     found = result.rates.get(task)
     if found is None:
         return UNDEFINED

@@ -1,4 +1,4 @@
-"""How an action reaches the arm: its bounds, holding still, and what replaces it before the choice.
+"""The arm: where it is, how an action reaches it, and what replaces actions before the choice.
 
 Knows nothing of objects, rewards or what a task is about.
 """
@@ -12,22 +12,52 @@ from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angle
 
 from vla_eval.control_modes import ABSOLUTE_MODES, EE_DELTA_POS, EE_DELTA_POSE, EE_POSE, JOINT_POS
 from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.arm.arms import Arm
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
+from vla_eval.tasks.objects.bodies import yaw_rad
 
 
 class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     """An environment whose arm can be held still, or moved by a script, whatever the action is.
 
     Attributes:
-        freeze_until_choice, move_in_delay: see `MemoryTableEnv`.
+        arm: the arm's row.
+        static_threshold_rad_s, freeze_until_choice, move_in_delay: see `MemoryTableEnv`.
         executed_action: (B, A) the last action as it was carried out; None after a step without one.
     """
 
+    arm: Arm
+    static_threshold_rad_s: float
     freeze_until_choice: bool
     move_in_delay: bool
     executed_action: torch.Tensor | None
     _cue_end_step: torch.Tensor
     _response_step: torch.Tensor
+
+    def tcp_position_m(self) -> torch.Tensor:
+        """Return the (B, 3) tool centre point, world frame."""
+        position: torch.Tensor = self.agent.tcp.pose.p
+        return position
+
+    def tcp_yaw_rad(self) -> torch.Tensor:
+        """Return (B,): the gripper's yaw about world z; 0 with the fingers aligned along y."""
+        return yaw_rad(self.agent.tcp.pose.q)
+
+    def gripper_width_m(self) -> torch.Tensor:
+        """Return the (B,) gap between the fingers."""
+        width: torch.Tensor = self.agent.robot.get_qpos()[:, -2:].sum(dim=1)
+        return width
+
+    def is_static(self) -> torch.Tensor:
+        """Return (B,) bool: no arm joint moves faster than the threshold."""
+        static: torch.Tensor = self.agent.is_static(self.static_threshold_rad_s)
+        return static
+
+    def arm_speed(self) -> torch.Tensor:
+        """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
+        qvel = self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)]
+        speed: torch.Tensor = torch.linalg.norm(qvel, dim=1)
+        return speed
 
     def check_motion(self) -> None:
         """Raise `TaskArgumentError` if the scripted motion cannot be made in this control mode."""

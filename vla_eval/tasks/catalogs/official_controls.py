@@ -47,11 +47,15 @@ def control_fields(name: str) -> dict[str, Any]:
     task = name.partition("-")[0]
     for prefix, controls in _CHOICES.items():
         if task.startswith(prefix):
-            return {**_fields(controls), "chance_success": 1 / n_candidates(task)}
+            n = n_candidates(task)
+            return {**_fields(controls), "candidate_counts": {"n_items": n}, "chance_success": 1 / n}
     for prefix, true_state in _MOVING.items():
         if task.startswith(prefix):
-            own = _OWN[task]
-            return {**_fields(Controls(own.oracle, true_state, own.oracle_sees)), "kwargs": _speeds(task)}
+            own, speeds = _OWN[task], _speeds(task)
+            fields = _fields(Controls(own.oracle, true_state, own.oracle_sees))
+            # Not of TakeItBack: the official state does not say which colour the disc has.
+            seen = {"seen_in_one_frame": own.seen_in_one_frame} if speeds else {}
+            return {**fields, **seen, "turns_wrist": own.turns_wrist, "kwargs": speeds}
     return {}
 
 

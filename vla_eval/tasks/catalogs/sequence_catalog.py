@@ -1,7 +1,6 @@
 """The rows of BunchOfColors, SeqOfColors and ChainOfColors. Importing it starts no simulator."""
 
-from vla_eval.tasks.chance import chance_of_several
-from vla_eval.tasks.spec import MemoryType, TaskSpec
+from vla_eval.tasks.spec import MemoryType, TaskSpec, chance_of_several
 
 N_CUBES = 9
 HORIZON_STEPS = 120
@@ -33,6 +32,8 @@ def _several(
             "has appeared"
         ),
         candidates="cubes",
+        candidate_counts={"n_items": N_CUBES},
+        several_right=True,
         chance_success=chance_of_several(N_CUBES, n_shown, in_order=in_order),
         max_reward=100.0,
         shows_one_by_one=one_by_one,

@@ -35,6 +35,7 @@ def _intercept(mode: str) -> TaskSpec:
         description="A ball rolls across the table: deflect it so that it passes over the target disc.",
         success="The ball is within 10 cm of the target's centre, measured in the table's plane.",
         oracle=f"vla_eval.oracles.cradle:{mode.upper()}",
+        seen_in_one_frame="ball",
         idle_success=IDLE_SUCCESS.get(mode, 0.0),
         oracle_sees="positions and velocity of ball and target, once the base camera could see the ball",
         max_reward=30.0,
@@ -50,6 +51,7 @@ def _intercept_grab(mode: str) -> TaskSpec:
         description="A ball rolls across the table: catch it with the gripper and come to rest.",
         success="Both fingers press the ball with at least 0.5 N and the arm is at rest.",
         oracle=f"vla_eval.oracles.catch:{mode.upper()}",
+        seen_in_one_frame="ball",
         oracle_sees="position and velocity of the ball, once the base camera could see it",
         max_reward=300.0,
     )
@@ -70,6 +72,7 @@ def _rotate(mode: str, *, strict: bool) -> TaskSpec:
         if strict
         else f"{success}.",
         oracle="vla_eval.oracles.turn:PEG_SIGNED" if signed else "vla_eval.oracles.turn:PEG",
+        turns_wrist=True,
         oracle_sees="place and yaw of the peg, now and at the start, and the angle asked for",
         max_reward=100.0 if strict else 25.0,
     )
@@ -85,6 +88,7 @@ _TAKE_IT_BACK = _spatial(
     ),
     success="The cube's middle was within 8 cm of the disc's, and is within 8 cm of its first place.",
     oracle="vla_eval.oracles.carry:CUBE",
+    seen_in_one_frame="cube",
     oracle_sees="places of cube and disc, and the cube's first place, which it sees at the start",
     max_reward=30.0,
 )

@@ -1,8 +1,12 @@
 """The state of a body for privileged readers: position, velocity, yaw."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+
+from vla_eval.task_state import BodyState
 
 
 class Body(NamedTuple):
@@ -11,6 +15,19 @@ class Body(NamedTuple):
     position_m: torch.Tensor
     velocity_m_s: torch.Tensor
     yaw_rad: torch.Tensor
+
+    def state(self, env: int) -> BodyState:
+        """Return it in one parallel environment, as new numbers."""
+        return BodyState(
+            position_m=to_vector(self.position_m[env]),
+            velocity_m_s=to_vector(self.velocity_m_s[env]),
+            yaw_rad=float(self.yaw_rad[env]),
+        )
+
+
+def to_vector(tensor: Any) -> NDArray[np.float64]:  # Any: also what ManiSkill hands out, which is untyped
+    """Return a tensor as new float64 numbers."""
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()
 
 
 def moving_body(

@@ -69,14 +69,9 @@ class Estimate:
 def estimate(
     model: Any, policy: Any, recipe: FinetuneRecipe, *, device: str, tflops: float | None = None
 ) -> Estimate:
-    """Estimate what a fine-tuning of a model takes.
+    """Estimate what a fine-tuning of a model takes; its weights need no memory.
 
-    Args:
-        model: as it is trained; its weights need no memory.
-        policy: lerobot's configuration of it.
-        recipe: see there.
-        device: `cpu` or a GPU.
-        tflops: rate to assume; None: a usual one of the device.
+    `tflops`: rate to assume; None: a usual one of the device.
     """
     usual = CPU_TFLOPS if device == "cpu" else SUSTAINED_TFLOPS
     return Estimate(
@@ -139,13 +134,7 @@ def _fits(largest: int | None) -> str:
 
 
 class RateWatch:
-    """Compares the assumed rate with the real one, once, after the first steps.
-
-    Args:
-        found: the estimate.
-        first_step: steps that were done before.
-        say: gets the line.
-    """
+    """Compares the assumed rate with the real one, once, after the first steps of this process."""
 
     def __init__(self, found: Estimate, first_step: int, say: Any) -> None:
         self._found, self._first, self._say = found, first_step, say

@@ -2,6 +2,13 @@
 
 An estimate from the shapes of the linear layers and the tokens that pass through them; attention scores and
 the optimizer's own operations are not counted, convolutions only in small networks. Knows only torch modules.
+
+How many numbers a layer keeps for the backward pass, per token and per input and output of its linear
+layers, is in the family's row (`saved_per_linear`). 1.3 was measured on a CPU (torch 2.11, bfloat16, 256
+tokens, SDPA) by counting the tensors that autograd saves in one layer of true width: SigLIP-so400m 0.89,
+Llama-2-7B 1.20, Gemma-300M 1.32, Gemma-2B 1.34; Gemma 2 with its capped eager attention: 1.91, of which the
+scores grow with the number of tokens. Small networks were measured whole, in float32, at the sizes of their
+recipes, by `scripts/activation_constants.py`; there, convolutions and attention count like linear layers.
 """
 
 import math
@@ -12,27 +19,10 @@ from typing import Any, NamedTuple  # Any: lerobot is untyped
 
 from torch import Tensor, nn
 
-from vla_eval.training.cost.network_stages import EPISODE_STEPS, HEAD, STAGES, stage_of
+from vla_eval.models.families import family_of
+from vla_eval.models.family import imported
+from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, stage_of
 
-SAVED_PER_LINEAR = 1.3
-"""Numbers that a layer keeps for the backward pass, per token and per input and output of its linear layers.
-
-Measured on a CPU (torch 2.11, bfloat16, 256 tokens, SDPA) by counting the tensors that autograd saves in
-one layer of true width: SigLIP-so400m 0.89, Llama-2-7B 1.20, Gemma-300M 1.32, Gemma-2B 1.34. Gemma 2 with
-its capped eager attention: 1.91, of which the scores grow with the number of tokens.
-"""
-SAVED_PER_LINEAR_OF = {
-    "mikasa_spatialvla": 1.9,
-    "act": 1.04,
-    "diffusion": 1.19,
-    "mikasa_memory": 1.91,
-    "mikasa_sequence": 1.1,
-    "mikasa_offline_rl": 1.4,
-}
-"""Where it is another number. For all but the first, whole networks were measured in float32, at the sizes of
-their recipes, by `scripts/activation_constants.py`; convolutions and attention count like linear layers.
-"""
-ALL_LAYERS = frozenset(SAVED_PER_LINEAR_OF) - {"mikasa_spatialvla"}
 LAYER = re.compile(r"(.*\.(?:layers|layer|blocks|block)\.\d+)\.")
 
 
@@ -88,17 +78,12 @@ class Counted:
 
 
 def sample_cost(model: Any, config: Any) -> SampleCost | None:
-    """Estimate it; None for a type of policy whose tokens are not known here.
-
-    Args:
-        model: a torch module of lerobot's; its weights need no memory.
-        config: of the policy.
-    """
-    if config.type not in STAGES:
+    """Estimate it for a torch module without values and its configuration; None: its tokens are not known."""
+    family = family_of(config.type)
+    if not family.stages:
         return None
     counted = count(model, config)
-    saved = counted.saved * SAVED_PER_LINEAR_OF.get(config.type, SAVED_PER_LINEAR)
-    saved += counted.inputs + counted.working
+    saved = counted.saved * family.saved_per_linear + counted.inputs + counted.working
     alone, through = config.n_passes(EPISODE_STEPS) if hasattr(config, "n_passes") else (0, 1)
     n_bytes = 2 if getattr(config, "dtype", None) == "bfloat16" or getattr(config, "use_amp", False) else 4
     return SampleCost(
@@ -111,7 +96,8 @@ def sample_cost(model: Any, config: Any) -> SampleCost | None:
 
 def count(model: Any, config: Any) -> Counted:
     """Count operations and numbers of a sample; see `sample_cost`, whose types it knows."""
-    stages = STAGES[config.type](config)
+    family = family_of(config.type)
+    stages = imported(family.stages)(config)
     first_trained = min(
         (stage_of(stages, name).order for name, x in model.named_parameters() if x.requires_grad),
         default=HEAD + 1,
@@ -121,7 +107,7 @@ def count(model: Any, config: Any) -> Counted:
     inputs: dict[str, float] = {}
     again: dict[str, float] = {}
     blocks: dict[str, float] = {}
-    for layer in _layers(model, every=config.type in ALL_LAYERS):
+    for layer in _layers(model, every=family.counts_all_layers):
         stage = stage_of(stages, layer.name)
         operations = 2.0 * layer.weight.numel() * stage.tokens
         numbers = float(stage.tokens * (layer.n_read + layer.n_written))

@@ -9,16 +9,15 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.workers.job_list import JobList
 from vla_eval.workers.jobs import Answered, Job
 from vla_eval.workers.local import LocalService
 from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.pool import WorkerPool
-from vla_eval.workers.process import CLOSE_SECONDS, WorkerMain
+from vla_eval.workers.process import CLOSE_SECONDS, WorkerMain, WorkerSpec
 from vla_eval.workers.start import NEAR_VARIABLE, worker_context
 
 OWN_VARIABLES = "MIKASA_VLA_"
@@ -53,31 +52,13 @@ class Place:
         return shared if shared.is_dir() else Path(tempfile.mkdtemp(prefix="mikasa-vla-logs-"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerSpec:
-    """What a worker is made of; see `WorkerPool`."""
-
-    main: WorkerMain
-    answers: tuple[type, ...]
-    timeouts: TimeoutConfig
-    preload: tuple[str, ...]
-    place: Place
-
-
 class WorkerActor[J: Job, A]:
     """A pool of one process; lives as long as its process's jobs last."""
 
-    def __init__(self, spec: WorkerSpec, index: int, address: str) -> None:
+    def __init__(self, spec: WorkerSpec, place: Place, index: int, address: str) -> None:
         """Take over the driver's place; no process starts yet."""
-        self._pool: WorkerPool[J, A] = WorkerPool(
-            spec.main,
-            answers=spec.answers,
-            size=1,
-            timeouts=spec.timeouts,
-            logs=spec.place.enter(address),
-            preload=spec.preload,
-            first_index=index,
-        )
+        spec = replace(spec, logs=place.enter(address))
+        self._pool: WorkerPool[J, A] = WorkerPool(spec, size=1, first_index=index)
 
     def ready(self) -> None:
         """Return once the actor is there."""

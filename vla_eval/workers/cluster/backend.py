@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # Ray is optional: not looked at by mypy
 
-from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers
-from vla_eval.workers.cluster.actor import OWN_VARIABLES, Place, WorkerSpec
+from vla_eval.workers.cluster.actor import OWN_VARIABLES, Place
 from vla_eval.workers.cluster.connect import connected
 from vla_eval.workers.cluster.machines import Machines
 from vla_eval.workers.cluster.pool import ClusterPool
@@ -18,7 +17,7 @@ from vla_eval.workers.cluster.service import ClusterService
 from vla_eval.workers.jobs import Job
 from vla_eval.workers.local import LOOPBACK
 from vla_eval.workers.needed_files import Needed
-from vla_eval.workers.process import WorkerMain
+from vla_eval.workers.process import WorkerMain, WorkerSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +42,10 @@ class ClusterBackend:
         """How many GPUs the cluster may use."""
         return sum(machine.n_gpus for machine in self.machines.usable)
 
-    def pool[J: Job, A](
-        self,
-        main: WorkerMain,
-        *,
-        answers: tuple[type, ...],
-        size: int,
-        timeouts: TimeoutConfig,
-        logs: Path,
-        preload: Sequence[str] = (),
-        takes_gpu: bool = False,
-    ) -> ClusterPool[J, A]:
+    def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> ClusterPool[J, A]:
         """Return workers, one core each, and one GPU each where they take one and there is one."""
-        spec = WorkerSpec(
-            main=main, answers=answers, timeouts=timeouts, preload=tuple(preload), place=_place(logs)
-        )
-        return ClusterPool(self.ray, self.machines, spec, size=size, takes_gpu=takes_gpu and self.n_gpus > 0)
+        takes_gpu = takes_gpu and self.n_gpus > 0
+        return ClusterPool(self.ray, self.machines, spec, _place(spec.logs), size=size, takes_gpu=takes_gpu)
 
     def services(
         self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()

@@ -41,7 +41,7 @@ class Machine:
         name: what people call it.
         address: its IP address.
         n_cores, n_gpus: what the cluster may use of it.
-        facts: what it said of itself; None: it has not answered yet.
+        facts: its facts; None: it has not answered yet.
         refused: why it is not used; empty: it is.
         is_alive: whether the cluster has it.
         was_sent: whether folders that it did not have were sent to it.

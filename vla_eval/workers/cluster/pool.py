@@ -15,16 +15,16 @@ from typing import Any, Self  # Ray is optional: not looked at by mypy
 
 from vla_eval.errors import ClusterError
 from vla_eval.records import EpisodeError
-from vla_eval.workers.cluster.actor import WorkerActor, WorkerSpec
+from vla_eval.workers.cluster.actor import Place, WorkerActor
 from vla_eval.workers.cluster.connect import on_machine
 from vla_eval.workers.cluster.machines import MAX_ERRORS_IN_A_ROW, Machine, Machines
 from vla_eval.workers.jobs import Answered, Event, Job, JobSource
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import Failed, Notice
-from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS
+from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerSpec
 
 TICK_SECONDS = 0.2
-MAX_LOSSES = 3  # of one job: whoever takes it dies, so it is probably the cause
+MAX_LOSSES = 3  # of one job: each worker that takes it dies, so it is probably the cause
 CALL_SECONDS = 1.0  # short jobs are handed out together until a call takes about so long
 MAX_JOBS_PER_CALL = 16
 
@@ -63,6 +63,7 @@ class ClusterPool[J: Job, A]:
         ray: the module, connected.
         machines: where actors may be.
         spec: what a worker is made of.
+        place: what it takes over from the driver.
         size: how many at most.
         takes_gpu: whether a GPU is reserved for each.
     """
@@ -72,12 +73,13 @@ class ClusterPool[J: Job, A]:
         ray: Any,
         machines: Machines,
         spec: WorkerSpec,
+        place: Place,
         *,
         size: int,
         takes_gpu: bool = False,
     ) -> None:
-        self._ray, self._machines, self._spec, self._size = ray, machines, spec, size
-        self._takes_gpu = takes_gpu
+        self._ray, self._machines, self._spec, self._place = ray, machines, spec, place
+        self._size, self._takes_gpu = size, takes_gpu
         self._workers: dict[int, _Worker[J]] = {}
         self._returned: deque[_Given[J]] = deque()
         self._seconds_per_job: float | None = None
@@ -154,7 +156,7 @@ class ClusterPool[J: Job, A]:
             num_cpus=1,
             num_gpus=1 if self._takes_gpu else 0,
         )
-        return actor.remote(self._spec, index, machine.address)
+        return actor.remote(self._spec, self._place, index, machine.address)
 
     def _hand_out(self, queue: JobSource[J]) -> None:
         taken: set[Any] = {worker.loaded for worker in self._workers.values() if worker.loaded is not None}

@@ -1,0 +1,110 @@
+"""Make a LeRobot checkpoint of a published one, as its family's converter reads it. Knows no family.
+
+No code of the checkpoint is run. The result is a whole folder or none.
+"""
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any  # a family's options
+
+from vla_eval.checkpoints.files import TOKENIZER_FOLDER
+from vla_eval.checkpoints.foreign_code import no_foreign_code
+from vla_eval.checkpoints.loading import make_unfilled_policy
+from vla_eval.checkpoints.processors import save_tokenizers
+from vla_eval.errors import CheckpointError
+from vla_eval.models.families import FAMILIES, family_of_base
+from vla_eval.models.family import Base, imported
+from vla_eval.models.shared.options import typed
+from vla_eval.models.shared.original import Original
+from vla_eval.models.shared.weights import put_weights
+
+TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
+
+
+def convert(kind: str, source: Path, out: Path, options: Any) -> Path:
+    """Write the LeRobot checkpoint `out` with every parameter of the original and no other; return it.
+
+    Args:
+        kind: the family's type.
+        source: folder of the published checkpoint.
+        out: a folder that is not there yet.
+        options: of the family's class of options.
+
+    Raises:
+        CheckpointError: something is missing, of another form, or not what the options say.
+    """
+    check_free(out)
+    original: Original = imported(FAMILIES[kind].converter)(source, options)
+    policy = make_unfilled_policy(original.config)
+    put_weights(policy, original.weights(policy), where=str(source), cast=original.casts)
+    with folder_when_whole(out) as partial:
+        _save(original, policy, source, partial, out)
+    return out
+
+
+def convert_base(base: Base, source: Path, out: Path) -> Path:
+    """Convert a published base as recipes expect it, with the options that its row states; see `convert`."""
+    family = family_of_base(base)
+    return convert(family.type, source, out, imported(family.convert_options)(**_options(base, source)))
+
+
+def convert_command(base: Base, source: Path, out: Path) -> str:
+    """Return the command that does what `convert_base` does."""
+    family = family_of_base(base)
+    words = typed(imported(family.convert_options), _options(base, source))
+    return " ".join(
+        ["mikasa-vla checkpoint", f"convert-{family.name}", str(source), *words, "--out", str(out)]
+    )
+
+
+def _options(base: Base, source: Path) -> dict[str, Any]:
+    return {
+        name: value.format(source=source) if isinstance(value, str) else value
+        for name, value in (base.options or {}).items()
+    }
+
+
+def _save(original: Original, policy: Any, source: Path, partial: Path, out: Path) -> None:
+    is_beside = original.check_tokenizer is not None
+    if is_beside:
+        policy.config.tokenizer_name = str(_copy_tokenizer(source, partial / TOKENIZER_FOLDER))
+    with no_foreign_code(policy.config.type):
+        processors = original.make_processors()
+    if original.check_tokenizer is not None:
+        steps = (step for step in processors[0].steps if hasattr(step, "input_tokenizer"))
+        original.check_tokenizer(next(steps).input_tokenizer)
+        policy.config.tokenizer_name = str(out / TOKENIZER_FOLDER)
+    else:
+        save_tokenizers(processors[0], partial)
+    policy.save_pretrained(partial)
+    for processor in processors:
+        processor.save_pretrained(partial)
+
+
+def check_free(out: Path) -> None:
+    """Raise `CheckpointError` for a folder that is there."""
+    if out.exists():
+        raise CheckpointError(f"{out} exists already. Name another folder.")
+
+
+@contextlib.contextmanager
+def folder_when_whole(out: Path) -> Iterator[Path]:
+    """Give a folder to write into, which gets its name, not taken so far, once everything is in it."""
+    check_free(out)
+    partial = out.with_name(f"{out.name}.partial")  # which the lock lets be written, too
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    yield partial
+    partial.rename(out)
+
+
+def _copy_tokenizer(source: Path, folder: Path) -> Path:
+    files = [file for pattern in TOKENIZER_FILES for file in sorted(source.glob(pattern)) if file.is_file()]
+    if not files:
+        raise CheckpointError(f"{source}: expected the tokenizer's files, found none. Fetch them, too.")
+    folder.mkdir(parents=True)
+    for file in files:
+        shutil.copy2(file, folder / file.name)
+    return folder

@@ -1,0 +1,137 @@
+"""What a person asks to be evaluated, with everything that was left open decided: made once, at the door.
+
+Plan, dry run, fingerprint, pool and cluster get a `ResolvedEvaluation`; none of them reads a policy again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self  # Any: plain data
+
+from vla_eval.config.appearance import AS_DESIGNED
+from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
+from vla_eval.config.files import content_of, digest_of
+from vla_eval.config.policy import PolicyRecipe
+from vla_eval.policies.entries import PolicyEntry, load_policy_entries
+from vla_eval.policies.recipe import bare_policy
+from vla_eval.storage.shard import Shard, shard_folder
+from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
+
+RUNS_FOLDER = Path("runs")
+FINGERPRINT_DIGITS = 8
+INFERENCE_FIELDS = ("inference", "inference_max_batch")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResolvedEvaluation:
+    """An evaluation as it will run.
+
+    Attributes:
+        config: what was asked for; `inference` is never `auto`.
+        policies: those of the configuration, each read once; a policy server asked once.
+        backend: where the workers run.
+        shard: the part of the episodes that is run; None: all.
+        named_out: the run folder that was asked for; None: the default one.
+    """
+
+    config: EvalConfig
+    policies: tuple[PolicyEntry, ...]
+    backend: Backend
+    shard: Shard | None
+    named_out: Path | None
+
+    @classmethod
+    def of(
+        cls,
+        config: EvalConfig,
+        policies: Sequence[PolicyEntry],
+        *,
+        backend: Backend = LOCAL,
+        out: Path | None = None,
+        shard: Shard | None = None,
+    ) -> Self:
+        """Decide where policies infer; arguments as for `resolve`, with the policies that were read."""
+        if config.inference == "auto":
+            config = replace(
+                config, inference="shared" if _shares(config, policies, backend) else "in_process"
+            )
+        return cls(config=config, policies=tuple(policies), backend=backend, shard=shard, named_out=out)
+
+    @property
+    def out(self) -> Path:
+        """The run folder."""
+        return self.named_out or shard_folder(self.default_folder, self.shard)
+
+    @property
+    def default_folder(self) -> Path:
+        """The folder of the whole run, if none is named: the same for the same configuration."""
+        return RUNS_FOLDER / f"{self.config.name}-{self.fingerprint[:FINGERPRINT_DIGITS]}"
+
+    @property
+    def fingerprint(self) -> str:
+        """The sha256 of the part of the configuration that results depend on."""
+        return digest_of(self.results_config)
+
+    @property
+    def results_config(self) -> dict[str, Any]:
+        """The part of the configuration that results depend on; compared when a run is resumed."""
+        config = self.config
+        data = content_of(config, options=OPTION_FIELDS)
+        # So that runs of versions without these fields can be resumed.
+        if config.slots_per_worker == 1:
+            del data["slots_per_worker"]
+        if config.inference == "in_process":
+            data = {name: value for name, value in data.items() if name not in INFERENCE_FIELDS}
+        data["policies"] = [bare_policy(name) for name in data["policies"]]
+        if config.reset_policy_at_step is None:
+            del data["reset_policy_at_step"]
+        if config.chunking.first_inference_step == 0:
+            del data["chunking"]["first_inference_step"]
+        if config.cue_view == "as_shown":
+            del data["cue_view"]
+        if config.appearance == AS_DESIGNED:
+            del data["appearance"]
+        return data
+
+    @property
+    def shared(self) -> dict[str, str]:
+        """`EpisodeGroup.part` whose inference all workers share -> what the configuration calls it."""
+        if self.config.inference == "in_process":
+            return {}
+        return {
+            policy.part(index): text
+            for policy in self.policies
+            for index, text in enumerate(policy.texts)
+            if has_weights(policy.recipes[index].value)
+        }
+
+
+def resolve(
+    config: EvalConfig, *, backend: Backend = LOCAL, out: Path | None = None, shard: Shard | None = None
+) -> ResolvedEvaluation:
+    """Read the policies of a configuration, ask policy servers, and decide what it leaves open.
+
+    Args:
+        config: what to evaluate.
+        backend: where the workers run.
+        out: the run folder; None: a folder in `runs/`, or that of its shard.
+        shard: run only this part of the episodes.
+
+    Raises:
+        VlaEvalError: a policy cannot be read; see `load_policy_entry`.
+    """
+    policies = load_policy_entries(config.policies)
+    return ResolvedEvaluation.of(config, policies, backend=backend, out=out, shard=shard)
+
+
+def has_weights(recipe: PolicyRecipe) -> bool:
+    """Whether a policy's recipe names a checkpoint: only such policies are shared."""
+    return isinstance(recipe.args.get("checkpoint"), str)
+
+
+def _shares(config: EvalConfig, policies: Sequence[PolicyEntry], backend: Backend) -> bool:
+    """Whether workers share inference where it is left open: on a GPU, with several workers and weights."""
+    n_workers = backend.n_cores if config.workers == "auto" else config.workers
+    recipes = (recipe.value for entry in policies for recipe in entry.recipes)
+    return n_workers > 1 and bool(backend.n_gpus) and any(map(has_weights, recipes))

@@ -1,0 +1,363 @@
+"""The families of policies, a row for each: ours and those of LeRobot's that a row is needed for.
+
+Everything else reads these rows. A new family is its folder, a row, a recipe in `policies/`, and tests; types
+that are understood from their configuration alone need no row. Standard library only.
+"""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from vla_eval.models.family import Base, Family, Source, Tiny
+
+WEIGHTS = ("config.json", "model.safetensors", "policy_preprocessor*", "policy_postprocessor*")
+TOKENIZER = ("tokenizer*", "special_tokens_map.json", "added_tokens.json", "spiece.model")
+OCTO = ("config.json", "dataset_statistics.json", "*/default/checkpoint")
+SHARDS = ("*.json", "*.safetensors", "tokenizer.model")
+GEMMA = "weights: Gemma Terms of Use; code: Apache-2.0"
+OPEN_X = {"gripper": "unit_open"}  # of Open X-Embodiment, on which all that are converted were trained
+BYTES = {"tokenizer_name": "bytes"}
+TINY_POLICY: Mapping[str, Any] = MappingProxyType(
+    {
+        "chunk_size": 4,
+        "n_action_steps": 4,
+        "num_inference_steps": 2,
+        "image_resolution": [56, 56],
+        "dtype": "float32",
+    }
+)
+"""Fields of a tiny policy of the π0 family."""
+_STAGES = "vla_eval.models.shared.stages"
+_STAND_INS = "vla_eval.testing.stand_ins"
+_TINY_PALIGEMMA = "vla_eval.testing.tiny_models:tiny_paligemma"
+_PALIGEMMA = Source(
+    repo_id="google/paligemma-3b-pt-224",
+    revision="35e4f46485b4d07967e7e9935bc3786aad50687c",
+    patterns=TOKENIZER,
+    folder="tokenizer",
+)
+_RESNET18 = Base(
+    name="resnet18",
+    title="ResNet-18 of torchvision, trained on ImageNet (IMAGENET1K_V1)",
+    terms="BSD-3-Clause",
+    parts=(
+        Source(
+            repo_id="timm/resnet18.tv_in1k",
+            revision="bbd144b3e5565108aad885f145491d11bc6ce807",
+            patterns=("model.safetensors",),
+        ),
+    ),
+    is_backbone=True,
+)
+
+
+def _octo_base(size: str, revision: str, fields: Mapping[str, Any]) -> Base:
+    return Base(
+        name=f"octo_{size}",
+        title=f"Octo-{size} 1.5",
+        terms="MIT",
+        parts=(
+            Source(
+                repo_id="google-t5/t5-base",
+                revision="a9723ea7f1b39c1eae772870f3b547bf6ef7e6c1",
+                patterns=TOKENIZER,
+                folder="tokenizer",
+            ),
+            Source(repo_id=f"rail-berkeley/octo-{size}-1.5", revision=revision, patterns=OCTO),
+        ),
+        # Any of the statistics that it has: a fine-tuning replaces them.
+        options={
+            "size": size,
+            "dataset": "bridge_dataset",
+            **OPEN_X,
+            "tokenizer": "{source}/tokenizer",
+        },
+        fields=fields,
+    )
+
+
+_SMOLVLA = Family(
+    type="smolvla",
+    is_built_empty=True,
+    noise="flow",
+    stages=f"{_STAGES}:smolvlm_with_expert",
+    stand_in=f"{_STAND_INS}:smolvlm",
+    built_tiny="contextlib:nullcontext",  # the description that stands in makes it tiny
+    bases=(
+        Base(
+            name="smolvla_base",
+            title="SmolVLA",
+            terms="Apache-2.0",
+            parts=(
+                Source(
+                    repo_id="HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+                    revision="7b375e1b73b11138ff12fe22c8f2822d8fe03467",
+                    patterns=("*.json", "*.jinja", "*.txt"),  # no weights: they are in SmolVLA's
+                    folder="vlm",
+                ),
+                Source(
+                    repo_id="lerobot/smolvla_base",
+                    revision="c83c3163b8ca9b7e67c509fffd9121e66cb96205",
+                    patterns=WEIGHTS,
+                ),
+            ),
+        ),
+    ),
+)
+_PI0 = Family(
+    type="pi0",
+    is_built_empty=True,
+    noise="flow",
+    stages=f"{_STAGES}:paligemma_with_expert",
+    stand_in=f"{_STAND_INS}:paligemma",
+    built_tiny=_TINY_PALIGEMMA,
+    tiny=Tiny(fields={**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": 2}),
+    bases=(
+        Base(
+            name="pi0_base",
+            title="π0",
+            terms=GEMMA,
+            parts=(
+                _PALIGEMMA,
+                Source(
+                    repo_id="lerobot/pi0_base",
+                    revision="25c379b52ba2ff8788cab921758a3cc3fe3f77f2",
+                    patterns=WEIGHTS,
+                ),
+            ),
+        ),
+    ),
+)
+_PI05 = replace(
+    _PI0,
+    type="pi05",
+    stages=f"{_STAGES}:paligemma_with_expert_and_state_in_prompt",
+    # lerobot 0.6.1 looks for π0.5's projections of time under π0's names, and leaves them frozen
+    # (https://github.com/huggingface/lerobot/pull/4494).
+    lora_targets=r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"
+    r"|model\.(action_in_proj|action_out_proj|time_mlp_in|time_mlp_out))",
+    tiny=None,
+    bases=(
+        Base(
+            name="pi05_base",
+            title="π0.5",
+            terms=GEMMA,
+            parts=(
+                _PALIGEMMA,
+                Source(
+                    repo_id="lerobot/pi05_base",
+                    revision="b211f3d44c36b6acfcf7ae94a64e8e96f75a64ba",
+                    patterns=WEIGHTS,
+                ),
+            ),
+        ),
+    ),
+)
+_ADDS_MEMORY: dict[str, Any] = {
+    "configuration": "vla_eval.models.vla_memory.configuration_vla_memory",
+    "docs": "docs/vla_memory.md",
+    "bases": (),
+    "tiny": None,
+}
+
+_ROWS = (
+    Family(
+        type="act",
+        draws_nothing=True,
+        stages=f"{_STAGES}:resnet_and_transformer",
+        saved_per_linear=1.04,
+        counts_all_layers=True,
+        tiny=Tiny(),
+        bases=(_RESNET18,),
+    ),
+    Family(
+        type="diffusion",
+        cuts_chunk=True,
+        noise="ddim",
+        stages=f"{_STAGES}:resnet_and_unet",
+        saved_per_linear=1.19,
+        counts_all_layers=True,
+        # Its own recipes are small, but for the U-Net.
+        tiny=Tiny(fields={"down_dims": [16, 32], "n_groups": 4, "num_inference_steps": 2}, sets_chunk=False),
+    ),
+    _SMOLVLA,
+    _PI0,
+    _PI05,
+    replace(
+        _PI0,
+        type="pi0_fast",
+        noise=None,
+        cuts_chunk=True,
+        stages=f"{_STAGES}:paligemma_alone",
+        stand_in=f"{_STAND_INS}:paligemma_with_action_tokens",
+        tiny=None,
+        # Its action tokenizer is read as data.
+        replaces={
+            f"{module}:AutoProcessor": "vla_eval.checkpoints.fast_tokens:FastProcessors"
+            for module in (
+                "lerobot.policies.pi0_fast.modeling_pi0_fast",
+                "lerobot.processor.tokenizer_processor",
+            )
+        },
+        bases=(
+            Base(
+                name="pi0_fast_base",
+                title="π0-FAST",
+                terms=GEMMA,
+                parts=(
+                    _PALIGEMMA,
+                    Source(
+                        repo_id="lerobot/fast-action-tokenizer",
+                        revision=None,
+                        patterns=("*.json", "tokenizer*"),  # its code is not fetched: it is read as data
+                        folder="action_tokenizer",
+                    ),
+                    Source(repo_id="lerobot/pi0fast-base", revision=None, patterns=WEIGHTS),
+                ),
+            ),
+        ),
+    ),
+    # What lerobot 0.6 has besides these, where its configuration does not say it.
+    Family(type="multi_task_dit", queues=("_queues",)),
+    Family(type="tdmpc", queues=("_queues", "_prev_mean")),
+    Family(type="vqbet", queues=("_queues",)),
+    Family(
+        type="gaussian_actor",
+        why_not="it has no chunks, and learns by reinforcement, not from demonstrations",
+    ),
+    Family(
+        type="lingbot_va",
+        why_not="it keeps what it has seen and done inside its networks, for one episode at a time",
+    ),
+    Family(type="groot", cuts_chunk=True),
+    Family(type="molmoact2", cuts_chunk=True),
+    Family(
+        type="mikasa_memory",
+        configuration="vla_eval.models.memory.configuration_memory",
+        docs="docs/positive_control.md",
+        stages="vla_eval.models.memory.configuration_memory:network_stages",
+        saved_per_linear=1.91,
+        counts_all_layers=True,
+        tiny=Tiny(),
+    ),
+    Family(
+        type="mikasa_offline_rl",
+        configuration="vla_eval.models.offline_rl.configuration_offline_rl",
+        docs="docs/offline_rl.md",
+        stages="vla_eval.models.offline_rl.configuration_offline_rl:network_stages",
+        saved_per_linear=1.4,
+        counts_all_layers=True,
+        tiny=Tiny(),
+    ),
+    Family(
+        type="mikasa_sequence",
+        configuration="vla_eval.models.sequence.configuration_sequence",
+        docs="docs/sequence_policies.md",
+        stages="vla_eval.models.sequence.configuration_sequence:network_stages",
+        saved_per_linear=1.1,
+        counts_all_layers=True,
+        tiny=Tiny(),
+    ),
+    replace(_SMOLVLA, type="mikasa_smolvla", wraps=_SMOLVLA.type, **_ADDS_MEMORY),
+    replace(_PI0, type="mikasa_pi0", wraps=_PI0.type, **_ADDS_MEMORY),
+    replace(_PI05, type="mikasa_pi05", wraps=_PI05.type, **_ADDS_MEMORY),
+    Family(
+        type="mikasa_octo",
+        configuration="vla_eval.models.octo.configuration_octo",
+        docs="docs/octo.md",
+        is_built_empty=True,
+        stages="vla_eval.models.octo.configuration_octo:network_stages",
+        stand_in_fields=BYTES,
+        tiny=Tiny(recipe="octo_tiny"),
+        converter="vla_eval.models.octo.conversion:read_original",
+        convert_options="vla_eval.models.octo.conversion_options:OctoOptions",
+        bases=(
+            _octo_base("small", "dc9aa3019f764726c770814b27e4ab0fc6e32a58", {}),
+            # Source: octo/model/components/transformer.py of the original, `vit_b`; `vit_s` is the default.
+            _octo_base(
+                "base",
+                "ee3c10e8edd6ce2e8b1e8744d3c6fba4097bed48",
+                {"width": 768, "layers": 12, "heads": 12, "mlp_width": 3072},
+            ),
+        ),
+    ),
+    Family(
+        type="mikasa_openvla",
+        configuration="vla_eval.models.openvla.configuration_openvla",
+        docs="docs/openvla.md",
+        is_built_empty=True,
+        stages="vla_eval.models.openvla.configuration_openvla:network_stages",
+        stand_in_fields=BYTES,
+        tiny=Tiny(recipe="openvla_oft_tiny"),
+        converter="vla_eval.models.openvla.conversion:read_original",
+        convert_options="vla_eval.models.openvla.conversion_options:OpenVLAOptions",
+        adapters={"openvla": "vla_eval.policies.lerobot.paper_compat:make_paper_compat"},
+        bases=(
+            Base(
+                name="openvla_7b",
+                title="OpenVLA-7B",
+                terms="MIT; derived from Llama 2, whose Community License applies",
+                parts=(
+                    Source(
+                        repo_id="openvla/openvla-7b",
+                        revision="47a0ec7fc4ec123775a391911046cf33cf9ed83f",
+                        patterns=SHARDS,
+                    ),
+                ),
+                options={**OPEN_X, "image_augmentation": False},
+            ),
+        ),
+    ),
+    Family(
+        type="mikasa_spatialvla",
+        configuration="vla_eval.models.spatialvla.configuration_spatialvla",
+        docs="docs/spatialvla.md",
+        is_built_empty=True,
+        stages="vla_eval.models.spatialvla.configuration_spatialvla:network_stages",
+        saved_per_linear=1.9,
+        stand_in_fields={
+            **BYTES,  # whose tokens have these numbers
+            "sizes": {"pad_token": 0, "bos_token": 1, "stop_token": 2, "newline_token": 201},
+        },
+        tiny=Tiny(recipe="spatialvla_tiny"),
+        converter="vla_eval.models.spatialvla.conversion:read_original",
+        convert_options="vla_eval.models.spatialvla.conversion_options:SpatialVLAOptions",
+        bases=(
+            Base(
+                name="spatialvla_4b",
+                title="SpatialVLA-4B",
+                terms="MIT as its README states; derived from PaliGemma 2, whose Gemma Terms of Use apply",
+                parts=(
+                    Source(repo_id="IPEC-COMMUNITY/spatialvla-4b-224-pt", revision=None, patterns=SHARDS),
+                ),
+                options={},
+            ),
+        ),
+    ),
+)
+FAMILIES: dict[str, Family] = {family.type: family for family in _ROWS}
+"""Type -> its row; a test may add one."""
+
+
+def family_of(kind: str) -> Family:
+    """Return the row of a type; one that says nothing for a type without a row."""
+    return FAMILIES.get(kind) or Family(type=kind)
+
+
+def register_families() -> None:
+    """Import the configurations of our families, which registers them with lerobot."""
+    for family in FAMILIES.values():
+        if family.configuration:
+            importlib.import_module(family.configuration)
+
+
+def bases() -> dict[str, Base]:
+    """Return the published checkpoints by the names of their folders."""
+    return {base.name: base for family in FAMILIES.values() for base in family.bases}
+
+
+def family_of_base(base: Base) -> Family:
+    """Return the row that a base stands in."""
+    return next(row for row in FAMILIES.values() if base.name in (one.name for one in row.bases))

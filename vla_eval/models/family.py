@@ -1,0 +1,146 @@
+"""What a row of `families` may say. Standard library only: planning must not wait for torch."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal  # Any: fields of a configuration, and what a row names
+
+Noise = Literal["flow", "ddim"]
+"""What an inference draws and can be given: `flow`: a chunk of actions as wide as the model's; `ddim`: the
+horizon of a diffusion policy whose scheduler draws nothing further."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Files of a repository of the Hub.
+
+    Attributes:
+        repo_id: `OWNER/NAME`.
+        revision: the commit that is fetched; None: the newest, which is noted beside the files.
+        patterns: names of the files, as shells match them.
+        folder: where they lie below the folder that is fetched; empty: in it.
+    """
+
+    repo_id: str
+    revision: str | None
+    patterns: tuple[str, ...]
+    folder: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Base:
+    """A published checkpoint.
+
+    Attributes:
+        name: of its folder in `checkpoints/`, as recipes name it.
+        title: for people.
+        terms: the licence, as its authors state it; the Hub's own statement is shown, too.
+        parts: what is fetched, small parts first: one that is refused is then known before the large ones.
+        options: of its family's converter, which makes a LeRobot checkpoint of the files; `{source}` is
+            their folder. None: they are one.
+        fields: of its configuration, where they are not the defaults of its type.
+        is_backbone: the files are not a checkpoint, but weights of a part of a policy; the name is
+            torchvision's.
+    """
+
+    name: str
+    title: str
+    terms: str
+    parts: tuple[Source, ...]
+    options: Mapping[str, Any] | None = None
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    is_backbone: bool = False
+
+    @property
+    def weights(self) -> Source:
+        """What holds the weights."""
+        return self.parts[-1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tiny:
+    """The form of a family in a table of tiny models.
+
+    Attributes:
+        recipe: in `policies/`; empty: the row's own recipe, or, of a family with `built_tiny`, none.
+        fields: of the configuration that differ from the recipe's.
+        sets_chunk: the chunk is as long as the row executes; False: it follows from other fields.
+    """
+
+    recipe: str = ""
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    sets_chunk: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """A type of LeRobot policy. What is named as `module:attribute` is imported when it is used.
+
+    Attributes:
+        type: lerobot's name of it.
+        configuration: the module that registers it; empty: lerobot does.
+        wraps: lerobot's type to which ours adds something; the row is then a copy of that one's.
+        docs: page that explains it.
+        is_built_empty: its constructor does not compute with its weights: it is built without memory for
+            them.
+        replaces: `module:name` in lerobot -> `module:attribute` that stands there while a policy is loaded,
+            where lerobot would run code that comes with a checkpoint.
+        draws_nothing: it draws nothing at inference.
+        queues: what `reset` empties, of a type whose `predict_action_chunk` reads the frames that its own
+            `select_action` collected. It is asked for one action at a time (`checkpoints.select_step`).
+        why_not: why it can be asked neither for a chunk nor for a step of one of several episodes.
+        cuts_chunk: its `predict_action_chunk` returns `n_action_steps` actions and no more.
+        noise: what it can be given in place of its own draws.
+        lora_targets: modules that get an adapter, where lerobot's own choice is wrong.
+        stages: function from a configuration to the `Stage`s of its network; empty: they are not known.
+        saved_per_linear: numbers that a layer keeps for the backward pass (`training.cost.sample_cost`).
+        counts_all_layers: convolutions and attention are counted like linear layers.
+        bases: published checkpoints that recipes start from.
+        converter: function `(source, options)` that makes an `Original` of a published checkpoint.
+        convert_options: the class of its options, whose fields are also the verb's flags.
+        adapters: further adapters of its checkpoints: name -> `module:attribute`, see `policies.registry`.
+        tiny: its form in a table of tiny models; None: there is none.
+        built_tiny: context `(type)` in which lerobot builds it tiny.
+        stand_in: function `(folder, tiny)` that makes what its configuration names, without a network.
+        stand_in_fields: of the configuration, without a published tokenizer.
+    """
+
+    type: str
+    configuration: str = ""
+    wraps: str = ""
+    docs: str = ""
+    is_built_empty: bool = False
+    replaces: Mapping[str, str] = field(default_factory=dict)
+    draws_nothing: bool = False
+    queues: tuple[str, ...] = ()
+    why_not: str = ""
+    cuts_chunk: bool = False
+    noise: Noise | None = None
+    lora_targets: str | None = None
+    stages: str = ""
+    saved_per_linear: float = 1.3
+    counts_all_layers: bool = False
+    bases: tuple[Base, ...] = ()
+    converter: str = ""
+    convert_options: str = ""
+    adapters: Mapping[str, str] = field(default_factory=dict)
+    tiny: Tiny | None = None
+    built_tiny: str = ""
+    stand_in: str = ""
+    stand_in_fields: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Its type as commands call it."""
+        return self.type.removeprefix("mikasa_")
+
+    @property
+    def lerobot_type(self) -> str:
+        """Its type, or lerobot's where ours adds something to it."""
+        return self.wraps or self.type
+
+
+def imported(target: str) -> Any:
+    """Return what a row names as `module:attribute`."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)

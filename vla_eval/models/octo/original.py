@@ -1,0 +1,123 @@
+"""Read a checkpoint of the original code without jax: parameters and statistics. Pickles are never read.
+
+Two layouts of parameters are read: a safetensors file whose names are the parameter tree's joined with
+".", and flax's msgpack (`checkpoint`, as orbax aggregates it). The layouts of one folder per parameter
+(zarr, OCDBT) need tensorstore and are not read; the message says how to export them.
+
+Source of the format: https://github.com/google/flax/blob/v0.10.4/flax/serialization.py (extension 1: an array
+as shape, name of its type, bytes).
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any  # plain data of JSON and msgpack
+
+import msgpack
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from vla_eval.errors import CheckpointError, did_you_mean
+from vla_eval.strict.json_fields import read_json
+
+STATISTICS_FILE = "dataset_statistics.json"
+AGGREGATED_FILE = "checkpoint"
+ARRAY_EXTENSION = 1
+CHUNKED = "__msgpack_chunked_array__"
+EXPORT_HINT = (
+    "Where jax is installed, export it once: flatten OctoModel.load_pretrained(PATH).params with "
+    "flax.traverse_util.flatten_dict(params, sep='.') and write it with safetensors.numpy.save_file."
+)
+
+
+def read_parameters(folder: Path) -> dict[str, Tensor]:
+    """Return the original's parameter tree, flat, from its folder, a step in it, or one file.
+
+    Raises:
+        CheckpointError: there is none, several, or one in a layout that is not read.
+    """
+    files = [folder] if folder.is_file() else _parameter_files(folder)
+    if len(files) != 1:
+        found = ", ".join(str(file) for file in files) or "none"
+        raise CheckpointError(
+            f"{folder}: expected one file of parameters (*.safetensors or {AGGREGATED_FILE}), found {found}. "
+            f"Name one of several. {EXPORT_HINT}"
+        )
+    (file,) = files
+    if file.suffix == ".safetensors":
+        try:
+            return dict(load_file(file))
+        except Exception as exc:  # safetensors raises its own class, which is no public name
+            raise CheckpointError(f"{file}: cannot be read as safetensors ({exc}). Fetch it again.") from exc
+    tree = unpack(file.read_bytes(), where=str(file))
+    if not isinstance(tree, dict):
+        raise CheckpointError(f"{file}: expected a tree of parameters, found {type(tree).__name__}.")
+    inner = tree.get("params", tree)
+    return {key: torch.from_numpy(np.array(values)) for key, values in _flat(inner).items()}
+
+
+def read_statistics(folder: Path, *, dataset: str | None) -> dict[str, list[float]]:
+    """Return the statistics of actions of a dataset: name -> one number per dimension.
+
+    Raises:
+        CheckpointError: there are none, or several and none is named.
+    """
+    data = read_json(folder / STATISTICS_FILE)
+    if "action" not in data:
+        if dataset is None or dataset not in data:
+            hint = did_you_mean(dataset, data) if dataset else ""
+            raise CheckpointError(
+                f"{folder / STATISTICS_FILE}: holds the statistics of several datasets; name one with "
+                f"--dataset-name.{hint} There are: {', '.join(sorted(data))}."
+            )
+        data = data[dataset]
+    action = data["action"]
+    return {name: [float(x) for x in values] for name, values in action.items() if isinstance(values, list)}
+
+
+def _parameter_files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise CheckpointError(f"{folder}: no such folder.")
+    layouts = [*folder.rglob(".zarray"), *folder.rglob("manifest.ocdbt")]
+    if layouts:
+        raise CheckpointError(
+            f"{folder}: holds a folder per parameter (zarr or OCDBT), which is not read. {EXPORT_HINT}"
+        )
+    return sorted([*folder.rglob("*.safetensors"), *folder.rglob(AGGREGATED_FILE)])
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{name}."))
+        else:
+            flat[name] = value
+    return flat
+
+
+def unpack(data: bytes, *, where: str) -> Any:
+    """Return what msgpack holds, arrays as numpy's.
+
+    Raises:
+        CheckpointError: it is something else, damaged, or has arrays in several parts.
+    """
+    try:
+        value = msgpack.unpackb(data, ext_hook=_array, strict_map_key=False)
+    except (ValueError, TypeError, AttributeError) as exc:  # of damage, types and shapes
+        raise CheckpointError(
+            f"{where}: not flax's msgpack: {exc!s:.200}. Fetch the checkpoint again."
+        ) from exc
+    if isinstance(value, dict) and any(CHUNKED in key for key in _flat(value)):
+        raise CheckpointError(f"{where}: holds arrays in several parts, which are not read. {EXPORT_HINT}")
+    return value
+
+
+def _array(code: int, inner: bytes) -> Any:
+    if code != ARRAY_EXTENSION:
+        raise ValueError(f"extension {code} is not an array")
+    shape, dtype, content = msgpack.unpackb(inner)
+    name = dtype.decode() if isinstance(dtype, bytes) else dtype
+    return np.frombuffer(content, dtype=np.dtype(name)).reshape(shape)

@@ -1,0 +1,112 @@
+"""The fields by which a policy is given earlier frames: an image and a mask for each place and camera.
+
+A place that holds no frame has a mask of False: the model's own attention mask then leaves its image out, so
+that its values are of no effect.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from vla_eval.models.shared.frame_choice import FrameChoice, Seen
+from vla_eval.models.shared.levels import in_bytes
+
+SEGMENT_PADDING_KEY = "segment_is_pad"
+"""(B, T) of a training batch in segments: which come before the episode's beginning."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segments:
+    """The frames of an episode at which its memory tokens are written, for training.
+
+    Attributes:
+        stride: control steps between them, from the first frame on.
+        n_segments: of a sample, the frame itself among them; shorter ones are padded at their beginning.
+    """
+
+    stride: int
+    n_segments: int
+
+    def numbers(self, newest: int) -> list[int]:
+        """Return the numbers of the frames of the sample that ends with this one."""
+        return [*range(0, newest, self.stride), newest]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleMemory:
+    """What a training sample has beside its own frame.
+
+    Attributes:
+        choice: of earlier frames; None: none are shown.
+        cameras: fields of the dataset of which they are shown; a rule looks at the first.
+        segments: None: a sample is one frame.
+    """
+
+    choice: FrameChoice | None
+    cameras: tuple[str, ...]
+    segments: Segments | None
+
+
+def place_field(camera: str, place: int) -> str:
+    """Return the field of the image in a place, counted from 1."""
+    return f"{camera}_m{place}"
+
+
+def mask_field(image_field: str) -> str:
+    """Return the field of the mask of an image; lerobot's SmolVLA reads it by this name."""
+    return f"{image_field}_padding_mask"
+
+
+def place_fields(cameras: Iterable[str], n_places: int) -> tuple[str, ...]:
+    """Return the fields of all images, place by place."""
+    cameras = tuple(cameras)
+    return tuple(place_field(camera, place) for place in range(1, n_places + 1) for camera in cameras)
+
+
+def in_places(camera: str, images: Sequence[Tensor | None], like: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Yield the fields of a camera's images (3, H, W), in the order of the places, and of their masks.
+
+    `camera` is the field of the newest image, `like` an image of the same shape and type.
+    """
+    for place, image in enumerate(images, start=1):
+        name = place_field(camera, place)
+        yield name, torch.zeros_like(like) if image is None else image
+        yield mask_field(name), torch.tensor(image is not None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameMemory:
+    """The earlier frames of one running episode; of constant size.
+
+    Attributes:
+        choice: see there.
+        cameras: fields of which images are kept; the rule looks at the first.
+        seen: what the rule keeps.
+        images: number of a frame -> its images by field, float32 in [0, 1]; those that may be shown.
+    """
+
+    choice: FrameChoice
+    cameras: tuple[str, ...]
+    seen: Seen = field(default_factory=Seen)
+    images: Mapping[int, Mapping[str, Tensor]] = field(default_factory=dict)
+
+    def after(self, frame: Mapping[str, Tensor]) -> "FrameMemory":
+        """Return the memory after one more frame."""
+        look = in_bytes(frame[self.cameras[0]]).numpy() if self.choice.looks else None
+        seen = self.choice.after(self.seen, look)
+        images = {**self.images, seen.n_frames - 1: {camera: frame[camera] for camera in self.cameras}}
+        wanted = self.choice.wanted(seen)
+        kept = {number: images[number] for number in images if number in wanted}
+        return replace(self, seen=seen, images=kept)
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return the further fields of the newest frame."""
+        newest = self.images[self.seen.n_frames - 1]
+        shown = self.choice.shown(self.seen)
+        found: dict[str, Tensor] = {}
+        for camera in self.cameras:
+            images = [None if number is None else self.images[number][camera] for number in shown]
+            found.update(in_places(camera, images, newest[camera]))
+        return found

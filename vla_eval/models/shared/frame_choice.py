@@ -1,0 +1,200 @@
+"""Which earlier frames are shown beside the newest one: a rule over the frames of an episode, one by one.
+
+The same code chooses for a training sample and in a rollout. It sees images and counts frames; it knows
+neither phases nor tasks, and no torch.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.core import ImageArray
+from vla_eval.errors import RecipeError, check_names
+from vla_eval.models.shared.levels import MAX_LEVEL
+
+BLOCKS = (8, 16, 32)  # per side of an image; of 128 px: 16, 8 and 4 px
+NEAR, FAR = 2, 5  # blocks: what changes between these distances from a block is its surroundings
+BURST_FRAMES = 4  # changes in so many frames are one event: cups come down, a cube is replaced
+
+Values = NDArray[np.float64]
+Blocks = tuple[Values, ...]
+"""(3, n, n) for each n of `BLOCKS`: mean colours of an image's blocks, in [0, 1]."""
+
+
+class Event(NamedTuple):
+    """A change of the scene.
+
+    Attributes:
+        number: of the last frame before it.
+        novelty: see `novelty`; the greatest in the burst.
+    """
+
+    number: int
+    novelty: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """What a rule keeps of an episode, whatever its length.
+
+    Attributes:
+        n_frames: so far; the newest one has the number `n_frames` - 1.
+        blocks: of the newest one; None if the rule does not look at images.
+        events: that are kept, oldest first.
+    """
+
+    n_frames: int = 0
+    blocks: Blocks | None = None
+    events: tuple[Event, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameChoice:
+    """A rule and its numbers.
+
+    Attributes:
+        rule: a name of `RULES`.
+        n_places: so many frames are shown at most.
+        stride: of the rule `last`: control steps between them.
+        least_novelty: of the rule `keyframes`: a smaller change is no event; see `novelty`.
+    """
+
+    rule: str
+    n_places: int
+    stride: int
+    least_novelty: float
+
+    def __post_init__(self) -> None:
+        check_names("rule", [self.rule], RULES, where="policy.memory_rule")
+        for name, value in (("memory_places", self.n_places), ("memory_stride", self.stride)):
+            if value < 1:
+                raise RecipeError(f"policy.{name} is {value}, expected a number ≥ 1")
+        if not 0 < self.least_novelty < 1:
+            raise RecipeError(
+                f"policy.memory_novelty is {self.least_novelty}, expected a number between 0 and 1"
+            )
+
+    @property
+    def looks(self) -> bool:
+        """Whether the rule looks at images."""
+        return RULES[self.rule].looks
+
+    def after(self, seen: Seen, image: ImageArray | None) -> Seen:
+        """Return what is kept after one more frame (3, H, W) uint8; None: the rule does not look at it."""
+        return RULES[self.rule].after(self, seen, image)
+
+    def shown(self, seen: Seen) -> tuple[int | None, ...]:
+        """Return for each place the number of the frame that is shown beside the newest; None: there is none.
+
+        `last`: place 1 is the nearest in time. `keyframes`: place 1 is the oldest.
+        """
+        numbers = RULES[self.rule].shown(self, seen)
+        return (*numbers, *[None] * (self.n_places - len(numbers)))
+
+    def wanted(self, seen: Seen) -> frozenset[int]:
+        """Return the numbers of the frames that are shown, or may be after further frames."""
+        return RULES[self.rule].wanted(self, seen)
+
+
+class Rule(NamedTuple):
+    """What `FrameChoice` asks of a rule; see its methods."""
+
+    looks: bool
+    after: Callable[[FrameChoice, Seen, ImageArray | None], Seen]
+    shown: Callable[[FrameChoice, Seen], tuple[int, ...]]
+    wanted: Callable[[FrameChoice, Seen], frozenset[int]]
+
+
+def blocks_of(image: ImageArray) -> Blocks:
+    """Return the mean colours of the blocks of an image (3, H, W) of at least 32 pixels each way.
+
+    Exact, whatever the array's order in memory.
+    """
+    return tuple(_means(image.astype(np.int64), n) for n in BLOCKS)
+
+
+def _means(image: NDArray[np.int64], n_blocks: int) -> Values:
+    _, height, width = image.shape
+    rows, columns = ((np.arange(n_blocks) * size) // n_blocks for size in (height, width))
+    sums = np.add.reduceat(np.add.reduceat(image, rows, axis=1), columns, axis=2)
+    n_pixels = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))
+    means: Values = sums / (n_pixels * MAX_LEVEL)
+    return means
+
+
+def novelty(before: Blocks, after: Blocks) -> float:
+    """Return by how much the image changes in one place more than around it, in [0, 1].
+
+    A cue is small and comes and goes at once. An arm that moves changes more pixels by more, but along its
+    whole outline: the greatest change in a block's surroundings is subtracted. The block for which most is
+    left counts, of any size. A change is averaged over the colours.
+    """
+    return max(_alone(np.abs(new - old).mean(axis=0)) for old, new in zip(before, after, strict=True))
+
+
+def _alone(changes: Values) -> float:
+    """Return the greatest of changes (n, n) less what changes around it."""
+    offsets = np.abs(np.arange(-FAR, FAR + 1))
+    around = np.maximum.outer(offsets, offsets) >= NEAR
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(changes, FAR), around.shape)
+    return float((changes - windows[..., around].max(axis=-1)).max())
+
+
+def _count(choice: FrameChoice, seen: Seen, image: ImageArray | None) -> Seen:
+    return replace(seen, n_frames=seen.n_frames + 1)
+
+
+def _last(choice: FrameChoice, seen: Seen) -> tuple[int, ...]:
+    newest = seen.n_frames - 1
+    numbers = (newest - place * choice.stride for place in range(1, choice.n_places + 1))
+    return tuple(number for number in numbers if number >= 0)
+
+
+def _recent(choice: FrameChoice, seen: Seen) -> frozenset[int]:
+    oldest = seen.n_frames - 1 - choice.n_places * choice.stride
+    return frozenset(range(max(0, oldest), seen.n_frames))
+
+
+def _note_change(choice: FrameChoice, seen: Seen, image: ImageArray | None) -> Seen:
+    if image is None:
+        raise ValueError("the rule 'keyframes' chooses from images, found none")
+    blocks = blocks_of(image)
+    changed = 0.0 if seen.blocks is None else novelty(seen.blocks, blocks)
+    events = seen.events
+    if changed >= choice.least_novelty:
+        events = _with_event(events, Event(seen.n_frames - 1, changed), choice.n_places)
+    return Seen(n_frames=seen.n_frames + 1, blocks=blocks, events=events)
+
+
+def _with_event(events: tuple[Event, ...], event: Event, n_places: int) -> tuple[Event, ...]:
+    """Return the events with one more, or with a burst that grew; of too many, the least one goes."""
+    if events and event.number - events[-1].number < BURST_FRAMES:
+        begun = events[-1]
+        return (*events[:-1], Event(begun.number, max(begun.novelty, event.novelty)))
+    events = (*events, event)
+    if len(events) <= n_places:
+        return events
+    least = min(event.novelty for event in events)
+    gone = max(place for place, event in enumerate(events) if event.novelty == least)  # of equals, the newest
+    return events[:gone] + events[gone + 1 :]
+
+
+def _before_changes(choice: FrameChoice, seen: Seen) -> tuple[int, ...]:
+    return tuple(event.number for event in seen.events)
+
+
+def _before_changes_and_newest(choice: FrameChoice, seen: Seen) -> frozenset[int]:
+    return frozenset({*_before_changes(choice, seen), seen.n_frames - 1})
+
+
+RULES: Mapping[str, Rule] = {
+    "last": Rule(looks=False, after=_count, shown=_last, wanted=_recent),
+    "keyframes": Rule(
+        looks=True, after=_note_change, shown=_before_changes, wanted=_before_changes_and_newest
+    ),
+}
+"""By name. `last`: every `stride`-th frame before the newest. `keyframes`: the last frame before each of the
+greatest changes of the scene, so what was in view and is no longer."""

@@ -1,0 +1,180 @@
+"""The statistics of a row's own episodes, and the footnotes on them."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from vla_eval.errors import some_of
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.comparison import Evidence, Success
+from vla_eval.results.estimates import wilson_interval
+from vla_eval.results.grouping import RowEpisodes
+from vla_eval.results.printed_table import UNDEFINED, Column
+from vla_eval.results.success_table import Row, Statistic
+
+
+class Episodes(NamedTuple):
+    """How many episodes have a result, and how many have none and are in no rate."""
+
+    n_episodes: int
+    n_errors: int
+
+
+class Choices(NamedTuple):
+    """First choices; None without candidates.
+
+    Attributes:
+        n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
+        right_if_chose: the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson
+            interval, of one run.
+    """
+
+    n_chose: int | None
+    n_chose_right: int | None
+    right_if_chose: float | None
+    right_if_chose_low: float | None
+    right_if_chose_high: float | None
+
+
+def rate(value: float | None) -> str:
+    """Return a rate with two digits, or a dash."""
+    return UNDEFINED if value is None else f"{value + 0.0:.2f}".replace("-0.00", "0.00")
+
+
+def count(n: int, noun: str) -> str:
+    """Return a number and its noun, in the plural unless it is one."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _count(value: float | None) -> str:
+    return UNDEFINED if value is None else f"{value:.1f}"
+
+
+def _choices(of: Evidence) -> Choices:
+    results = of.episodes.results
+    chose = [record for record in results if record.first_choice is not None]
+    has_candidates = any(record.first_choice_success is not None for record in results)
+    n_right = sum(bool(record.first_choice_success) for record in chose)
+    interval = wilson_interval(n_right, len(chose)) if of.success.n_runs == 1 else None
+    return Choices(
+        n_chose=len(chose) if has_candidates else None,
+        n_chose_right=n_right if has_candidates else None,
+        right_if_chose=n_right / len(chose) if chose else None,
+        right_if_chose_low=interval.low if interval else None,
+        right_if_chose_high=interval.high if interval else None,
+    )
+
+
+def _mean_over_runs(group: RowEpisodes, value: Callable[[EpisodeRecord], float | None]) -> float | None:
+    runs = group.runs_with_results
+    means = [mean for run in runs if (mean := _mean(run.results.values(), value)) is not None]
+    return math.fsum(means) / len(means) if means and len(means) == len(runs) else None
+
+
+def _mean(records: Iterable[EpisodeRecord], value: Callable[[EpisodeRecord], float | None]) -> float | None:
+    """Return the mean of a value; None if any record has none.
+
+    Excluding those would bias it: with `stop_at_success`, success_at_end is known for failures only.
+    """
+    values = [value(record) for record in records]
+    known = [float(item) for item in values if item is not None]
+    return math.fsum(known) / len(known) if values and len(known) == len(values) else None
+
+
+def _shown_success(row: Row) -> str:
+    success = row[SUCCESS]
+    if success.success_once is None:
+        return UNDEFINED
+    sem = "" if success.sem is None else f" ± {success.sem:.2f}"
+    return f"{success.success_once:.2f}{sem} [{rate(success.ci_low)}, {rate(success.ci_high)}]"
+
+
+def _shown_right(row: Row) -> str:
+    share, low, high = row[CHOICES][2:]
+    return rate(share) if low is None else f"{rate(share)} [{rate(low)}, {rate(high)}]"
+
+
+def _shown_episodes(row: Row) -> str:
+    n_episodes, n_runs = row[EPISODES].n_episodes, row[SUCCESS].n_runs
+    return f"{n_episodes} ({n_runs} runs)" if n_runs > 1 else str(n_episodes)
+
+
+def _interval_notes(rows: Sequence[Row]) -> Iterator[str]:
+    """Say which interval is used where."""
+    found = [row[SUCCESS] for row in rows]
+    if any(one.interval == "wilson" and one.n_runs == 1 for one in found):
+        yield "success once, one run: 95 % Wilson interval over its episodes."
+    if any(one.interval == "t_over_runs" for one in found):
+        yield (
+            "success once, several runs: mean of the run means ± SEM over the runs, 95 % t interval over the "
+            "run means."
+        )
+    without_spread = [row.key for row in rows if row[SUCCESS].n_runs > 1 and row[SUCCESS].sem == 0]
+    if without_spread:
+        yield (
+            f"SEM is exactly 0 for {some_of(map(str, without_spread))}: all runs have the same "
+            "rate. Scripted deterministic controls do not vary between runs, and more runs of them add "
+            "nothing. Their interval is Wilson's over the episodes of one run."
+        )
+
+
+def _error_notes(rows: Sequence[Row]) -> Iterator[str]:
+    n_errors = sum(row[EPISODES].n_errors for row in rows)
+    if n_errors:
+        yield (
+            f"errors: {count(n_errors, 'episode')} without a result, in no rate, neither as success nor as "
+            "failure; the same `mikasa-vla eval` command runs such episodes again."
+        )
+
+
+EPISODES: Statistic[Episodes] = Statistic(
+    estimate=lambda of: Episodes(len(of.episodes.results), of.episodes.n_errors),
+    cells=lambda value: value._asdict(),
+    columns=(
+        Column("episodes", _shown_episodes, name="episodes", folds=True, is_last=True),
+        Column("errors", lambda row: str(row[EPISODES].n_errors), name="errors", folds=True, is_last=True),
+    ),
+    notes=_error_notes,
+)
+SUCCESS: Statistic[Success] = Statistic(
+    estimate=lambda of: of.success,
+    cells=lambda value: value._asdict(),
+    columns=(Column("success once", _shown_success, name="success"),),
+    notes=_interval_notes,
+)
+AT_END: Statistic[float | None] = Statistic(
+    estimate=lambda of: _mean_over_runs(of.episodes, lambda record: record.success_at_end),
+    cells=lambda value: {"success_at_end": value},
+    columns=(Column("at end", lambda row: rate(row[AT_END]), name="at_end", rank=7),),
+)
+FIRST_CHOICE: Statistic[float | None] = Statistic(
+    estimate=lambda of: _mean_over_runs(of.episodes, lambda record: record.first_choice_success),
+    cells=lambda value: {"first_choice_success": value},
+    columns=(Column("1st choice", lambda row: rate(row[FIRST_CHOICE]), name="first_choice", rank=2),),
+)
+CHOICES: Statistic[Choices] = Statistic(
+    estimate=_choices,
+    cells=lambda value: value._asdict(),
+    columns=(
+        Column(
+            "chose",
+            lambda row: UNDEFINED if row[CHOICES].n_chose is None else str(row[CHOICES].n_chose),
+            name="chose",
+            rank=2,
+            is_extra=True,
+        ),
+        Column("right if chose", _shown_right, name="right_if_chose", rank=2, is_extra=True),
+    ),
+)
+STEPS: Statistic[float | None] = Statistic(
+    estimate=lambda of: _mean(
+        [record for record in of.episodes.results if record.success_once], lambda record: record.success_step
+    ),
+    cells=lambda value: {"mean_success_step": value},
+    columns=(Column("steps", lambda row: _count(row[STEPS]), name="steps", rank=6),),
+)
+INFERENCES: Statistic[float | None] = Statistic(
+    estimate=lambda of: _mean(of.episodes.results, lambda record: record.n_inferences),
+    cells=lambda value: {"inferences_per_episode": value},
+    columns=(Column("infer.", lambda row: _count(row[INFERENCES]), name="inferences", rank=8),),
+)
