@@ -158,7 +158,6 @@ def require_checked(dataset: OpenDataset) -> None:
 
 
 def _known_or_found(facts: Facts | None, demonstrations: Demonstrations) -> Iterator[Said]:
-    """Yield what a conversion has found, or what is found now; a recording follows the rules."""
     if facts is not None and facts.is_checked:
         yield from (_kept(sentence) for sentence in facts.kept)
     else:

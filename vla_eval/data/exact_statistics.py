@@ -149,8 +149,6 @@ def about_still_dimensions(statistics: _Fields | None, features: _Fields) -> Ite
 
 
 class _Field(NamedTuple):
-    """State or action: names of its dimensions, its statistics, and the least spread of each dimension."""
-
     key: str
     names: list[str]
     found: dict[str, NDArray[np.float64]]

@@ -9,7 +9,7 @@ from vla_eval.errors import DatasetError
 from vla_eval.lock.switch import distrust
 
 SNAPSHOTS, BLOBS = "snapshots", "blobs"
-"""The Hub's cache keeps a dataset as `snapshots/REVISION`, whose files are links into `blobs` beside it."""
+"""The Hub's cache keeps a dataset as `snapshots/REVISION`, whose files are links into its sibling `blobs`."""
 REMEDY = "It is not read. Copy the dataset with `cp -rL` if you trust where it leads, or fetch it again."
 
 

@@ -54,8 +54,6 @@ class DatasetInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Feature:
-    """What lerobot computes with of a feature."""
-
     dtype: str
     shape: tuple[Positive, ...]
     names: Any = field(default=None)  # Any: a list, or a mapping of lists

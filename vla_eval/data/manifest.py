@@ -1,4 +1,4 @@
-"""What lies in `meta/mikasa/` beside lerobot's own files: which episodes these are, and proof of it.
+"""The files in `meta/mikasa/`, next to lerobot's own: which episodes these are, and proof of it.
 
     manifest.jsonl  one `RecordedEpisode` per episode: enough to make the episode again
     failed.jsonl    one `FailedSeed` per seed at which the expert did not succeed

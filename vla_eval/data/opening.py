@@ -53,7 +53,7 @@ NEEDED = ("meta/info.json", "meta/tasks.parquet", EPISODE_TABLES, FRAME_TABLES)
 
 
 class LocalDataset:
-    """A LeRobotDataset (v3) that is there in full, whoever made it. Each of its files is read once.
+    """A LeRobotDataset (v3) that is there in full, of any program. Each of its files is read once.
 
     Raises:
         DatasetError: there is none, or files are missing.
@@ -186,7 +186,6 @@ class OpenDataset:
 
     @functools.cached_property
     def _spoken(self) -> list[tuple[str, list[str]]]:
-        """Return of each episode its task and its sentences."""
         names = self.meta.tasks.index
         episodes, indices = (self.columns[key].astype(np.int64) for key in ("episode_index", "task_index"))
         sources = self.facts.sources if isinstance(self.facts, MixtureFacts) else ()

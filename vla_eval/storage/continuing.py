@@ -62,7 +62,7 @@ def continued(
         return RunFile(description=description, sessions=(session,))
     old = known.description
     if may_grow:
-        known.planned(folder)  # what is no configuration cannot be compared with a larger one
+        known.planned(folder)  # what is not a configuration cannot be compared with a larger one
     _check_unchanged(old, description, shown, may_grow=may_grow)
     changes = find_changes(
         without_device(old.environment), without_device(description.environment), prefix="environment"
@@ -118,7 +118,7 @@ def check_allowed(changes: Sequence[Change], *, shown: Path, allowed: bool) -> N
 
 
 def without_device(environment: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """Return what is known of the environment before a worker has started."""
+    """Return the environment as it is known before a worker has started."""
     return {name: value for name, value in environment.items() if name != DEVICE}
 
 

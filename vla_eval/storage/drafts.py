@@ -1,4 +1,4 @@
-"""Write a folder beside its place and rename it when it is whole. Knows nothing of what it holds."""
+"""Write a folder next to its place and rename it when it is whole. Knows nothing of what it holds."""
 
 import contextlib
 import errno

@@ -1,7 +1,7 @@
 """Write files so that a killed process, a full disk or a power cut loses nothing that was promised.
 
 Ours, since a record has to be a line of plain text that is durable when `append` returns, and gone if the
-disk was full: Python's files promise neither, and a database is no text. Knows nothing of episodes.
+disk was full: Python's files promise neither, and a database is not text. Knows nothing of episodes.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """Read `episodes.jsonl`, and repair its end after its writer was killed.
 
-One line is one `EpisodeRecord`. What follows the last newline is no line yet.
+One line is one `EpisodeRecord`. What follows the last newline is not a line yet.
 """
 
 import json

@@ -61,7 +61,7 @@ def other_files(
 
 
 def _check_subfolder(path: Path) -> None:
-    """Raise `RunFolderError` where a run would have to write into what is no folder, or into a closed one."""
+    """Raise `RunFolderError` where a run would write into something that is not a folder, or a closed one."""
     if not path.is_dir() and (path.exists() or path.is_symlink()):
         raise RunFolderError(
             f"{path}: expected a folder, found something else. Move it away, or use another --out."
@@ -74,7 +74,7 @@ def _check_subfolder(path: Path) -> None:
 
 
 def not_a_run_folder(path: Path) -> RunFolderError:
-    """Build the error for a folder that is no run folder, with the ones that may have been meant."""
+    """Build the error for a folder that is not a run folder, with the ones that may have been meant."""
     inside = _run_folders(path)
     if inside:
         shown = " ".join(str(path / name) for name in inside[:5])

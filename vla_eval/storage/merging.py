@@ -89,7 +89,6 @@ def _link_captures(run: StoredRun, target: Path) -> None:
 
 
 def _missing_episodes(part: ShardPart, there: set[EpisodeKey]) -> Iterator[str]:
-    """Say how many episodes of a shard were not run."""
     absent = [key for key in _planned(part) if key not in there]
     if absent:
         yield (

@@ -158,7 +158,7 @@ def find_changes(
 
 
 def leaves(value: JsonValue, *, prefix: str) -> Iterator[tuple[str, str]]:
-    """Yield path and JSON text of each value that is no mapping; an empty mapping has none."""
+    """Yield path and JSON text of each value that is not a mapping; an empty mapping has none."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from leaves(item, prefix=f"{prefix}.{key}" if prefix else str(key))
@@ -169,7 +169,7 @@ def leaves(value: JsonValue, *, prefix: str) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Sessions:
-    """As they are in the file, beside the description."""
+    """As they are in the file, next to the description."""
 
     sessions: tuple[Session, ...]
 

@@ -162,7 +162,6 @@ class RunFolder:
             self._write(sound)
 
     def _check(self, record: EpisodeRecord, others: Collection[EpisodeKey]) -> None:
-        """Raise `RunFolderError` if an episode cannot be stored after the others."""
         if self._episodes is None:
             raise RunFolderError(f"{self.path}: the run folder is closed. Open it again before appending.")
         if record.outcome != "error" and (record.key in self._finished or record.key in others):

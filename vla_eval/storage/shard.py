@@ -68,7 +68,7 @@ class Shard:
 
 
 def shard_folder(out: Path, shard: Shard | None) -> Path:
-    """Return the folder beside `out` that a shard goes to, `out-shard-3-of-8`; `out` itself without one."""
+    """Return the sibling of `out` that a shard goes to, `out-shard-3-of-8`; `out` itself without one."""
     if shard is None:
         return out
     named = out if out.name not in ("", "..") else out.resolve()

@@ -96,7 +96,6 @@ def _refuse_other_plan(first: ShardPart, other: ShardPart) -> None:
 
 
 def _division(shard: Shard) -> dict[str, JsonValue]:
-    """Return what all shards of a plan have in common."""
     return {"count": shard.count, "block_size": shard.block_size, "groups": shard.groups}
 
 
@@ -112,7 +111,7 @@ def _refuse_doubles(parts: Sequence[ShardPart]) -> None:
 
 
 def _environment_changes(first: ShardPart, other: ShardPart) -> tuple[Change, ...]:
-    """Return how the environments differ; of the devices, what is known of both."""
+    """Return how the environments differ; of the devices, in what both state."""
     environments = [without_device(part.run_file.description.environment) for part in (first, other)]
     return (
         *find_changes(*environments, prefix="environment"),

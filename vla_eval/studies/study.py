@@ -196,7 +196,6 @@ def tiny_models(study: Study) -> Iterator[None]:
 
 
 def _free_memory() -> None:
-    """Give a GPU's memory back before the next model."""
     import gc
 
     import torch

@@ -78,7 +78,7 @@ class StepBatches(Sampler[list[Any]]):
 
 
 class SeededSamples(Dataset[Any]):
-    """Seeds each sample's random augmentation by run seed, epoch and number, whoever makes it."""
+    """Seeds each sample's random augmentation by run seed, epoch and number, in any process."""
 
     def __init__(self, dataset: Any, run_seed: int) -> None:
         self._dataset, self._run_seed = dataset, run_seed

@@ -125,7 +125,6 @@ def _estimate(
 
 
 def _passes(policy: Any, dataset: OpenDataset, recipe: FinetuneRecipe) -> str:
-    """Return a line that says how often a training sees the dataset."""
     n_samples, frames = recipe.steps * recipe.batch_size, used_frames(policy, dataset).n_used
     if getattr(policy, "whole_episodes", False):
         episodes = len(dataset.lengths)

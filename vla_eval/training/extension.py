@@ -76,7 +76,6 @@ def _rates(policy: Any, n_steps: int) -> Iterator[float]:
 
 
 def _new_training(job: TrainingJob, config: FinetuneConfig, steps: int) -> str:
-    """Return the command that begins a new training with the newest weights."""
     weights = whole_checkpoints(job.out)[-1] / MODEL_FOLDER
     out = next(path for n in range(2, 1000) if not (path := Path(f"{job.out}-{n}")).exists())
     flags: dict[str, object] = {"--policy": config.policy, "--dataset": config.dataset}

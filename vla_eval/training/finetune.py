@@ -152,7 +152,6 @@ def _listeners(
 
 
 def _sentences(job: TrainingJob, say: Say) -> Callable[[SentenceReading], None]:
-    """Return what says which sentences are cut, and which tasks become one."""
     watch = SentenceWatch(job.name)
 
     def name(reading: SentenceReading) -> None:

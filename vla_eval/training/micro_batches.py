@@ -11,7 +11,7 @@ from vla_eval.errors import TrainingError
 
 
 class Loss(NamedTuple):
-    """The loss of a whole batch, and what the policy reports beside it, numbers averaged over samples."""
+    """The loss of a whole batch, and what the policy reports with it, numbers averaged over samples."""
 
     value: Tensor
     parts: dict[str, Any]
@@ -52,13 +52,11 @@ def add_gradient(
 
 
 class _Reported:
-    """What a policy reports beside its loss, averaged over parts."""
-
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}
 
     def add(self, output: Mapping[str, Any] | None, share: float) -> None:
-        """Add the values of a part with this share of the samples; what is no number is the last part's."""
+        """Add a part with this share of the samples; what is not a number is the last one's."""
         for name, value in (output or {}).items():
             if isinstance(value, float | int) and not isinstance(value, bool):
                 value = self.values.get(name, 0.0) + share * value

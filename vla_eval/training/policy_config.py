@@ -121,7 +121,6 @@ def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
 
 
 def _check_features(config: Any, dataset: OpenDataset) -> None:
-    """Ask the policy whether it takes the dataset's fields, before anything is built."""
     try:
         copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
     except VlaEvalError:

@@ -98,7 +98,6 @@ def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
 
 
 def _held_out(settings: HeldOutConfig, task: str, out: Path, last_step: int) -> HeldOut:
-    """Return evaluations that are only looked for, not run."""
     return HeldOut(
         settings=settings,
         task=task_spec(task).id,

@@ -89,7 +89,6 @@ def _change_steps(
     record: Mapping[str, JsonValue],
     check_steps: Callable[[int, int], None],
 ) -> None:
-    """Let a run have another number of steps, and write down that it was changed."""
     before, done = known[COMPARED][RECIPE].get(STEPS), newest_step(path)
     if type(before) is not int:
         raise _source(path / RUN_FILE).refuse(f"{STEPS} {shown(before)}", "expected a whole number")
@@ -210,7 +209,6 @@ def _source(where: Path | str, what: str = "the description of a fine-tuning") -
 
 
 def _cut_metrics(path: Path, step: int) -> None:
-    """Drop the lines of steps that will be run again."""
     if path.is_file():
         kept = [line for line in read_metrics(path.parent) if line["step"] <= step]
         replace_file(path, "".join(f"{json.dumps(line)}\n" for line in kept))

@@ -1,4 +1,4 @@
-"""Metrics to services beside the file: wandb, trackio, TensorBoard. One that fails is left out."""
+"""Metrics to services in addition to the file: wandb, trackio, TensorBoard. One that fails is left out."""
 
 import contextlib
 import functools
@@ -131,7 +131,7 @@ def _tensorboard(job: TrainingJob) -> Service:
 
 def _trackio(job: TrainingJob) -> Service:
     trackio: Any = importlib.import_module("trackio")
-    # No figures of the machine: they would start threads that measure beside the training.
+    # No figures of the machine: they would start threads that measure during the training.
     quiet = {"embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
     name, settings = job.out.resolve().name, to_data(job.recipe)
     trackio.init(project=job.recipe.trackio_project, name=name, resume="allow", config=settings, **quiet)
@@ -187,7 +187,7 @@ def _wandb(job: TrainingJob) -> Service:
 
 
 def _of_artifact(folder: Path) -> list[Path]:
-    """Return what lerobot's logger uploads: the weights, and what an adapter needs beside them."""
+    """Return what lerobot's logger uploads: the weights, and what an adapter needs in addition."""
     files = [weights_file(folder)]
     if (folder / ADAPTER_CONFIG_FILE).is_file():
         files += [folder / ADAPTER_CONFIG_FILE, folder / CONFIG_FILE]

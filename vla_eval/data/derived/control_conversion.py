@@ -124,7 +124,6 @@ def _copied(
     *,
     begun: float,
 ) -> RecordedDataset:
-    """Return the new dataset with the images of the old one."""
     changed = [
         dataclasses.replace(
             episode,

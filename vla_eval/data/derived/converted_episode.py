@@ -69,8 +69,6 @@ def _ignore(_stage: Stage) -> None:
 
 
 class _AimLog:
-    """A `StepObserver` that notes where the joints are to go in each step."""
-
     def __init__(self, env: JointAims) -> None:
         self._env = env
         self.aims: list[FloatArray] = []

@@ -89,7 +89,6 @@ def _source(opened: OpenDataset) -> MixtureSource:
 
 
 def _refuse_difference(first: OpenDataset, other: OpenDataset) -> None:
-    """Raise `DatasetError` where two datasets differ in what a policy sees or does."""
     expected, found = _form(first), _form(other)
     for what in {**expected, **found}:
         if expected.get(what) != found.get(what):

@@ -78,7 +78,7 @@ def _attempt(episode: RecordedEpisode) -> Attempt:
 
 
 def failed_attempt(seed: int, n_steps: int) -> Attempt:
-    """Return what is known of a failed seed; nobody renders it."""
+    """Return the attempt of a failed seed, which is not rendered."""
     return Attempt(
         seed=seed,
         success_step=None,

@@ -1,4 +1,4 @@
-"""Read demonstrations from a LeRobotDataset, whoever wrote it: what its fields mean, and its images."""
+"""Read demonstrations from a LeRobotDataset of any program: what its fields mean, and its images."""
 
 import re
 from collections.abc import Mapping
@@ -203,7 +203,6 @@ def _decoded(dataset: Any, rows: EpisodeRows, camera: str) -> ImageArray:
 
 
 def _stored(dataset: Any, rows: EpisodeRows, camera: str) -> ImageArray:
-    """Return frames that are stored as images in the table."""
     _, height, width = channels_first(dataset.meta.features[camera])
     table = dataset.hf_dataset.with_format(None).select_columns([camera])
     frames = []

@@ -1,1 +1,1 @@
-"""Decoded frames of a dataset: each decoded once, cached in files, with earlier frames beside them."""
+"""Decoded frames of a dataset: each decoded once, cached in files, and served with earlier ones."""

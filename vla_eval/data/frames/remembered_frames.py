@@ -80,7 +80,7 @@ class RememberedFramesDataset(DecodedFramesDataset):
         return images
 
     def _chosen(self, choice: FrameChoice) -> torch.Tensor:
-        """Return (frames, places): which rows are shown beside each, `NO_ROW` for none."""
+        """Return (frames, places): which rows are shown with each, `NO_ROW` for none."""
         frames = self._frames[self._memory.cameras[0]]
         chosen = torch.full((len(self), choice.n_places), NO_ROW)
         seen = Seen()

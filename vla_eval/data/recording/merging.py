@@ -47,8 +47,6 @@ class MergedTask:
 
 
 class _Tried(NamedTuple):
-    """A part that has tried all seeds."""
-
     folder: Path
     selection: Selection
 
@@ -155,7 +153,6 @@ def _of_task(task: TaskPlan, part: ShardPart) -> str:
 
 
 def _selection(task: TaskPlan, part: ShardPart) -> Selection | None:
-    """Return what a part has chosen; None if it has not tried all seeds."""
     queue = SeedQueue(task, read_attempts(part.path, task.task))
     return None if queue.has_next() else queue.selection()
 

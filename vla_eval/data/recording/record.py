@@ -49,7 +49,7 @@ from vla_eval.workers.process import WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording.worker"
-MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is no accident
+MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is not an accident
 
 Phase = Literal["trying seeds", "converting", "rendering", "joining", "replaying"]
 RecordingPool = Pool[RecordingJob, RecordingAnswer]
@@ -72,8 +72,6 @@ class RecordingObserver(Protocol):
 
 
 class _Silence:
-    """Watches nothing and never stops."""
-
     def on_tick(self) -> bool:
         return False
 
@@ -95,7 +93,7 @@ class RecordedDataset:
 
     @classmethod
     def read(cls, path: Path, *, seconds: float) -> Self:
-        """Return what is known of the dataset in a folder."""
+        """Read the dataset in a folder."""
         return cls(
             path=path,
             facts=read_facts(path),
@@ -216,8 +214,6 @@ def record(
 
 @dataclass(slots=True, kw_only=True)
 class _Recorder:
-    """Takes the tasks of a recipe through their phases."""
-
     plan: RecordingPlan
     folder: RecordingFolder
     pool: RecordingPool
@@ -304,7 +300,6 @@ class _Recorder:
 
 
 def _raise_if_last(failed: Failed, n_failed: int, name: str) -> None:
-    """Raise if it makes no sense to try the job again."""
     if failed.refused:
         raise as_exception(failed.error)
     if n_failed >= MAX_TRIES:

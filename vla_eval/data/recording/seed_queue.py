@@ -70,7 +70,6 @@ class SeedQueue:
         return self._recipe.keep == "all" or one.success_step is not None
 
     def _next(self) -> int | None:
-        """Return the lowest seed that must be tried and is not."""
         n_hopeful = 0
         for seed in range(self._recipe.seed_start, self._recipe.last_seed + 1):
             if n_hopeful >= self._recipe.episodes:

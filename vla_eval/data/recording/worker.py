@@ -73,7 +73,6 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
         return self._write_shard(job) if isinstance(job, ShardJob) else join_dataset(job)
 
     def _explained(self, exc: BaseException, job: RecordingJob) -> BaseException:
-        """Return a `StorageFullError` in place of what a full disk has caused."""
         if isinstance(exc, VlaEvalError) or isinstance(job, AttemptJob):
             return exc
         is_known = isinstance(exc, OSError) and exc.errno in DISK_TROUBLE

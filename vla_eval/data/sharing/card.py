@@ -45,7 +45,6 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
 
 
 def _render(summary: DatasetSummary, *, license_id: str | None = None) -> str:
-    """Return the card of a dataset."""
     facts = summary.dataset.facts
     if license_id is None and (
         all(source.task_version is not None for source in facts.sources)
@@ -144,7 +143,6 @@ def _fields(summary: DatasetSummary) -> str:
 
 
 def _origin(summary: DatasetSummary) -> str:
-    """Say how a recording came about, and what proves it."""
     facts, replay = summary.dataset.facts, summary.dataset.replay
     if not isinstance(facts, DatasetFacts):
         return ""
@@ -177,7 +175,6 @@ def _origin(summary: DatasetSummary) -> str:
 
 
 def _import(summary: DatasetSummary) -> str:
-    """Say where an import came from, and what it lacks."""
     facts = summary.dataset.facts
     if not isinstance(facts, ImportFacts):
         return ""
@@ -198,7 +195,6 @@ def _import(summary: DatasetSummary) -> str:
 
 
 def _mixture(summary: DatasetSummary) -> str:
-    """Say of which datasets a mixture was made."""
     facts = summary.dataset.facts
     if not isinstance(facts, MixtureFacts):
         return ""
@@ -226,7 +222,6 @@ def _mixture(summary: DatasetSummary) -> str:
 
 
 def _differences(summary: DatasetSummary) -> str:
-    """Say how a recording differs from the data that the paper's policies were trained on."""
     facts = summary.dataset.facts
     if not isinstance(facts, DatasetFacts):
         return ""

@@ -117,7 +117,6 @@ def _tag(api: HfApi, repo_id: str, commit: str) -> None:
 
 @contextmanager
 def _hub_errors(what: str) -> Iterator[None]:
-    """Turn what the Hub's client raises into one message."""
     try:
         yield
     except (OSError, httpx.HTTPError, HFValidationError) as exc:

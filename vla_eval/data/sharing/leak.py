@@ -59,8 +59,6 @@ class LeakReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Start:
-    """How an episode of the evaluation begins."""
-
     seed: int
     states: dict[StateKind, FloatArray]
     frames: Frames
