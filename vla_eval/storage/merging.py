@@ -4,6 +4,7 @@ Everything is checked before anything is written, and the new folder appears who
 are. Knows nothing of tasks, policies or statistics.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,16 +77,11 @@ def write_merged(merged: MergedRun, out: Path) -> None:
             replace_file(draft / EPISODES_FILE, "".join(f"{one.to_json()}\n" for one in merged.records))
             merged.run_file.save(draft)
             for run in merged.runs:
-                _link_captures(run, draft)
+                for place, record in itertools.product(CAPTURES, run.records):
+                    if place(run.path, record).is_file():
+                        link_file(place(run.path, record), place(draft, record))
     except OSError as exc:
         raise storage_full(out, exc) from exc
-
-
-def _link_captures(run: StoredRun, target: Path) -> None:
-    for record in run.records:
-        for place in CAPTURES:
-            if place(run.path, record).is_file():
-                link_file(place(run.path, record), place(target, record))
 
 
 def _missing_episodes(part: ShardPart, there: set[EpisodeKey]) -> Iterator[str]:

@@ -80,7 +80,9 @@ class PlannedEpisodes:
         """Return why a record is none of this run; None if it may be one."""
         config = self.config
         key, task = record.key, record.task
-        tasks = _known(config.task_versions, config.tasks)
+        tasks: Collection[str] | None = config.task_versions
+        if tasks is None and config.tasks is not None:
+            tasks = [bare_task(one) for one in config.tasks]
         if tasks is not None and task not in tasks:
             return f"the tasks are {some_of(tasks)}"
         if config.policy_names is not None and key.policy not in config.policy_names:
@@ -109,9 +111,3 @@ def bare_name(name: str) -> str:
 def bare_task(name: str) -> str:
     """Return what records call a task given with this package's namespace; others are part of its id."""
     return name.removeprefix("vla_eval/")
-
-
-def _known(versions: Mapping[str, int] | None, tasks: Collection[str] | None) -> Collection[str] | None:
-    if versions is not None:
-        return versions
-    return None if tasks is None else [bare_task(task) for task in tasks]

@@ -62,7 +62,10 @@ def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: 
                 f"--allow-environment-change: the change is then recorded and the report names it."
             )
         if part is not first:
-            sessions += [_with_changes(session, changes) for session in part.run_file.sessions]
+            sessions += [
+                replace(one, environment_changes=(*one.environment_changes, *changes))
+                for one in part.run_file.sessions
+            ]
         device = {**known_device(part.run_file), **device}
     environment = without_device(first.run_file.description.environment) | (
         {DEVICE: device} if device else {}
@@ -117,7 +120,3 @@ def _environment_changes(first: ShardPart, other: ShardPart) -> tuple[Change, ..
         *find_changes(*environments, prefix="environment"),
         *device_changes(first.run_file, known_device(other.run_file)),
     )
-
-
-def _with_changes(session: Session, changes: Sequence[Change]) -> Session:
-    return replace(session, environment_changes=(*session.environment_changes, *changes))

@@ -45,7 +45,7 @@ class FolderStart:
         folders = [entry for entry in new if entry.is_dir() and not entry.is_symlink()]
         files = [entry for entry in new if entry not in folders]
         known = self._own.issuperset(file.name for file in files)
-        if not known or not all(_is_bare(folder) or _is_of_logs(folder) for folder in folders):
+        if not known or not all(map(_is_of_start, folders)):
             return
         for file in files:
             file.unlink()
@@ -97,12 +97,10 @@ def starting(
         ) from exc
 
 
-def _is_of_logs(folder: Path) -> bool:
-    return folder.name == LOGS_FOLDER and all(
+def _is_of_start(folder: Path) -> bool:
+    """Whether there is no file in it, at any depth, or only logs."""
+    if folder.name == LOGS_FOLDER and all(
         entry.suffix == ".log" and entry.is_file() for entry in folder.iterdir()
-    )
-
-
-def _is_bare(folder: Path) -> bool:
-    """Whether there is no file in it, at any depth."""
+    ):
+        return True
     return all(entry.is_dir() and not entry.is_symlink() for entry in folder.rglob("*"))

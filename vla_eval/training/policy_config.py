@@ -97,15 +97,10 @@ def fit_to_dataset(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) ->
             config.fit_to_actions(actions, statistics[ACTION_KEY])
         if hasattr(config, "fit_to_rewards"):
             config.fit_to_rewards(dataset.columns_used)
-        if not masks_padding(config):
-            _leave_out_tails(config)
-
-
-def _leave_out_tails(config: Any) -> None:
-    """Train on no chunk that reaches beyond its episode: the policy would learn to repeat the last action."""
-    longest = max(config.action_delta_indices)
-    if getattr(config, "drop_n_last_frames", None) != longest:  # GR00T computes it
-        config.drop_n_last_frames = longest  # the sampler of lerobot's loop reads this
+        if not masks_padding(config):  # else it would learn to repeat an episode's last action
+            longest = max(config.action_delta_indices)
+            if getattr(config, "drop_n_last_frames", None) != longest:  # GR00T computes it
+                config.drop_n_last_frames = longest  # the sampler of lerobot's loop reads this
 
 
 def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:

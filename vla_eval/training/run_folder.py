@@ -132,7 +132,9 @@ def newest_checkpoint(path: Path) -> Path | None:
     for partial in folder.glob(f"{PARTIAL_PREFIX}*"):
         shutil.rmtree(partial)
     point(folder / LAST, whole[-1].name)
-    _cut_metrics(path / METRICS_FILE, int(whole[-1].name))
+    if (path / METRICS_FILE).is_file():  # without the lines of steps that will be run again
+        kept = [line for line in read_metrics(path) if line["step"] <= int(whole[-1].name)]
+        replace_file(path / METRICS_FILE, "".join(f"{json.dumps(line)}\n" for line in kept))
     return whole[-1]
 
 
@@ -206,9 +208,3 @@ def _settings(record: dict[str, Any], file: Path) -> dict[str, Any]:  # Any: JSO
 def _source(where: Path | str, what: str = "the description of a fine-tuning") -> Source:
     remedy = "The file was changed by something else; restore it, or use another --out."
     return Source(where=str(where), what=what, remedy=remedy, error=TrainingError)
-
-
-def _cut_metrics(path: Path, step: int) -> None:
-    if path.is_file():
-        kept = [line for line in read_metrics(path.parent) if line["step"] <= step]
-        replace_file(path, "".join(f"{json.dumps(line)}\n" for line in kept))

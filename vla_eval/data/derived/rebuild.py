@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from vla_eval.data.facts import read_facts
-from vla_eval.data.manifest import FAILED_FILE, RecordedEpisode, manifest_sha256, read_failed, read_manifest
+from vla_eval.data.manifest import FAILED_FILE, manifest_sha256, read_failed, read_manifest
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.record import RecordedDataset, RecordingObserver, record
 from vla_eval.data.recording.seed_queue import Selection
@@ -52,8 +52,9 @@ def rebuild(
     task = episodes[0].task
     recipe = dataclasses.replace(recipe_of(read_facts(dataset)), tasks=(task,), workers=workers)
     failed = read_failed(dataset) if (dataset / FAILED_FILE).exists() else ()
+    names = [field.name for field in dataclasses.fields(Attempt)]
     selection = Selection(
-        kept=tuple(_attempt(episode) for episode in episodes),
+        kept=tuple(Attempt(**{name: getattr(one, name) for name in names}) for one in episodes),
         failed=tuple(failed_attempt(one.seed, one.n_steps) for one in failed),
     )
     summary = record(
@@ -71,10 +72,6 @@ def rebuild(
     return Rebuilt(
         dataset=made, n_same_images=sum(old.images_sha256 == new.images_sha256 for old, new in pairs)
     )
-
-
-def _attempt(episode: RecordedEpisode) -> Attempt:
-    return Attempt(**{one.name: getattr(episode, one.name) for one in dataclasses.fields(Attempt)})
 
 
 def failed_attempt(seed: int, n_steps: int) -> Attempt:

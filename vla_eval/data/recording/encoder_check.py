@@ -30,7 +30,8 @@ def check_encoder(settings: EncoderSettings) -> None:
     if name in OF_A_DEVICE:
         return
     try:
-        formats = [one.name for one in av.Codec(name, "w").video_formats or () if _n_parts(one) == N_COLOURS]
+        known_formats = av.Codec(name, "w").video_formats or ()
+        formats = [one.name for one in known_formats if len(one.components) == N_COLOURS]
     except av.codec.codec.UnknownCodecError as exc:
         raise RecipeError(
             f"encoder.vcodec: PyAV has no encoder '{name}' on this machine. Choose another one of "
@@ -48,10 +49,6 @@ def check_encoder(settings: EncoderSettings) -> None:
             f"encoder: '{name}' does not take pix_fmt {settings.pix_fmt} with crf {settings.crf} and g "
             f"{settings.g} ({exc}). Change the section `encoder`, or leave it out."
         ) from exc
-
-
-def _n_parts(pixel_format: "av.VideoFormat") -> int:
-    return len(pixel_format.components)
 
 
 def _encode_one_frame(name: str, settings: EncoderSettings) -> None:

@@ -225,14 +225,21 @@ def _differences(summary: DatasetSummary) -> str:
     facts = summary.dataset.facts
     if not isinstance(facts, DatasetFacts):
         return ""
+    after = markdown_cell(str(facts.recipe.get("steps_after_success")))
+    cut = f"{after} steps after the first success"
+    cut = "at the horizon" if facts.recipe.get("cut") == "horizon" else cut
+    is_intended = facts.recipe.get("stored_action") == "intended"
+    stored = (
+        "as the expert asked for them, before noise was added" if is_intended else "as they were executed"
+    )
     lines = [
         "- The simulation is a new implementation of the tasks, not the authors' code "
         "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
         _expert_difference(facts, summary),
         f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper says that all of "
         f"its episodes succeed, and its recorder kept every episode, whether it succeeded or not.",
-        f"- Cut: {_cut(facts)}; the paper's recorder recorded to the horizon.",
-        f"- Actions are for {markdown_code(facts.control_mode)}, {_stored(facts)}; the paper's recordings "
+        f"- Cut: {cut}; the paper's recorder recorded to the horizon.",
+        f"- Actions are for {markdown_code(facts.control_mode)}, {stored}; the paper's recordings "
         f"for reinforcement learning are for {markdown_code(JOINT_DELTA_POS)}.",
         "- Images are video (lossy); the paper's are arrays of pixels.",
     ]
@@ -255,18 +262,6 @@ def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
             f"expect imitation to be easier than with the paper's data."
         )
     return text
-
-
-def _stored(facts: DatasetFacts) -> str:
-    if facts.recipe.get("stored_action") == "intended":
-        return "as the expert asked for them, before noise was added"
-    return "as they were executed"
-
-
-def _cut(facts: DatasetFacts) -> str:
-    if facts.recipe.get("cut") == "horizon":
-        return "at the horizon"
-    return f"{markdown_cell(str(facts.recipe.get('steps_after_success')))} steps after the first success"
 
 
 _SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {

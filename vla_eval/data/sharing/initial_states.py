@@ -69,7 +69,10 @@ def read_initial_states(path: Path) -> InitialStates:
         task=task,
         simulator=simulator,
         episodes=tuple(states),
-        read_frames=lambda: [_first_frames(episode) for episode in source.episodes],
+        read_frames=lambda: [
+            {camera: images[0] for camera, images in zip(CAMERA_KEYS, episode.read_images(), strict=True)}
+            for episode in source.episodes
+        ],
     )
 
 
@@ -80,11 +83,6 @@ def _state_of(episode: SourceEpisode) -> tuple[StateKind, FloatArray]:
     if EEF_KEY in firsts:
         return "eef", firsts[EEF_KEY]
     return "eef", eef_of_proprio(firsts[SOURCE_PROPRIO_KEY])  # a source has one of the three
-
-
-def _first_frames(episode: SourceEpisode) -> Frames:
-    images = (images[0] for images in episode.read_images())
-    return dict(zip(CAMERA_KEYS, images, strict=True))
 
 
 def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, Simulator]:

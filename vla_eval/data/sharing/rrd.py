@@ -87,10 +87,11 @@ def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Pa
     frames = [
         read_sample(dataset, index) for index in range(row["dataset_from_index"], row["dataset_to_index"])
     ]
+    cameras = [_camera(key) for key in dataset.meta.camera_keys]
     with rrd_when_whole(
         path,
         recording_id=f"{dataset.root.name}_{number}",
-        blueprint=_layout(dataset),
+        blueprint=layout(cameras, _dims(dataset, ACTION_KEY), _dims(dataset, STATE_KEY)),
         failed="cannot be written",
         advice="Free some space.",
     ) as stream:
@@ -101,11 +102,6 @@ def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Pa
         if recorded is not None:
             _log_phases(stream, recorded, float(dataset.fps))
     return path
-
-
-def _layout(dataset: Any) -> Any:
-    cameras = [_camera(key) for key in dataset.meta.camera_keys]
-    return layout(cameras, _dims(dataset, ACTION_KEY), _dims(dataset, STATE_KEY))
 
 
 def _camera(key: str) -> str:
