@@ -1,7 +1,7 @@
 """`mikasa-vla dataset check`: a report on a dataset, whichever program made it. Decodes no image."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
@@ -14,7 +14,7 @@ from vla_eval.data.checks.agreement import episodes_by_video
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import Answer, find_breaches, require_sound
 from vla_eval.data.dataset_folder import check_complete
-from vla_eval.data.facts import Facts, MixtureFacts, has_facts
+from vla_eval.data.facts import MixtureFacts, has_facts
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.foreign.episodes import Source
@@ -77,12 +77,15 @@ def check(path: Path) -> CheckReport:
     demonstrations = demonstrations_of(dataset)
     found = (*check_videos(dataset), *_statistics(dataset, demonstrations))
     if facts is not None or has_our_fields(dataset.meta.features):
+        known: Iterable[Said] = _breaches(demonstrations)
+        if facts is not None and facts.is_checked:  # the rules were applied when it was made
+            known = map(_kept, facts.kept)
         kind = "a LeRobotDataset with the fields of this project, without its records"
         return CheckReport(
             path=path,
             kind=kind if facts is None else facts.kind,
             demonstrations=demonstrations,
-            said=(*found, *_known_or_found(facts, demonstrations)),
+            said=(*found, *known),
             next_step=f"mikasa-vla dataset adopt {path}" if facts is None else "",
         )
     kind = "a LeRobotDataset"
@@ -155,13 +158,6 @@ def require_checked(dataset: OpenDataset) -> None:
     if not dataset.facts.is_checked:
         is_mixture = isinstance(dataset.facts, MixtureFacts)
         require_sound(dataclasses.replace(demonstrations_of(dataset.local), is_gripper_named=is_mixture))
-
-
-def _known_or_found(facts: Facts | None, demonstrations: Demonstrations) -> Iterator[Said]:
-    if facts is not None and facts.is_checked:
-        yield from (_kept(sentence) for sentence in facts.kept)
-    else:
-        yield from _breaches(demonstrations)
 
 
 def _breaches(demonstrations: Demonstrations) -> Iterator[Said]:

@@ -76,7 +76,7 @@ class LocalDataset:
         """Its numbers, frame by frame."""
         return self.tables.columns
 
-    @property
+    @functools.cached_property
     def meta(self) -> Any:
         """Lerobot's description of it."""
         return self.whole.meta
@@ -106,6 +106,11 @@ class LocalDataset:
         """
         with self.readers():
             return _open(self.root, options)
+
+    def release(self) -> None:
+        """Free the frames, once a training's dataset has them; description and columns stay."""
+        self.__dict__.pop("whole", None)
+        self.tables.__dict__.pop("frames", None)
 
     def readers(self) -> contextlib.AbstractContextManager[None]:
         """Let lerobot read this dataset from memory."""

@@ -239,6 +239,7 @@ def _dataset(job: TrainingJob, config: Any) -> Any:
     """Return lerobot's dataset, or one that serves the same from decoded frames."""
     with job.dataset.local.readers():
         dataset = make_dataset(config)
+    job.dataset.local.release()
     if job.sample_memory is not None:
         return RememberedFramesDataset(dataset, job.sample_memory)
     if job.recipe.decode_ahead:

@@ -90,23 +90,24 @@ def convert_control_mode(
     n_same_states = sum(one.states_sha256 == recorded[one.seed] for one in kept)
     recipe = dataclasses.replace(recipe, episodes=len(kept))
     if n_same_states == len(episodes):
-        made = _copied(dataset, out / plan.task, episodes, kept, recipe, begun=begun)
-        return Converted(dataset=made, n_episodes=len(episodes), n_same_states=n_same_states, left_out=())
-    summary = record(
-        recipe,
-        out=out,
-        observer=observer,
-        selections={
-            plan.task: Selection(
-                kept=tuple(kept), failed=tuple(sorted(failed, key=operator.attrgetter("seed")))
-            )
-        },
-        source=manifest_sha256(dataset),
-        backend=backend,
-    )
-    if summary.was_stopped:
-        return None
-    (made,) = summary.datasets
+        copy_with_actions(dataset, out / plan.task, _with_actions(episodes, kept, recipe), recipe)
+        made = RecordedDataset.read(out / plan.task, seconds=time.monotonic() - begun)
+    else:
+        summary = record(
+            recipe,
+            out=out,
+            observer=observer,
+            selections={
+                plan.task: Selection(
+                    kept=tuple(kept), failed=tuple(sorted(failed, key=operator.attrgetter("seed")))
+                )
+            },
+            source=manifest_sha256(dataset),
+            backend=backend,
+        )
+        if summary.was_stopped:
+            return None
+        (made,) = summary.datasets
     return Converted(
         dataset=made,
         n_episodes=len(episodes),
@@ -115,26 +116,16 @@ def convert_control_mode(
     )
 
 
-def _copied(
-    dataset: Path,
-    path: Path,
-    episodes: Sequence[RecordedEpisode],
-    kept: Sequence[Attempt],
-    recipe: DatasetRecipe,
-    *,
-    begun: float,
-) -> RecordedDataset:
-    changed = [
+def _with_actions(
+    episodes: Sequence[RecordedEpisode], kept: Sequence[Attempt], recipe: DatasetRecipe
+) -> list[RecordedEpisode]:
+    env = dict(recipe.env)
+    return [
         dataclasses.replace(
-            episode,
-            env_kwargs=dict(recipe.env),
-            actions=one.actions,
-            intended_actions=one.intended_actions,
+            episode, env_kwargs=env, actions=one.actions, intended_actions=one.intended_actions
         )
         for episode, one in zip(episodes, kept, strict=True)
     ]
-    copy_with_actions(dataset, path, changed, recipe)
-    return RecordedDataset.read(path, seconds=time.monotonic() - begun)
 
 
 def _env_arguments(recipe: DatasetRecipe, mode: str) -> dict[str, object]:
