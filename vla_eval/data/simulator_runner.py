@@ -8,12 +8,13 @@ from vla_eval.core import SimEnv
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import VlaEvalError
 from vla_eval.workers.inside import Heartbeat
+from vla_eval.workers.jobs import Job
 from vla_eval.workers.messages import DeviceFound, Failed, describe_error
 
 logger = logging.getLogger(__name__)
 
 
-class SimulatorRunner[J, A]:
+class SimulatorRunner[J: Job, A]:
     """Answers jobs of one kind; a `workers.inside.Runner`."""
 
     def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
@@ -30,7 +31,7 @@ class SimulatorRunner[J, A]:
         try:
             return self._do(job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
-            logger.exception("%.300s, stage %s", job, self._heartbeat.stage)
+            logger.exception("%s, stage %s", job.setup_key, self._heartbeat.stage)
             known = self._explained(exc, job)
             return Failed(
                 error=describe_error(known, self._heartbeat.stage), refused=isinstance(known, VlaEvalError)
