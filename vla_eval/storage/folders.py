@@ -16,17 +16,6 @@ SUBFOLDERS = (LOGS, VIDEOS, RRDS)
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
 
-def make_folder(path: Path) -> None:
-    """Make the folder that a run is to go into, if it is not there.
-
-    Raises:
-        RunFolderError: see `check_folder`.
-        OSError: it cannot be made.
-    """
-    check_folder(path)
-    path.mkdir(parents=True, exist_ok=True)
-
-
 def check_folder(path: Path) -> None:
     """Refuse a folder that a run cannot go into.
 

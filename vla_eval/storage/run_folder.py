@@ -25,7 +25,6 @@ from vla_eval.storage.folders import (
     LOCK_FILE,
     TIMINGS_FILE,
     check_folder,
-    make_folder,
     not_a_run_folder,
 )
 from vla_eval.storage.run_file import (
@@ -118,7 +117,7 @@ class RunFolder:
             StorageFullError: the disk is full.
         """
         with starting(
-            path, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="a run folder", make=make_folder
+            path, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="a run folder", check=check_folder
         ) as started:
             folder = cls(path, description, allow_environment_change=allow_environment_change, groups=groups)
         folder._started = started

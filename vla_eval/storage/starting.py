@@ -64,15 +64,26 @@ class StartedFolder:
     start: FolderStart
     lock: FolderLock
 
+    def leave(self, *, failed: bool) -> None:
+        """Let others in; what is new is removed if nothing came of it."""
+        if failed:
+            self.start.undo()
+        self.lock.release()
+
 
 @contextlib.contextmanager
 def starting(
-    path: Path, *, own: Collection[str], lock_file: str, purpose: str, make: Callable[[Path], None]
+    path: Path,
+    *,
+    own: Collection[str],
+    lock_file: str,
+    purpose: str,
+    check: Callable[[Path], object] = lambda _path: None,
 ) -> Iterator[StartedFolder]:
     """Make and lock a folder; if the block ends with an exception, all that was made is removed.
 
-    `own` are the files that a start writes into it, `purpose` is `a run folder`, for messages, and `make`
-    makes the folder if it is not there, after checks of its own.
+    `own` are the files that a start writes into it, `purpose` is `a run folder`, for messages, and `check`
+    refuses what is there already.
 
     Raises:
         RunFolderError: the folder cannot be used, or is in use.
@@ -81,13 +92,13 @@ def starting(
     let_write(path)
     try:
         start = FolderStart(path, own=own)
-        make(path)
+        check(path)
+        path.mkdir(parents=True, exist_ok=True)
         started = StartedFolder(start=start, lock=FolderLock(path / lock_file))
         try:
             yield started
         except BaseException:
-            start.undo()
-            started.lock.release()
+            started.leave(failed=True)
             raise
     except OSError as exc:
         if exc.errno in DISK_TROUBLE:

@@ -228,21 +228,17 @@ def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[
 
     A mistake that is found before the first step leaves no folder behind.
     """
-
-    def make(folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-
     if not _is_first_process():  # the first one has the lock, and checks
         yield next(reversed(whole_checkpoints(job.out)), None)
         return
-    with starting(
-        job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a fine-tuning", make=make
-    ) as started:
+    purpose = "the folder of a fine-tuning"
+    with starting(job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose=purpose) as started:
         resume_from = _open(job, config, command)
+    failed = False
     try:
         yield resume_from
     except VlaEvalError:
-        started.start.undo()
+        failed = True
         raise
     finally:
-        started.lock.release()
+        started.leave(failed=failed)

@@ -65,12 +65,12 @@ class RecordingFolder:
         state = out / STATE_FOLDER
         let_write(out)
 
-        def make(folder: Path) -> None:
-            _refuse_foreign(out)
-            folder.mkdir(parents=True, exist_ok=True)
-
         with starting(
-            state, own=_OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a recording", make=make
+            state,
+            own=_OWN_FILES,
+            lock_file=LOCK_FILE,
+            purpose="the folder of a recording",
+            check=lambda _state: _refuse_foreign(out),
         ) as started:
             run_file = continued(
                 state, description, shown=out, allow_environment_change=allow_environment_change
@@ -89,9 +89,7 @@ class RecordingFolder:
         for file in self._attempts.values():
             file.close()
         self._attempts = {}
-        if isinstance(value, Exception):
-            self._started.start.undo()
-        self._started.lock.release()
+        self._started.leave(failed=isinstance(value, Exception))
 
     @property
     def origin(self) -> Origin:
