@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import yaml
 from huggingface_hub import DatasetCard, DatasetCardData
+from numpy.typing import NDArray
 
 from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.data.exact_statistics import RESOLUTION, about_still_dimensions
 from vla_eval.data.facts import DatasetFacts, ImportFacts, MixtureFacts
 from vla_eval.data.manifest import MANIFEST_FILE
-from vla_eval.data.opening import open_dataset
-from vla_eval.data.sharing.summary import DatasetSummary, draw_sheet, summarize
+from vla_eval.data.opening import OpenDataset, open_dataset
+from vla_eval.data.sharing.sheet import draw_sheet
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
 from vla_eval.storage.durable import replace_file
 from vla_eval.tasks.catalog import find_task
@@ -36,25 +38,25 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
         DatasetError: the dataset is not complete, or damaged.
         StorageFullError: the disk is full.
     """
-    summary = summarize(open_dataset(root))
+    dataset = open_dataset(root)
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)
-    (root / SHEET_FILE).write_bytes(draw_sheet(summary))
-    text = _render(summary, license_id=license_id)
+    (root / SHEET_FILE).write_bytes(draw_sheet(dataset))
+    text = _render(dataset, license_id=license_id)
     replace_file(root / CARD_FILE, text)
     return text
 
 
-def _render(summary: DatasetSummary, *, license_id: str | None = None) -> str:
-    facts = summary.dataset.facts
+def _render(dataset: OpenDataset, *, license_id: str | None = None) -> str:
+    facts = dataset.facts
     if license_id is None and (
         all(source.task_version is not None for source in facts.sources)
         if isinstance(facts, MixtureFacts)
         else isinstance(facts, DatasetFacts)
     ):
         license_id = OWN_LICENSE
-    sections = [f"# {_title(summary)}\n", _introduction(summary)]
+    sections = [f"# {_title(dataset)}\n", _introduction(dataset)]
     for heading, section in _SECTIONS.items():
-        text = section(summary)
+        text = section(dataset)
         if text:
             sections.append(f"## {heading}\n\n{text}")
     if license_id is None:
@@ -70,39 +72,41 @@ def _render(summary: DatasetSummary, *, license_id: str | None = None) -> str:
     return str(DatasetCard(f"---\n{data.to_yaml()}\n---\n\n{text}"))
 
 
-def _title(summary: DatasetSummary) -> str:
-    facts, n_episodes = summary.dataset.facts, len(summary.lengths)
+def _title(dataset: OpenDataset) -> str:
+    facts, n_episodes = dataset.facts, len(dataset.lengths)
     if isinstance(facts, MixtureFacts):
         return f"{len(facts.tasks)} tasks of {len(facts.sources)} datasets: {n_episodes} demonstrations"
-    all_succeed = summary.n_success in (None, n_episodes)
-    what = "demonstrations" if all_succeed else f"episodes, {summary.n_success} with success"
+    n_success = n_episodes - len(dataset.failed)
+    what = f"episodes, {n_success} with success" if dataset.failed else "demonstrations"
     return f"{markdown_cell(facts.task or 'Imported demonstrations')}: {n_episodes} {what}"
 
 
-def _introduction(summary: DatasetSummary) -> str:
-    facts = summary.dataset.facts
+def _introduction(dataset: OpenDataset) -> str:
+    facts = dataset.facts
     task = find_task(facts.task) if isinstance(facts, DatasetFacts) else None
     about = f"{task.description} " if task else ""
-    sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in summary.instructions)
-    height_px, width_px = summary.image_size_px
+    instructions = sorted(str(sentence) for sentence in dataset.meta.tasks.index)
+    sentences = "\n".join(f"> {markdown_cell(sentence)}" for sentence in instructions)
+    height_px, width_px = dataset.meta.features[next(iter(CAMERA_KEYS.values()))]["shape"][:2]
     size = f"{height_px} × {width_px}"
-    heading = "Instruction" if len(summary.instructions) == 1 else "Instructions"
+    heading = "Instruction" if len(instructions) == 1 else "Instructions"
     return (
         f"{about}Two cameras of {size} pixels, 20 frames per second, one frame per control step, as a "
         f"LeRobotDataset v3.\n\n{heading}:\n\n{sentences}\n\n![A few episodes]({SHEET_FILE.as_posix()})\n"
     )
 
 
-def _statistics(summary: DatasetSummary) -> str:
-    lengths = np.array(summary.lengths)
+def _statistics(dataset: OpenDataset) -> str:
+    lengths, features = np.array(dataset.lengths), dataset.meta.features
+    is_stored = SUCCESS_KEY in features
+    n_success = str(len(lengths) - len(dataset.failed)) if is_stored else "not stored"
     rows = [
         ("episodes", str(len(lengths))),
         ("frames", str(lengths.sum())),
         ("frames per episode", f"{lengths.min()} to {lengths.max()}, mean {lengths.mean():.1f}"),
-        ("episodes with success", "not stored" if summary.n_success is None else str(summary.n_success)),
+        ("episodes with success", n_success),
     ]
-    dataset = summary.dataset
-    still = [*about_still_dimensions(dataset.meta.stats, dataset.meta.features)]
+    still = [*about_still_dimensions(dataset.meta.stats, features)]
     if dataset.manifest:
         seeds = [episode.seed for episode in dataset.manifest]
         experts = sorted({f"{one.expert}, version {one.expert_version}" for one in dataset.manifest})
@@ -115,8 +119,9 @@ def _statistics(summary: DatasetSummary) -> str:
             ),
             ("expert", markdown_cell("; ".join(experts))),
         ]
-    action = summary.action
-    numbers = zip(action.names, action.mean, action.std, action.low, action.high, strict=True)
+    action = _actions(dataset)
+    columns = (action.mean(axis=0), action.std(axis=0), action.min(axis=0), action.max(axis=0))
+    numbers = zip(_action_names(dataset), *columns, strict=True)
     lines = [f"| {name} | {value} |" for name, value in rows]
     per_dim = [
         f"| {markdown_cell(name)} | {mean:.4f} | {std:.4f} | {low:.4f} | {high:.4f} |"
@@ -131,19 +136,36 @@ def _statistics(summary: DatasetSummary) -> str:
     )
 
 
+def _actions(dataset: OpenDataset) -> NDArray[np.float64]:
+    return dataset.columns[ACTION_KEY].astype(np.float64)
+
+
+def _action_names(dataset: OpenDataset) -> tuple[str, ...]:
+    feature = dataset.meta.features[ACTION_KEY]
+    return tuple(map(str, feature.get("names") or range(feature["shape"][0])))
+
+
+def idle_actions(names: Sequence[str], stds: NDArray[np.float64]) -> list[str]:
+    """Return the dimensions that hardly vary, which a normalisation by the standard deviation blows up."""
+    return [name for name, std in zip(names, stds, strict=True) if std < RESOLUTION]
+
+
 def _listed(seeds: Sequence[int]) -> str:
     shown = ", ".join(map(str, seeds[:MAX_SEEDS_SHOWN]))
     more = f" and {len(seeds) - MAX_SEEDS_SHOWN} more" if len(seeds) > MAX_SEEDS_SHOWN else ""
     return f"{len(seeds)}: {shown}{more}" if seeds else "none"
 
 
-def _fields(summary: DatasetSummary) -> str:
-    lines = [f"| {markdown_code(name)} | {markdown_cell(kind)} |" for name, kind in summary.fields.items()]
+def _fields(dataset: OpenDataset) -> str:
+    lines = []
+    for name, feature in sorted(dataset.meta.features.items()):
+        shape = " × ".join(str(size) for size in feature["shape"])
+        lines.append(f"| {markdown_code(name)} | {markdown_cell(f'{feature["dtype"]} ({shape})')} |")
     return "\n".join(["| field | type |", "|:--|:--|", *lines, ""])
 
 
-def _origin(summary: DatasetSummary) -> str:
-    facts, replay = summary.dataset.facts, summary.dataset.replay
+def _origin(dataset: OpenDataset) -> str:
+    facts, replay = dataset.facts, dataset.replay
     if not isinstance(facts, DatasetFacts):
         return ""
     said = "not replayed yet (`mikasa-vla replay`)"
@@ -174,8 +196,8 @@ def _origin(summary: DatasetSummary) -> str:
     )
 
 
-def _import(summary: DatasetSummary) -> str:
-    facts = summary.dataset.facts
+def _import(dataset: OpenDataset) -> str:
+    facts = dataset.facts
     if not isinstance(facts, ImportFacts):
         return ""
     lines = [
@@ -194,8 +216,8 @@ def _import(summary: DatasetSummary) -> str:
     return "\n".join([*lines, ""])
 
 
-def _mixture(summary: DatasetSummary) -> str:
-    facts = summary.dataset.facts
+def _mixture(dataset: OpenDataset) -> str:
+    facts = dataset.facts
     if not isinstance(facts, MixtureFacts):
         return ""
     rows = [
@@ -221,8 +243,8 @@ def _mixture(summary: DatasetSummary) -> str:
     )
 
 
-def _differences(summary: DatasetSummary) -> str:
-    facts = summary.dataset.facts
+def _differences(dataset: OpenDataset) -> str:
+    facts = dataset.facts
     if not isinstance(facts, DatasetFacts):
         return ""
     after = markdown_cell(str(facts.recipe.get("steps_after_success")))
@@ -235,7 +257,7 @@ def _differences(summary: DatasetSummary) -> str:
     lines = [
         "- The simulation is a new implementation of the tasks, not the authors' code "
         "(`docs/tasks.md` of mikasa-vla-eval lists what differs).",
-        _expert_difference(facts, summary),
+        _expert_difference(facts, dataset),
         f"- Kept: {markdown_cell(str(facts.recipe.get('keep', 'successes')))}; the paper says that all of "
         f"its episodes succeed, and its recorder kept every episode, whether it succeeded or not.",
         f"- Cut: {cut}; the paper's recorder recorded to the horizon.",
@@ -249,22 +271,23 @@ def _differences(summary: DatasetSummary) -> str:
     return "\n".join([*lines, ""])
 
 
-def _expert_difference(facts: DatasetFacts, summary: DatasetSummary) -> str:
+def _expert_difference(facts: DatasetFacts, dataset: OpenDataset) -> str:
     text = "- The paper's experts were trained by PPO; here the expert is "
     text += markdown_code(str(facts.recipe.get("expert", "oracle")))
     noise = facts.recipe.get("action_noise", 0.0)
     text += (
         f", with noise of std {markdown_cell(str(noise))} in its actions." if noise else ", without noise."
     )
-    if summary.action.idle:
+    idle = idle_actions(_action_names(dataset), _actions(dataset).std(axis=0))
+    if idle:
         text += (
-            f" Of its actions {', '.join(summary.action.idle)} hardly vary (std below {RESOLUTION:g}): "
+            f" Of its actions {', '.join(idle)} hardly vary (std below {RESOLUTION:g}): "
             f"expect imitation to be easier than with the paper's data."
         )
     return text
 
 
-_SECTIONS: dict[str, Callable[[DatasetSummary], str]] = {
+_SECTIONS: dict[str, Callable[[OpenDataset], str]] = {
     "Statistics": _statistics,
     "Fields": _fields,
     "Origin and proof": _origin,
