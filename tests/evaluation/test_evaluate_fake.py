@@ -123,7 +123,7 @@ def test_an_observer_is_given_the_steps_of_an_episode_while_it_runs(
     bench.write_policy(pause=0.25)  # four inferences: a second, and five ticks of the pool
     loads: list[Load] = []
 
-    class Observer(evaluate_module.Silence):
+    class Observer(evaluate_module.EvaluationObserver):
         def on_load(self, load: Load) -> None:
             loads.append(load)
 
@@ -143,7 +143,7 @@ def test_when_a_record_comes_its_steps_are_no_longer_among_those_under_way(
     under_way: list[int | None] = []
     when_recorded: list[int | None] = []
 
-    class Observer(evaluate_module.Silence):
+    class Observer(evaluate_module.EvaluationObserver):
         def on_load(self, load: Load) -> None:
             under_way.append(load.n_counted)
 

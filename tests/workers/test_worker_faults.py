@@ -73,7 +73,7 @@ from vla_eval.config.evaluation import EvalConfig
 
 evaluate_module.collect_environment = lambda: {"machine": "test"}
 
-class Observer(evaluate_module.Silence):
+class Observer(evaluate_module.EvaluationObserver):
     def on_record(self, record):
         if not self.__dict__.setdefault("seen", False):
             self.seen = True

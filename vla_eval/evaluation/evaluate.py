@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Literal, Self
 
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
@@ -45,8 +45,8 @@ EpisodePool = Pool[EpisodeBatch, Finished]
 logger = logging.getLogger(__name__)
 
 
-class EvaluationObserver(Protocol):
-    """Watches a run: progress on a terminal, for example."""
+class EvaluationObserver:
+    """Watches a run: progress on a terminal, for example. This one watches nothing and never stops it."""
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Called once, before the first episode."""
@@ -65,28 +65,6 @@ class EvaluationObserver(Protocol):
 
     def on_tick(self) -> bool:
         """Called several times a second; returns whether the run has to stop now."""
-
-
-class Silence:
-    """Watches nothing and never stops the run."""
-
-    def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
-        """Do nothing."""
-
-    def on_device(self, device: Mapping[str, str]) -> None:
-        """Do nothing."""
-
-    def on_warning(self, line: str) -> None:
-        """Do nothing."""
-
-    def on_record(self, record: EpisodeRecord) -> None:
-        """Do nothing."""
-
-    def on_load(self, load: Load) -> None:
-        """Do nothing."""
-
-    def on_tick(self) -> bool:
-        """Do not stop."""
         return False
 
 
@@ -128,7 +106,7 @@ def evaluate(
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
-    observer, path, plan = observer or Silence(), resolved.out, make_plan(resolved)
+    observer, path, plan = observer or EvaluationObserver(), resolved.out, make_plan(resolved)
     with RunFolder.open(
         path,
         describe(resolved, plan, command),

@@ -34,6 +34,7 @@ from vla_eval.records import EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
@@ -162,7 +163,7 @@ class EpisodeRunner:
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
         if self._env is None or self._policy is None:
-            facts = self._describe_env(job)
+            facts = self._describe_env(group.env)
             self._heartbeat("setup")
             if self._capture is not None:
                 self._capture.load()
@@ -193,13 +194,11 @@ class EpisodeRunner:
             human_camera_stride=self._capture.config.frame_stride,
         )
 
-    def _describe_env(self, job: EpisodeJob) -> EnvFacts:
+    def _describe_env(self, settings: EnvSettings) -> EnvFacts:
         """Return what the policy has to know of an environment whose cameras it then decides on."""
         # Privileged, as scripted controls need it: theirs is then already made.
-        env = self._make_env(dataclasses.replace(job.group.env, privileged=True))
-        self._heartbeat("reset")
-        status = env.reset({job.slot: job.seed}, render=False)[job.slot].status
-        return EnvFacts(env.spec, status.n_candidates)
+        env = self._make_env(dataclasses.replace(settings, privileged=True))
+        return EnvFacts(env.spec, task_spec(settings.task).n_candidates(settings.kwargs))
 
     def _close_other(self, settings: EnvSettings) -> None:
         """Close the environment if it is not made with these settings."""

@@ -20,7 +20,7 @@ from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.config.prompts import instruction_for
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.evaluate import Silence, evaluate
+from vla_eval.evaluation.evaluate import EvaluationObserver, evaluate
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
@@ -136,7 +136,7 @@ class HeldOut:
         )
 
 
-class _UntilStopped(Silence):
+class _UntilStopped(EvaluationObserver):
     """Stops an evaluation with the training that it is of, and passes on its warnings."""
 
     def __init__(self, is_stopping: Callable[[], bool], warn: Callable[[str], None]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from vla_eval.cli.terminal.episode_bar import EpisodeBar
 from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines
 from vla_eval.config.capture import CaptureConfig
-from vla_eval.evaluation.evaluate import EvaluationSummary, evaluate
+from vla_eval.evaluation.evaluate import EvaluationObserver, EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.records import EpisodeRecord
@@ -129,8 +129,8 @@ def load_text(load: Load, *, n_open: int) -> str:
     return f"{machines}{gpu}, {max(0, n_open - load.n_running)} episodes in the queue"
 
 
-class Progress:
-    """Implements `EvaluationObserver` on standard error."""
+class Progress(EvaluationObserver):
+    """Shows an evaluation on standard error."""
 
     def __init__(
         self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
