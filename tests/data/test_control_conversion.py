@@ -16,7 +16,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, JOINT_DELTA_POS, JOINT_POS
 from vla_eval.core import Observation, ObservationWindow
 from vla_eval.data.derived.changed_actions import copy_with_actions
-from vla_eval.data.derived.converted_episode import AimFollower, convert_episode
+from vla_eval.data.derived.control_conversion import AimFollower, convert_episode
 from vla_eval.data.facts import read_facts
 from vla_eval.data.manifest import RecordedEpisode, decode_actions, encode_actions, read_manifest
 from vla_eval.data.opening import open_dataset

@@ -1,7 +1,7 @@
 """Tables of learned policies: what is missing of one, and fine-tuning all that is. Knows no command line."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -183,16 +183,13 @@ def record_tiny(study: Study, backend: Backend, *, allow_environment_change: boo
     )
 
 
-@contextlib.contextmanager
-def tiny_models(study: Study) -> Iterator[None]:
+def tiny_models(study: Study) -> contextlib.AbstractContextManager[None]:
     """Build policies of lerobot's in their tiny form if the table is a tiny one."""
     if not study.is_tiny:
-        yield
-        return
+        return contextlib.nullcontext()
     from vla_eval.testing.tiny_models import tiny_forms
 
-    with tiny_forms():
-        yield
+    return tiny_forms()
 
 
 def _free_memory() -> None:

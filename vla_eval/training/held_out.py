@@ -53,9 +53,9 @@ class HeldOut:
     task: str
     out: Path
     last_step: int
-    on_metrics: Callable[[Mapping[str, float | str]], None]
-    say: Callable[[str], None]
-    is_stopping: Callable[[], bool]
+    on_metrics: Callable[[Mapping[str, float | str]], None] = lambda _line: None
+    say: Callable[[str], None] = lambda _line: None
+    is_stopping: Callable[[], bool] = lambda: False
     said: set[str] = field(default_factory=set)
 
     @property

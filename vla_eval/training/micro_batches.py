@@ -36,7 +36,7 @@ def add_gradient(
     Raises:
         TrainingError: a field of the batch cannot be divided.
     """
-    whole, reported = torch.zeros(()), _Reported()
+    whole, reported = torch.zeros(()), dict[str, Any]()
     parts = [(1.0, batch)] if size is None else list(_parts(batch, size))
     for index, (share, part) in enumerate(parts, start=1):
         # Processes exchange gradients once, with the last part.
@@ -47,20 +47,16 @@ def add_gradient(
             loss = share * loss.to(torch.promote_types(loss.dtype, torch.float32))
             accelerator.backward(scale(loss))
         whole = whole.to(loss) + loss.detach()
-        reported.add(output, share)
-    return Loss(whole, reported.values)
+        _add(reported, output, share)
+    return Loss(whole, reported)
 
 
-class _Reported:
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-
-    def add(self, output: Mapping[str, Any] | None, share: float) -> None:
-        """Add a part with this share of the samples; what is not a number is the last one's."""
-        for name, value in (output or {}).items():
-            if isinstance(value, float | int) and not isinstance(value, bool):
-                value = self.values.get(name, 0.0) + share * value
-            self.values[name] = value
+def _add(values: dict[str, Any], output: Mapping[str, Any] | None, share: float) -> None:
+    """Add a part with this share of the samples; what is not a number is the last one's."""
+    for name, value in (output or {}).items():
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            value = values.get(name, 0.0) + share * value
+        values[name] = value
 
 
 def _parts(batch: Mapping[str, Any], size: int) -> Iterator[tuple[float, dict[str, Any]]]:

@@ -10,7 +10,6 @@ from vla_eval.config.finetuning import (
     LOGGERS,
     FinetuneConfig,
     FinetuneRecipe,
-    HeldOutConfig,
     merge_fields,
 )
 from vla_eval.config.policy import load_policy
@@ -92,18 +91,10 @@ def finished_run(config: FinetuneConfig) -> FinetuneSummary | None:
     if config.held_out is not None:
         tasks = record.get("tasks")
         task = config.held_out.task or (tasks[0] if isinstance(tasks, list) and len(tasks) == 1 else "")
-        if not task or _held_out(config.held_out, str(task), out, step).missing(read_metrics(out)):
+        if not task:
+            return None
+        task = task_spec(str(task)).id
+        held_out = HeldOut(settings=config.held_out, task=task, out=out, last_step=step)  # only looked for
+        if held_out.missing(read_metrics(out)):
             return None
     return FinetuneSummary(out=out, step=step, is_finished=True)
-
-
-def _held_out(settings: HeldOutConfig, task: str, out: Path, last_step: int) -> HeldOut:
-    return HeldOut(
-        settings=settings,
-        task=task_spec(task).id,
-        out=out,
-        last_step=last_step,
-        on_metrics=lambda _line: None,
-        say=lambda _line: None,
-        is_stopping=lambda: True,
-    )

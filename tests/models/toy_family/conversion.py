@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from toy_family.configuration_toy import MikasaToyConfig
+
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.models.shared.options import option
 from vla_eval.models.shared.original import Original, read_safetensors, with_features

@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
-
 from toy_family.configuration_toy import MikasaToyConfig
+
 from vla_eval.features import ACTION_KEY, STATE_KEY
 
 

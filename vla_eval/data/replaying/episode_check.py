@@ -5,6 +5,7 @@ Every function returns sentences, one per mismatch; none: all is as it should be
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,7 @@ def check_states(
     if not equal:
         difference = _largest_difference(rows, log)
         if expect_equal_bits or difference.value > STATE_TOLERANCE:
-            found.append(f"states differ, most by {difference}")
+            found.append(f"states differ, most by {difference.value:.2g} in {difference.where}")
     success_step = next((i for i, result in enumerate(log.results) if result.status.success and i > 0), None)
     if (success_step is None) != (episode.success_step is None) or (
         equal and success_step != episode.success_step
@@ -103,21 +104,16 @@ def psnr_db(reference: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     return 100.0 if mean_square == 0 else float(10 * np.log10(MAX_LEVEL**2 / mean_square))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Difference:
+class _Difference(NamedTuple):
     value: float
-    step: int
-    name: str
-
-    def __str__(self) -> str:
-        return f"{self.value:.2g} in {self.name} at step {self.step}"
+    where: str
 
 
 def _largest_difference(rows: Columns, log: EpisodeLog) -> _Difference:
     fresh: FloatArray = np.stack([proprioception(r.observation.state)["joints"] for r in log.results[:-1]])
     stored = rows[PROPRIO_KEYS["joints"]].astype(np.float32)
     if stored.shape != fresh.shape:
-        return _Difference(value=float("inf"), step=min(len(stored), len(fresh)), name="length")
+        return _Difference(float("inf"), f"length at step {min(len(stored), len(fresh))}")
     gap = np.abs(stored - fresh)
     step, dim = (int(i) for i in np.unravel_index(int(gap.argmax()), gap.shape))
-    return _Difference(value=float(gap[step, dim]), step=step, name=STATE_NAMES["joints"][dim])
+    return _Difference(float(gap[step, dim]), f"{STATE_NAMES['joints'][dim]} at step {step}")
