@@ -5,7 +5,7 @@ zeros. A step of the positive control on ten episodes has 84,000 to 110,000 page
 25,000 (two cores, torch 2.13). The time they take depends on the kernel and was not measured separately.
 
 What is kept is used again only by blocks that fit into it. A network whose large tensors have another size in
-each step computes them in parts of one size, as the encoders of `policies/sequence` do, or the process grows.
+each step computes them in parts of one size, as the encoders of `models/sequence` do, or the process grows.
 """
 
 import ctypes
