@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb
-from vla_eval.cli.shared.output import FORMATS, print_in
+from vla_eval.cli.shared.arguments import add_flags, add_verb
+from vla_eval.cli.shared.output import print_in
 from vla_eval.cli.terminal.screen import screen_width
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
@@ -26,7 +26,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         epilog="docs/chunk_sizes.md explains the columns.",
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
-    # Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
     parser.add_argument(
         "--by", choices=("n_action_steps", "policy"), default="n_action_steps", help="(n_action_steps)"
     )
@@ -36,7 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument(
         "--difference", type=float, default=0.1, metavar="D", help="difference to plan for (0.1)"
     )
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_flags(parser, "--format")
 
 
 def run(args: argparse.Namespace) -> int:

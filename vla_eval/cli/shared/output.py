@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.cli.shared.arguments import add_flags
 from vla_eval.cli.terminal.screen import print_markdown, screen_width
 from vla_eval.errors import unknown_name
 from vla_eval.storage.shard import Shard
@@ -14,15 +15,13 @@ if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
 
 
-# Not taken from vla_eval.results: importing that would make `mikasa-vla --help` wait for scipy.
-FORMATS = ("markdown", "csv", "json", "latex", "html-table")
 PRESETS = ("paper",)
 DEFAULT_BOARD = "leaderboard_mikasa"
 
 
 def add_table_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the table is printed."""
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_flags(parser, "--format")
     parser.add_argument("--wide", action="store_true", help="every column, and a row per run")
     parser.add_argument(
         "--preset",
