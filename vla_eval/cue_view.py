@@ -108,7 +108,7 @@ class CueView:
         self._frames = [frame for frame in self._frames if frame.step >= step]
 
     def take(self, slot: int, spec: PolicySpec) -> ObservationWindow:
-        """Return the observations since the last inference, or only the newest; they are given once."""
+        """Return the observations since the last inference, or only the newest one; none is given twice."""
         frames, self._frames = self._frames, []
         read = frames if spec.reads == "every" else frames[-1:]
         return ObservationWindow(slot=slot, frames=tuple(frame.as_declared(spec) for frame in read))

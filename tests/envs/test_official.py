@@ -14,7 +14,6 @@ from vla_eval.envs import official
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.official import official_class
 from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
-from vla_eval.rollout import _worded
 from vla_eval.tasks.catalog import task_spec
 
 TASK = "mikasa_vla/RememberColor3-VLA-v0"
@@ -148,4 +147,4 @@ def test_the_angle_of_an_episode_is_put_into_its_instruction() -> None:
     status: Any = None
     observation: Any = None
     reset = StepResult(observation=observation, status=status, wording={"angle_deg": "44"})
-    assert _worded(start, reset).instruction == "Rotate by 44 degrees."
+    assert start.worded(reset.wording).instruction == "Rotate by 44 degrees."

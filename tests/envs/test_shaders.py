@@ -27,7 +27,7 @@ lean, tasks = json.loads(sys.argv[1])
 if not lean:
     maniskill.use_lean_shaders = lambda: False
 for task in tasks:
-    env = maniskill.make_maniskill_env(
+    env = maniskill.ManiSkillEnv(
         EnvSettings(task=task, cameras=("base_camera", "hand_camera"), human_camera_stride=1)
     )
     found = [env.reset({0: 7}, render=True)[0].observation.images]

@@ -152,7 +152,7 @@ def test_a_chain_must_be_touched_in_the_order_shown() -> None:
         info, _ = touch(env, index)
     assert not bool(info["success"][0])
     assert int(info["n_wrong_choices"][0]) >= 1
-    assert env.right_first_choices(0) == (first,)
+    assert env.status(env.get_info(), 0).right_first_choices == (first,)
 
 
 def test_a_touch_can_be_asked_to_last() -> None:

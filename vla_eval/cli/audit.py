@@ -4,16 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import (
-    EXIT_EPISODE_ERRORS,
-    add_allow_environment_change,
-    add_json_progress,
-    add_overrides,
-    add_shard,
-    add_verb,
-    add_workers,
-)
-from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, add_verb
+from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.storage.shard import shard_folder
@@ -38,38 +30,29 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         epilog="docs/audit.md explains controls, tests and verdicts.",
     )
     which = parser.add_mutually_exclusive_group()
-    which.add_argument(
-        "--task",
-        nargs="+",
-        action="extend",
-        dest="tasks",
-        metavar="T",
-        help="task ids (all of the suite)",
-    )
+    which.add_argument("--task", **{**FLAGS["--task"], "help": "task ids (all of the suite)"})
     which.add_argument(
         "--suite",
         choices=("paper", "mikasa_vla_90"),
         default="paper",
         help="all tasks of this package (paper), or the official package's 90",
     )
-    parser.add_argument(
-        "--control", nargs="+", action="extend", dest="controls", metavar="C", help="only these controls"
-    )
-    parser.add_argument("--episodes", type=int, default=30, metavar="N", help="per task and control (30)")
+    parser.add_argument("--control", **MANY, dest="controls", metavar="C", help="only these controls")
     parser.add_argument(
         "--protocol",
         choices=("paper", "strict", "both"),
         default="both",
         help="(both); official tasks have their own",
     )
-    add_workers(parser, default="auto")
-    add_cluster(parser)
-    parser.add_argument("--out", type=Path, default=Path("runs/audit"), metavar="DIR", help="(runs/audit)")
-    add_shard(parser)
-    add_json_progress(parser)
-    add_overrides(parser, help="change another field of the evaluations, for example simulator=fake")
+    add_flags(
+        parser,
+        *("--workers", "--cluster", "--shard", "--json-progress", "--allow-environment-change"),
+        episodes="per task and control (30)",
+        out="(runs/audit)",
+        set="change another field of the evaluations, for example simulator=fake",
+    )
+    parser.set_defaults(episodes=30, workers="auto", out=Path("runs/audit"))
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
-    add_allow_environment_change(parser)
 
 
 def run(args: argparse.Namespace) -> int:

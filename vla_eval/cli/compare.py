@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb
+from vla_eval.cli.shared.arguments import add_flags, add_verb
 from vla_eval.cli.shared.output import print_in
 from vla_eval.cli.terminal.screen import screen_width
-from vla_eval.results.formats import COMPARED_BY, FORMATS
+from vla_eval.results.formats import COMPARED_BY
 
 DESCRIPTION = """Compare what was evaluated on the same seeds: success by n_action_steps (K) with intervals,
 chance and ceiling at the same K, frames of the cue that each K let the policy see, an exact paired
@@ -34,7 +34,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument(
         "--difference", type=float, default=0.1, metavar="D", help="difference to plan for (0.1)"
     )
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_flags(parser, "--format")
 
 
 def run(args: argparse.Namespace) -> int:

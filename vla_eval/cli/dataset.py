@@ -4,10 +4,11 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.shared.arguments import add_workers, seeds_argument
+from vla_eval.cli.shared.arguments import add_flags, seeds_argument
 from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     convert.add_argument(
         "--clip-actions", action="store_true", help="store actions as the environment would execute them"
     )
-    add_workers(convert, default="auto")
+    add_flags(convert, "--workers")
+    convert.set_defaults(workers="auto")
 
     mix = actions.add_parser(
         "mix", help="make one dataset of several, for a policy that learns several tasks", allow_abbrev=False
@@ -163,14 +165,10 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
         raise RecipeError(f"{flag}: --control-mode keeps all else of the recording. Remove it.")
     from vla_eval.data.derived.control_conversion import convert_control_mode
 
-    with stop_on_signals() as stop:
-        progress = RecordingProgress(stop)
-        try:
-            converted = convert_control_mode(
-                args.source, args.control_mode, out=args.out, observer=progress, workers=args.workers
-            )
-        finally:
-            progress.close()
+    with stop_on_signals() as stop, closing(RecordingProgress(stop)) as progress:
+        converted = convert_control_mode(
+            args.source, args.control_mode, out=args.out, observer=progress, workers=args.workers
+        )
     if converted is None:
         print("Stopped. The same command resumes.", file=sys.stderr)
         return stop.exit_code

@@ -7,27 +7,24 @@ from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
-    add_allow_environment_change,
-    add_dry_run,
-    add_json_progress,
+    FLAGS,
+    add_flags,
     add_old_flag,
-    add_overrides,
-    add_shard,
     add_verb,
-    add_workers,
     positive_argument,
+    read_config,
     set_flags,
     typed_command,
 )
-from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.output import add_table_arguments
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import apply_overrides, load_recipe
+from vla_eval.config.files import apply_overrides
 from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.storage.shard import shard_folder
-from vla_eval.strict.decoding import decode, set_field
+from vla_eval.strict.decoding import set_field
 from vla_eval.workers.needed_files import Needed, shared_folder
 
 if TYPE_CHECKING:
@@ -67,45 +64,31 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    many: dict[str, Any] = {"nargs": "+", "action": "extend"}  # Any: argparse's keyword arguments
-    parser.add_argument(
-        "--task", **many, dest="tasks", metavar="T", help="task ids (`mikasa-vla list tasks`)"
-    )
-    parser.add_argument(
-        "--policy",
-        **many,
-        dest="policies",
-        metavar="P",
-        help="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server; "
+    add_flags(
+        parser,
+        task="task ids (`mikasa-vla list tasks`)",
+        policy="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server; "
         "NAME=DIR,DIR,DIR: one row whose runs are these checkpoints",
+        n_action_steps="actions executed per inference; several: one after another",
+        episodes="episodes per task, policy and run (100)",
     )
-    parser.add_argument(
-        "--n-action-steps",
-        **many,
-        type=int,
-        metavar="K",
-        help="actions executed per inference; several: one after another",
-    )
-    parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task, policy and run (100)")
-    parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
     parser.add_argument("--runs", type=int, metavar="R", help="independent runs over the same seeds (1)")
-    add_workers(parser)
-    add_cluster(parser)
     parser.add_argument(
         "--serve",
         action="store_true",
         help="load each model once, in a server that all workers share (inference: shared)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/NAME-FINGERPRINT)")
-    add_shard(parser)
-    add_json_progress(parser)
-    add_overrides(parser, help="change any field of the configuration")
+    add_flags(
+        parser,
+        *("--seed-start", "--workers", "--cluster", "--shard", "--json-progress", "--dry-run"),
+        out="run folder (runs/NAME-FINGERPRINT)",
+        set="change any field of the configuration",
+        allow_environment_change=f"{FLAGS['--allow-environment-change']['help']}; the table will say so",
+    )
     _add_dry_run_arguments(parser)
-    add_allow_environment_change(parser, consequence="; the table will say so")
 
 
 def _add_dry_run_arguments(parser: argparse.ArgumentParser) -> None:
-    add_dry_run(parser)
     parser.add_argument(
         "--steps-per-second",
         type=positive_argument,
@@ -238,15 +221,14 @@ def _config(args: argparse.Namespace) -> EvalConfig:
         apply_overrides(data, args.overrides, cls=EvalConfig)
         fill_from_protocol(data)
 
-    if args.config is not None:
-        return load_recipe("configs", args.config, EvalConfig, edit=edit).value
-    data: dict[str, Any] = {"name": args.protocol or "eval"}
-    edit(data)
-    for flag, field in (("--task", "tasks"), ("--policy", "policies")):
-        if field not in data:
-            raise RecipeError(
-                "Name a configuration (`mikasa-vla list configs`), or at least one --task (or a --protocol) "
-                f"and one --policy; {flag} is missing. Example: mikasa-vla eval --task RememberColor3-v0 "
-                "--policy oracle"
-            )
-    return decode(EvalConfig, data, where="command line")
+    return read_config(
+        EvalConfig,
+        edit,
+        folder="configs",
+        name=args.config,
+        start={"name": args.protocol or "eval"},
+        asks="a configuration (`mikasa-vla list configs`), or at least one --task (or a --protocol) and one "
+        "--policy",
+        needed={"tasks": "--task", "policies": "--policy"},
+        example="eval --task RememberColor3-v0 --policy oracle",
+    )

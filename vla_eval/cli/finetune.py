@@ -6,22 +6,21 @@ import sys
 from typing import Any
 
 from vla_eval.cli.shared.arguments import (
-    add_dry_run,
+    add_flags,
     add_old_flag,
-    add_overrides,
     add_verb,
     dry_run_options,
     memory_argument,
     positive_argument,
+    read_config,
     set_flags,
     typed_command,
 )
-from vla_eval.cli.shared.cluster import add_cluster
-from vla_eval.config.files import apply_overrides, load_recipe
+from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import is_model_table
-from vla_eval.strict.decoding import decode, set_field
+from vla_eval.strict.decoding import set_field
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 
@@ -74,9 +73,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     parser.add_argument(
         "--allow-unreplayed", action="store_true", help="train on a dataset that no replay has confirmed"
     )
-    add_overrides(parser, help="change any field of the recipe's `finetune` section")
-    add_cluster(parser)
-    add_dry_run(parser)
+    add_flags(parser, "--cluster", "--dry-run", set="change any field of the recipe's `finetune` section")
     parser.add_argument(
         "--tflops",
         type=positive_argument,
@@ -167,17 +164,16 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
 
     if args.tasks is not None:
         raise RecipeError("--task is for a table of learned policies; otherwise the dataset says the task.")
-    if args.config is not None:
-        return load_recipe("configs", args.config, FinetuneConfig, edit=edit).value
-    data: dict[str, Any] = {}
-    edit(data)
-    for name in ("policy", "dataset"):
-        if name not in data:
-            raise RecipeError(
-                f"Name a configuration, or a policy and a dataset; --{name} is missing. Example: mikasa-vla "
-                f"finetune --policy act --dataset data/RememberColor3-v0 --steps 20000"
-            )
-    return decode(FinetuneConfig, data, where="command line")
+    return read_config(
+        FinetuneConfig,
+        edit,
+        folder="configs",
+        name=args.config,
+        start={},
+        asks="a configuration, or a policy and a dataset",
+        needed={"policy": "--policy", "dataset": "--dataset"},
+        example="finetune --policy act --dataset data/RememberColor3-v0 --steps 20000",
+    )
 
 
 def _one_policy(names: list[str]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, add_allow_environment_change, add_verb
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, add_flags, add_verb
 from vla_eval.errors import MergeError
 from vla_eval.storage.folders import not_a_run_folder
 from vla_eval.storage.run_file import RUN_FILE
@@ -40,7 +40,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         action="store_true",
         help="merge what is there; the command without --shard, with --out DIR, runs the rest",
     )
-    add_allow_environment_change(parser, consequence="; the table will say so")
+    consequence = "; the table will say so"
+    add_flags(parser, allow_environment_change=FLAGS["--allow-environment-change"]["help"] + consequence)
 
 
 def run(args: argparse.Namespace) -> int:

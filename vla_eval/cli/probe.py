@@ -2,27 +2,25 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.probe_grid import add_grid_arguments, run_grid
 from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
-    add_allow_environment_change,
-    add_json_progress,
-    add_overrides,
-    add_shard,
-    workers_argument,
+    MANY,
+    add_flags,
+    add_verb,
+    read_config,
+    set_flags,
 )
-from vla_eval.cli.shared.cluster import add_cluster
+from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.output import print_in
-from vla_eval.cli.shared.probe_runs import run_all
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import apply_overrides, load_recipe
+from vla_eval.config.files import apply_overrides
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.results.formats import FORMATS
-from vla_eval.strict.decoding import decode
+from vla_eval.storage.shard import shard_folder
+from vla_eval.workers.needed_files import Needed
 
 if TYPE_CHECKING:
     from vla_eval.probe.grid import GridSettings
@@ -47,82 +45,67 @@ EPISODES = 50
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "probe",
         help="find out what a policy remembers, and for how long",
         description=DESCRIPTION,
         epilog="docs/probe.md defines each quantity.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
-    many: dict[str, Any] = {"nargs": "+", "action": "extend"}  # Any: argparse's keyword arguments
-    parser.add_argument("--task", **many, dest="tasks", metavar="T", help="task ids")
-    parser.add_argument("--policy", **many, dest="policies", metavar="P", help="names, files or folders")
-    parser.add_argument("--n-action-steps", **many, type=int, metavar="K", help="actions per inference")
-    parser.add_argument("--episodes", type=int, metavar="N", help=f"per policy and world ({EPISODES})")
-    parser.add_argument("--seed-start", type=int, metavar="S", help="seed of the first episode (1)")
-    parser.add_argument("--workers", type=workers_argument, metavar="W", help="processes, or 'auto'")
-    add_cluster(parser)
-    _add_interventions(parser)
-    parser.add_argument("--out", type=Path, default=Path("runs/probe"), metavar="DIR", help="(runs/probe)")
-    add_shard(parser)
-    add_json_progress(parser)
-    add_overrides(parser, help="change any field of the evaluations")
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
-    add_allow_environment_change(parser)
-
-
-def _add_interventions(parser: argparse.ArgumentParser) -> None:
-    many: dict[str, Any] = {"nargs": "+", "action": "extend"}  # Any: argparse's keyword arguments
-    parser.add_argument(
-        "--probe",
-        **many,
-        dest="probes",
-        type=_one_or_several,
-        metavar="P",
-        help="what to change, by spaces or commas (swap,blank,delay,reset)",
+    add_flags(
+        parser,
+        *("--task", "--policy", "--n-action-steps", "--seed-start", "--workers", "--cluster", "--shard"),
+        *("--json-progress", "--format", "--allow-environment-change"),
+        episodes=f"per policy and world ({EPISODES})",
+        out="(runs/probe)",
+        set="change any field of the evaluations",
     )
-    parser.add_argument("--swap", **many, type=int, dest="swaps", metavar="K", help="which other cues (1)")
+    parser.set_defaults(out=Path("runs/probe"))
+    for flag, (dest, kind, metavar, text) in INTERVENTIONS.items():
+        parser.add_argument(flag, **MANY, dest=dest, type=kind, metavar=metavar, help=text)
     parser.add_argument(
-        "--delay", **many, type=int, dest="delays", metavar="L", help="steps (0 5 10 20 40 80 160 320)"
+        "--grid",
+        action="store_true",
+        help="each --n-action-steps (1 2 4 8) with each --delay (0 5 20 80); with --probe cue or delay,cue: "
+        "with each --cue (1 2 3 5)",
     )
-    parser.add_argument("--cue", **many, type=int, dest="cues", metavar="L", help="steps of the cue (1 2 3)")
-    parser.add_argument(
-        "--mask", **many, dest="masks", metavar="M", help="what is hidden (cue elsewhere later)"
-    )
-    parser.add_argument(
-        "--late", **many, type=int, dest="lates", metavar="L", help="steps before the cue (5 20)"
-    )
-    parser.add_argument(
-        "--appearance",
-        **many,
-        dest="appearances",
-        metavar="A",
-        help="what looks different (light camera table hue)",
-    )
-    parser.add_argument("--distract", **many, type=int, dest="distractors", metavar="L", help="steps (3)")
-    parser.add_argument(
-        "--instruction",
-        **many,
-        dest="instructions",
-        metavar="SET",
-        help="prompt sets (paraphrased other_task no_content)",
-    )
-    parser.add_argument(
-        "--reset-at",
-        **many,
-        type=int,
-        dest="reset_steps",
-        metavar="S",
-        help="control steps (the end of the cue, the beginning of the response)",
-    )
-    add_grid_arguments(parser)
     parser.add_argument("--no-controls", action="store_true", help="run only the policies that are named")
 
 
 def _one_or_several(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
+
+
+INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
+    "--probe": (
+        *("probes", _one_or_several, "P"),
+        "what to change, by spaces or commas (swap,blank,delay,reset)",
+    ),
+    "--swap": ("swaps", int, "K", "which other cues (1)"),
+    "--delay": ("delays", int, "L", "steps (0 5 10 20 40 80 160 320)"),
+    "--cue": ("cues", int, "L", "steps of the cue (1 2 3)"),
+    "--mask": ("masks", str, "M", "what is hidden (cue elsewhere later)"),
+    "--late": ("lates", int, "L", "steps before the cue (5 20)"),
+    "--appearance": ("appearances", str, "A", "what looks different (light camera table hue)"),
+    "--distract": ("distractors", int, "L", "steps (3)"),
+    "--instruction": ("instructions", str, "SET", "prompt sets (paraphrased other_task no_content)"),
+    "--reset-at": (
+        *("reset_steps", int, "S"),
+        "control steps (the end of the cue, the beginning of the response)",
+    ),
+    "--first-inference": (
+        *("first_inferences", int, "S"),
+        "of a grid: control steps of the first inference (all below K if K does not divide the phases)",
+    ),
+}
+"""Flag -> name, type and metavar of its value, and its help."""
+LEAST = {
+    **{"swaps": 1, "delays": 0, "cues": 1, "lates": 1, "distractors": 1, "reset_steps": 1},
+    "first_inferences": 0,
+}
+"""Least number of the flags that take numbers."""
+OF_GRIDS = ("probes", "delays", "cues", "first_inferences")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -138,13 +121,13 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.probe.table import read_probe
 
     if args.grid:
-        return run_grid(args, _config(args), _grid_settings(args))
+        return _run_grid(args)
     if args.first_inferences is not None:
         raise RecipeError("--first-inference is of a grid. Add --grid.")
     probe = plan_probe(_config(args), _settings(args))
     for pair in probe.left_out:
         print(f"left out: {pair}", file=sys.stderr)
-    stopped = run_all([world.config for world in probe.worlds], args)
+    stopped = _run_all([world.config for world in probe.worlds], args)
     if stopped is not None:
         return stopped
     table = read_probe(probe.worlds, args.out)
@@ -159,7 +142,7 @@ def _settings(args: argparse.Namespace) -> "ProbeSettings":
     from vla_eval.probe.views import APPEARANCES, MASKS
 
     chosen: dict[str, Any] = {  # Any: tuples of words or numbers
-        name: _numbers(getattr(args, name), name) for name in FLAGS
+        name: _numbers(getattr(args, name), name) for name in LEAST if name != "first_inferences"
     }
     if args.instructions is not None:
         chosen["instructions"] = tuple(dict.fromkeys(args.instructions))
@@ -178,7 +161,11 @@ def _grid_settings(args: argparse.Namespace) -> "GridSettings":
     for word in words:
         if word not in AXES:
             raise RecipeError(f"--grid: --probe {word}: expected {' or '.join(AXES)}. Run it without --grid.")
-    others = [flag for name, flag in OF_NO_GRID.items() if getattr(args, name) is not None]
+    others = [
+        flag
+        for flag, (name, *_) in INTERVENTIONS.items()
+        if name not in OF_GRIDS and getattr(args, name) is not None
+    ]
     if others:
         raise RecipeError(f"--grid has no {', '.join(others)}. Run it without --grid.")
     given = {name: _numbers(getattr(args, name), name) for name in ("delays", "cues", "first_inferences")}
@@ -186,29 +173,6 @@ def _grid_settings(args: argparse.Namespace) -> "GridSettings":
     if words:
         chosen["axes"] = tuple(dict.fromkeys(words))
     return GridSettings(**chosen, controls=not args.no_controls)
-
-
-OF_NO_GRID = {
-    "swaps": "--swap",
-    "masks": "--mask",
-    "lates": "--late",
-    "appearances": "--appearance",
-    "distractors": "--distract",
-    "instructions": "--instruction",
-    "reset_steps": "--reset-at",
-}
-"""Attribute -> flag of what only other interventions have."""
-
-FLAGS = {
-    "swaps": ("--swap", 1),
-    "delays": ("--delay", 0),
-    "cues": ("--cue", 1),
-    "lates": ("--late", 1),
-    "distractors": ("--distract", 1),
-    "reset_steps": ("--reset-at", 1),
-}
-"""Attribute -> flag and least value."""
-GRID_FLAGS = {"first_inferences": ("--first-inference", 0)}
 
 
 def _names(
@@ -223,35 +187,77 @@ def _names(
 def _numbers(values: list[int] | None, name: str) -> tuple[int, ...] | None:
     if values is None:
         return None
-    flag, least = {**FLAGS, **GRID_FLAGS}[name]
+    flag = next(flag for flag, (dest, *_) in INTERVENTIONS.items() if dest == name)
     for value in values:
-        if value < least:
-            raise RecipeError(f"{flag} {value}: expected a whole number ≥ {least}.")
+        if value < LEAST[name]:
+            raise RecipeError(f"{flag} {value}: expected a whole number ≥ {LEAST[name]}.")
     return tuple(dict.fromkeys(values))
+
+
+def _run_grid(args: argparse.Namespace) -> int:
+    from vla_eval.probe.grid import plan_grid
+    from vla_eval.probe.grid_table import read_grid
+    from vla_eval.probe.grid_text import render_grid
+    from vla_eval.probe.page.heat_maps import write_heat_maps
+
+    grid = plan_grid(_config(args), _grid_settings(args))
+    for task in grid.left_out:
+        print(f"left out: {task}", file=sys.stderr)
+    print(f"{len(grid.worlds)} run folders, {grid.n_episodes} episodes", file=sys.stderr)
+    stopped = _run_all([world.config for world in grid.worlds], args)
+    if stopped is not None:
+        return stopped
+    table = read_grid(grid.worlds, args.out)
+    print_in(args.format, render_grid(table, args.format))
+    sys.stdout.flush()  # the table first, wherever the two go
+    for path in write_heat_maps(table, args.out):
+        print(f"Heat map: {path}", file=sys.stderr)
+    return EXIT_EPISODE_ERRORS if table.n_errors else 0
+
+
+def _run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:
+    """Run or resume each evaluation in `OUT/NAME`, or one shard of each, on `--cluster`.
+
+    Returns:
+        None once all are there; the exit code after a shard, or if a signal has stopped them.
+    """
+    from vla_eval.cli.shared.evaluations import evaluate_each
+    from vla_eval.cli.shared.output import print_shard
+
+    out = shard_folder(args.out, args.shard)
+    runs = ((out / config.name, config) for config in configs)
+    with backend_of(args, needs=lambda: _needed(configs)) as backend:
+        done = evaluate_each(runs, args, backend=backend)
+    if done.stopped is not None:
+        return done.stopped
+    if args.shard is None:
+        return None
+    print_shard(out, args.out, args.shard)
+    return EXIT_EPISODE_ERRORS if done.n_errors else 0
+
+
+def _needed(configs: Sequence[EvalConfig]) -> tuple[Needed, ...]:
+    from vla_eval.evaluation.needed_files import needed_files
+    from vla_eval.policies.entries import load_policy_entries
+
+    policies = dict.fromkeys(policy for config in configs for policy in config.policies)
+    return needed_files(load_policy_entries(tuple(policies)))
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:
     """Return the configuration that all worlds share: the file, the flags, `--set`."""
-    edit = _editor(args)
-    if args.config is not None:
-        return load_recipe("configs", args.config, EvalConfig, edit=edit).value
-    data: dict[str, Any] = {"name": "probe", "episodes": EPISODES}  # Any: plain data of YAML
-    edit(data)
-    for flag, field in (("--task", "tasks"), ("--policy", "policies")):
-        if field not in data:
-            raise RecipeError(
-                f"Name a configuration, or at least one --task and one --policy; {flag} is missing. Example: "
-                "mikasa-vla probe --task RememberColor3-v0 --policy memory_color3"
-            )
-    return decode(EvalConfig, data, where="command line")
 
-
-def _editor(args: argparse.Namespace) -> Callable[[dict[str, Any]], None]:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        for name in ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "workers"):
-            value = getattr(args, name)
-            if value is not None:
-                data[name] = value
+        set_flags(data, args, ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "workers"))
         apply_overrides(data, args.overrides, cls=EvalConfig)
 
-    return edit
+    return read_config(
+        EvalConfig,
+        edit,
+        folder="configs",
+        name=args.config,
+        start={"name": "probe", "episodes": EPISODES},
+        asks="a configuration, or at least one --task and one --policy",
+        needed={"tasks": "--task", "policies": "--policy"},
+        example="probe --task RememberColor3-v0 --policy memory_color3",
+    )

@@ -2,26 +2,16 @@
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vla_eval.cli.shared.arguments import (
-    add_allow_environment_change,
-    add_json_progress,
-    add_overrides,
-    add_shard,
-    add_verb,
-    add_workers,
-    set_flags,
-    typed_command,
-)
-from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.arguments import add_flags, add_verb, read_config, set_flags, typed_command
+from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
-from vla_eval.config.files import apply_overrides, load_recipe
-from vla_eval.errors import RecipeError
+from vla_eval.config.files import apply_overrides
 from vla_eval.storage.shard import shard_folder
-from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.needed_files import shared_folder
@@ -54,21 +44,17 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         epilog=EPILOG,
     )
     parser.add_argument("recipe", nargs="?", metavar="RECIPE", help="file, or name in datasets/")
-    parser.add_argument("--task", nargs="+", action="extend", dest="tasks", metavar="T", help="task ids")
-    parser.add_argument("--episodes", type=int, metavar="N", help="episodes per task (250)")
-    parser.add_argument("--seed-start", type=int, metavar="S", help="the first seed that is tried (1000)")
-    add_workers(parser)
-    add_cluster(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (data/NAME-FINGERPRINT)")
-    add_shard(parser)
-    add_json_progress(parser)
-    parser.add_argument(
-        "--no-replay",
-        action="store_true",
-        help="leave out the check that `mikasa-vla replay` does",
+    add_flags(
+        parser,
+        *("--task", "--workers", "--cluster", "--shard", "--json-progress", "--allow-environment-change"),
+        episodes="episodes per task (250)",
+        seed_start="the first seed that is tried (1000)",
+        out="folder (data/NAME-FINGERPRINT)",
+        set="change any field of the recipe",
     )
-    add_overrides(parser, help="change any field of the recipe")
-    add_allow_environment_change(parser)
+    parser.add_argument(
+        "--no-replay", action="store_true", help="leave out the check that `mikasa-vla replay` does"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,9 +71,8 @@ def run(args: argparse.Namespace) -> int:
     out = shard_folder(whole, args.shard)
     needs = (shared_folder(out),)
     with backend_of(args, needs=lambda: needs, notes_kinds=False) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop, json_progress=args.json_progress)
-        progress.say(cost(recipe))
-        try:
+        with closing(RecordingProgress(stop, json_progress=args.json_progress)) as progress:
+            progress.say(cost(recipe))
             summary = record(
                 recipe,
                 out=out,
@@ -97,8 +82,6 @@ def run(args: argparse.Namespace) -> int:
                 backend=backend,
                 part=args.shard,
             )
-        finally:
-            progress.close()
         if summary.was_stopped:
             print(f"Stopped. What was recorded is in {out}. To resume: {command}", file=sys.stderr)
             return stop.exit_code
@@ -168,13 +151,13 @@ def _recipe(args: argparse.Namespace) -> DatasetRecipe:
         set_flags(data, args, ("tasks", "episodes", "seed_start", "workers"))
         apply_overrides(data, args.overrides, cls=DatasetRecipe)
 
-    if args.recipe is not None:
-        return load_recipe("datasets", args.recipe, DatasetRecipe, edit=edit).value
-    data: dict[str, Any] = {"name": "demonstrations"}
-    edit(data)
-    if "tasks" not in data:
-        raise RecipeError(
-            "Name a recipe (a file, or one of datasets/), or at least one --task. "
-            "Example: mikasa-vla record --task RememberColor3-v0 --episodes 10"
-        )
-    return decode(DatasetRecipe, data, where="command line")
+    return read_config(
+        DatasetRecipe,
+        edit,
+        folder="datasets",
+        name=args.recipe,
+        start={"name": "demonstrations"},
+        asks="a recipe (a file, or one of datasets/), or at least one --task",
+        needed={"tasks": "--task"},
+        example="record --task RememberColor3-v0 --episodes 10",
+    )

@@ -2,11 +2,12 @@
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_json_progress, add_verb, add_workers
-from vla_eval.cli.shared.cluster import add_cluster, backend_of
+from vla_eval.cli.shared.arguments import add_flags, add_verb
+from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.errors import RecipeError
 from vla_eval.workers.needed_files import shared_folder
@@ -31,9 +32,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
     parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
-    add_workers(parser, default="auto")
-    add_cluster(parser)
-    add_json_progress(parser)
+    add_flags(parser, "--workers", "--cluster", "--json-progress")
+    parser.set_defaults(workers="auto")
     parser.add_argument(
         "--rebuild",
         type=Path,
@@ -75,18 +75,14 @@ def _rebuild(args: argparse.Namespace) -> int:
             "--rebuild makes the whole dataset again: it does not go with --episodes or --pixels."
         )
     needs = (shared_folder(args.rebuild),)
-    with backend_of(args, needs=lambda: needs) as backend, stop_on_signals() as stop:
-        progress = RecordingProgress(stop, json_progress=args.json_progress)
-        try:
-            rebuilt = rebuild(
-                args.dataset,
-                out=args.rebuild,
-                workers=args.workers,
-                observer=progress,
-                backend=backend,
-            )
-        finally:
-            progress.close()
+    with (
+        backend_of(args, needs=lambda: needs) as backend,
+        stop_on_signals() as stop,
+        closing(RecordingProgress(stop, json_progress=args.json_progress)) as progress,
+    ):
+        rebuilt = rebuild(
+            args.dataset, out=args.rebuild, workers=args.workers, observer=progress, backend=backend
+        )
     if rebuilt is None:
         print("Stopped. The same command resumes.", file=sys.stderr)
         return stop.exit_code

@@ -1,9 +1,10 @@
 """How a scene looks, where that is not as the task has it. Knows nothing of simulators."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from vla_eval.errors import RecipeError
-from vla_eval.strict.bounds import check_bounds
+from vla_eval.strict.bounds import Bounds, check_bounds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,22 +23,15 @@ class AppearanceSettings:
         RecipeError: a number out of its range.
     """
 
-    light: float = 1.0
-    camera_shift_m: float = 0.0
-    camera_turn_deg: float = 0.0
-    table_rgb: tuple[float, ...] | None = None
-    hue_deg: float = 0.0
+    light: Annotated[float, Bounds(0.0, 10.0)] = 1.0
+    camera_shift_m: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    camera_turn_deg: Annotated[float, Bounds(-45.0, 45.0)] = 0.0
+    table_rgb: Annotated[tuple[float, ...] | None, Bounds(0.0, 1.0)] = None
+    hue_deg: Annotated[float, Bounds(-180.0, 180.0)] = 0.0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        bounds = {
-            "light": (0.0, 10.0),
-            "camera_shift_m": (-0.5, 0.5),
-            "camera_turn_deg": (-45.0, 45.0),
-            "table_rgb": (0.0, 1.0),
-            "hue_deg": (-180.0, 180.0),
-        }
-        check_bounds(self, bounds, prefix="appearance.")
+        check_bounds(self, prefix="appearance.")
         if self.table_rgb is not None and len(self.table_rgb) != 3:
             raise RecipeError(f"appearance.table_rgb is {list(self.table_rgb)}, expected three numbers.")
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from vla_eval.errors import RecipeError
-from vla_eval.strict.bounds import MAX_EPISODES, MAX_STEPS, check_bounds
+from vla_eval.strict.bounds import MAX_EPISODES, Steps, check_bounds
 
 Outcomes = Literal["none", "all", "failures", "successes"]
 Which = Outcomes | int
@@ -23,11 +23,11 @@ class CaptureConfig:
 
     video: Which = "none"
     rrd: Which = "none"
-    frame_stride: int = 2
+    frame_stride: Steps = 2
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_bounds(self, {"frame_stride": (1, MAX_STEPS)}, prefix="capture.")
+        check_bounds(self, prefix="capture.")
         for name in ("video", "rrd"):
             which = getattr(self, name)
             if isinstance(which, int) and not 1 <= which <= MAX_EPISODES:

@@ -1,14 +1,22 @@
 """`datasets/*.yaml`: which demonstrations, how recorded, how many. Knows nothing of lerobot or simulators."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.config.files import check_run_name, content_of, digest_of
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings, StateKind
-from vla_eval.strict.bounds import MAX_EPISODES, MAX_PROCESSES, MAX_STEPS, check_bounds, check_seeds
+from vla_eval.strict.bounds import (
+    MAX_EPISODES,
+    MAX_STEPS,
+    Bounds,
+    Episodes,
+    Workers,
+    check_bounds,
+    check_seeds,
+)
 
 MAX_ACTION_NOISE = 10.0  # actions lie between -1 and 1: more is all noise
 EVALUATION_SEEDS = range(1, 101)
@@ -26,40 +34,30 @@ class DatasetRecipe:
     name: str
     tasks: tuple[str, ...]
     description: str = ""
-    episodes: int = 250
+    episodes: Episodes = 250
     seed_start: int = 1000
     expert: str = "oracle"
     prompt_set: str = "paper"
     state: StateKind = "eef"
     keep: Literal["successes", "all"] = "successes"
     cut: Literal["after_success", "horizon"] = "after_success"
-    steps_after_success: int = 5
-    action_noise: float = 0.0
+    steps_after_success: Annotated[int, Bounds(0, MAX_STEPS)] = 5
+    action_noise: Annotated[float, Bounds(0, MAX_ACTION_NOISE)] = 0.0
     stored_action: Literal["executed", "intended"] = "executed"
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
     render: RenderSettings = field(default_factory=RenderSettings)
     simulator: Simulator = "maniskill"
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
-    episodes_per_shard: int = 10
-    max_failed_seeds: int = 250
-    workers: int | Literal["auto"] = "auto"
+    episodes_per_shard: Episodes = 10
+    max_failed_seeds: Annotated[int, Bounds(0, MAX_EPISODES)] = 250
+    workers: Workers = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
 
     def __post_init__(self) -> None:
         check_run_name(self.name)
         if not self.tasks or len(set(self.tasks)) != len(self.tasks):
             raise RecipeError(f"tasks is {list(self.tasks)}, expected at least one, none of them twice.")
-        check_bounds(
-            self,
-            {
-                "episodes": (1, MAX_EPISODES),
-                "episodes_per_shard": (1, MAX_EPISODES),
-                "steps_after_success": (0, MAX_STEPS),
-                "action_noise": (0, MAX_ACTION_NOISE),
-                "max_failed_seeds": (0, MAX_EPISODES),
-                "workers": (1, MAX_PROCESSES),
-            },
-        )
+        check_bounds(self)
         check_seeds(self.seed_start, self.episodes + self.max_failed_seeds)
         self._refuse_evaluation_seeds()
 

@@ -59,3 +59,8 @@ class EnvSettings:
     privileged: bool = False
     human_camera_stride: int | None = None
     n_slots: int = 1
+
+    def shows_human_camera(self, step: int, horizon_steps: int) -> bool:
+        """Whether the images of a step include the view for people."""
+        stride = self.human_camera_stride
+        return stride is not None and (step % stride == 0 or step == horizon_steps)

@@ -1,8 +1,7 @@
 """`configs/*.yaml`: one evaluation."""
 
-import dataclasses
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
@@ -11,12 +10,13 @@ from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
 from vla_eval.config.files import check_run_name
 from vla_eval.cue_view import CueViewKind
 from vla_eval.strict.bounds import (
-    MAX_EPISODES,
-    MAX_PROCESSES,
-    MAX_SECONDS,
     MAX_SERVER_ROWS,
-    MAX_SLOTS,
-    MAX_STEPS,
+    Bounds,
+    Episodes,
+    SecondsAllowed,
+    Slots,
+    Steps,
+    Workers,
     check_bounds,
     check_seeds,
     require,
@@ -28,14 +28,13 @@ from vla_eval.strict.renamed import formerly
 class TimeoutConfig:
     """Seconds after which a worker that is busy with one thing is killed."""
 
-    setup_seconds: float = 900.0
-    reset_seconds: float = 120.0
-    step_seconds: float = 120.0
-    inference_seconds: float = 300.0
+    setup_seconds: SecondsAllowed = 900.0
+    reset_seconds: SecondsAllowed = 120.0
+    step_seconds: SecondsAllowed = 120.0
+    inference_seconds: SecondsAllowed = 300.0
 
     def __post_init__(self) -> None:
-        least_and_most = (0.001, MAX_SECONDS)
-        check_bounds(self, {f.name: least_and_most for f in dataclasses.fields(self)}, prefix="timeouts.")
+        check_bounds(self, prefix="timeouts.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +51,9 @@ class EvalConfig:
     description: str = ""
     protocol: str | None = None
     n_action_steps: tuple[int, ...] | None = None
-    episodes: int = 100
+    episodes: Episodes = 100
     seed_start: int = 1
-    runs: int = 1
+    runs: Episodes = 1
     prompt_set: str = "paper"
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
     chunking: ChunkingSettings = field(default_factory=ChunkingSettings)
@@ -63,31 +62,20 @@ class EvalConfig:
     simulator: Simulator = "maniskill"
     sim_backend: SimBackend = "cpu"
     stop_at_success: bool = False
-    reset_policy_at_step: int | None = None
+    reset_policy_at_step: Steps | None = None
     cue_view: CueViewKind = "as_shown"
     eager_rendering: bool = False
-    slots_per_worker: int = 1
+    slots_per_worker: Slots = 1
     inference: Literal["auto", "in_process", "shared"] = "auto"
-    inference_max_batch: int = 8
-    workers: int | Literal["auto"] = "auto"
+    inference_max_batch: Annotated[int, Bounds(1, MAX_SERVER_ROWS)] = 8
+    workers: Workers = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
-    max_consecutive_errors: int = 10
+    max_consecutive_errors: Episodes = 10
     capture: CaptureConfig = field(default_factory=CaptureConfig, metadata=formerly("recording"))
 
     def __post_init__(self) -> None:
         check_run_name(self.name)
-        check_bounds(
-            self,
-            {
-                "episodes": (1, MAX_EPISODES),
-                "runs": (1, MAX_EPISODES),
-                "slots_per_worker": (1, MAX_SLOTS),
-                "inference_max_batch": (1, MAX_SERVER_ROWS),
-                "max_consecutive_errors": (1, MAX_EPISODES),
-                "workers": (1, MAX_PROCESSES),
-                "reset_policy_at_step": (1, MAX_STEPS),
-            },
-        )
+        check_bounds(self)
         check_seeds(self.seed_start, self.episodes)
         for name in ("tasks", "policies", "n_action_steps"):
             values = getattr(self, name)

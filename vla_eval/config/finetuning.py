@@ -5,24 +5,25 @@ Standard library only: `mikasa-vla list` reads recipes without waiting for torch
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from vla_eval.config.environment import Simulator
 from vla_eval.errors import RecipeError
 from vla_eval.strict.bounds import (
     MAX_BATCH,
-    MAX_EPISODES,
     MAX_PROCESSES,
-    MAX_SLOTS,
-    MAX_STEPS,
-    MAX_TRAINING_STEPS,
+    Bounds,
+    Episodes,
+    Slots,
+    Steps,
+    TrainingSteps,
+    Workers,
     check_bounds,
     check_seeds,
 )
 from vla_eval.strict.renamed import formerly
 
-MAX_RANK = 65_536  # of a LoRA adapter: no layer of these policies is wider
-
+Rank = Annotated[int, Bounds(1, 65_536)]  # of a LoRA adapter: no layer of these policies is wider
 
 LOGGERS = ("wandb_project", "trackio_project", "tensorboard")
 """Fields of a recipe that may be changed when a run is resumed: no weight depends on them."""
@@ -41,13 +42,13 @@ class LoraRecipe:
         full_modules: last names of modules that are trained in full beside the adapters.
     """
 
-    rank: int = 16
-    alpha: int | None = None
+    rank: Rank = 16
+    alpha: Rank | None = None
     target_modules: str | None = None
     full_modules: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_bounds(self, {"rank": (1, MAX_RANK), "alpha": (1, MAX_RANK)}, prefix="finetune.lora.")
+        check_bounds(self, prefix="finetune.lora.")
         if self.target_modules == "all-linear":
             raise RecipeError(
                 "finetune.lora.target_modules is 'all-linear', which takes heads and embeddings of a policy, "
@@ -89,12 +90,12 @@ class FinetuneRecipe:
     tokenizer: str | None = None
     rename_cameras: dict[str, str] = field(default_factory=dict)
     lora: LoraRecipe | None = None
-    steps: int = 50_000
-    batch_size: int = 32
+    steps: TrainingSteps = 50_000
+    batch_size: Annotated[int, Bounds(1, MAX_BATCH)] = 32
     micro_batch_size: int | None = None
-    save_every_steps: int = 5_000
-    log_every_steps: int = 100
-    num_workers: int = 4
+    save_every_steps: TrainingSteps = 5_000
+    log_every_steps: TrainingSteps = 100
+    num_workers: Annotated[int, Bounds(0, MAX_PROCESSES)] = 4
     failed_episodes: Literal["keep", "leave_out"] | None = None
     decode_ahead: bool = True
     image_transforms: dict[str, Any] | None = None  # Any: lerobot checks its own fields
@@ -104,17 +105,7 @@ class FinetuneRecipe:
     tensorboard: bool = False
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            {
-                "steps": (1, MAX_TRAINING_STEPS),
-                "batch_size": (1, MAX_BATCH),
-                "save_every_steps": (1, MAX_TRAINING_STEPS),
-                "log_every_steps": (1, MAX_TRAINING_STEPS),
-                "num_workers": (0, MAX_PROCESSES),
-            },
-            prefix="finetune.",
-        )
+        check_bounds(self, prefix="finetune.")
         if self.micro_batch_size is not None and not 1 <= self.micro_batch_size <= self.batch_size:
             raise RecipeError(
                 f"finetune.micro_batch_size is {self.micro_batch_size}, expected a number from 1 to "
@@ -145,28 +136,18 @@ class HeldOutConfig:
         simulator, slots_per_worker, workers: see `EvalConfig`.
     """
 
-    every_steps: int
-    episodes: int = 20
+    every_steps: TrainingSteps
+    episodes: Episodes = 20
     seed_start: int = 900_000  # far above the seeds of demonstrations
     task: str | None = None
-    n_action_steps: int | None = None
+    n_action_steps: Steps | None = None
     env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
     simulator: Simulator = "maniskill"
-    slots_per_worker: int = 1
-    workers: int | Literal["auto"] = "auto"
+    slots_per_worker: Slots = 1
+    workers: Workers = "auto"
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            {
-                "every_steps": (1, MAX_TRAINING_STEPS),
-                "episodes": (1, MAX_EPISODES),
-                "n_action_steps": (1, MAX_STEPS),
-                "slots_per_worker": (1, MAX_SLOTS),
-                "workers": (1, MAX_PROCESSES),
-            },
-            prefix="held_out.",
-        )
+        check_bounds(self, prefix="held_out.")
         check_seeds(self.seed_start, self.episodes, name="held_out.seed_start")
 
 

@@ -6,17 +6,13 @@ Some names of former recipes are rows of `configs/ablations.yaml` now; they stil
 import functools
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from vla_eval.config.files import Recipe, load_recipe, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, merge_fields
 from vla_eval.config.shipped import search_folders
 from vla_eval.errors import UnknownNameError
-from vla_eval.strict.bounds import (
-    MAX_PROCESSES,
-    MAX_STEPS,
-    check_bounds,
-)
+from vla_eval.strict.bounds import MAX_PROCESSES, Bounds, Steps, check_bounds
 from vla_eval.strict.decoding import decode, load_yaml
 from vla_eval.strict.renamed import warn_renamed
 
@@ -42,13 +38,13 @@ class PolicyRecipe:
     description: str
     adapter: str
     args: dict[str, Any] = field(default_factory=dict)  # Any: whatever the adapter takes
-    default_n_action_steps: int = 1
-    max_workers: int | None = None
+    default_n_action_steps: Steps = 1
+    max_workers: Annotated[int, Bounds(1, MAX_PROCESSES)] | None = None
     needs_candidates: bool = False
     finetune: FinetuneRecipe | None = None
 
     def __post_init__(self) -> None:
-        check_bounds(self, {"default_n_action_steps": (1, MAX_STEPS), "max_workers": (1, MAX_PROCESSES)})
+        check_bounds(self)
 
 
 def load_policy(name: str) -> Recipe[PolicyRecipe]:

@@ -1,10 +1,18 @@
 """`protocols/*.yaml`: what a published figure fixes: tasks, seeds, runs, K. Knows nothing of results."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from vla_eval.config.files import Recipe, check_run_name, load_recipe
-from vla_eval.strict.bounds import MAX_EPISODES, MAX_STEPS, check_bounds, check_seeds, require
+from vla_eval.strict.bounds import (
+    MAX_EPISODES,
+    MAX_STEPS,
+    Bounds,
+    Episodes,
+    check_bounds,
+    check_seeds,
+    require,
+)
 
 FREE_SETTINGS = ("stop_at_success", "eager_rendering", "render.backend")
 """Settings of an evaluation that no protocol fixes: success at any step is the same with and without them."""
@@ -32,27 +40,21 @@ class Protocol:
     """
 
     name: str
-    version: int
+    version: Annotated[int, Bounds(1, MAX_EPISODES)]
     description: str
     source: str
     tasks: dict[str, int]
-    episodes: int
+    episodes: Episodes
     seed_start: int
-    runs: int | None = None
-    n_action_steps: tuple[int, ...] | None = None
+    runs: Episodes | None = None
+    n_action_steps: Annotated[tuple[int, ...] | None, Bounds(1, MAX_STEPS)] = None
     metric: Literal["success_once"] = "success_once"
     groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
     free: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_run_name(self.name)
-        bounds = {
-            "version": (1, MAX_EPISODES),
-            "episodes": (1, MAX_EPISODES),
-            "runs": (1, MAX_EPISODES),
-            "n_action_steps": (1, MAX_STEPS),
-        }
-        check_bounds(self, bounds)
+        check_bounds(self)
         check_seeds(self.seed_start, self.episodes)
         require(bool(self.tasks), "tasks", "{}", "at least one task with its version")
         for group, tasks in self.groups.items():

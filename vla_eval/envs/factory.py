@@ -15,10 +15,10 @@ from vla_eval.tasks.catalog import task_spec
 __all__ = ["EnvSettings", "RenderSettings", "describe_device", "make_env"]
 
 SIMULATORS = {
-    "maniskill": "vla_eval.envs.maniskill:make_maniskill_env",
-    "fake": "vla_eval.envs.fake:make_fake_env",
+    "maniskill": "vla_eval.envs.maniskill:ManiSkillEnv",
+    "fake": "vla_eval.envs.fake:FakeEnv",
 }
-OFFICIAL = "vla_eval.envs.official:make_official_env"
+OFFICIAL = "vla_eval.envs.official:OfficialEnv"
 """In place of `maniskill` for the tasks of the official package, which are its own ManiSkill environments."""
 
 

@@ -283,10 +283,8 @@ class FakeEnv:
         )
 
     def _shown(self, episode: _Episode) -> tuple[str, ...]:
-        stride = self._settings.human_camera_stride
-        if stride is None or (episode.step % stride and episode.step != self.spec.horizon_steps):
-            return self._settings.cameras
-        return (*self._settings.cameras, HUMAN_CAMERA)
+        shows_human = self._settings.shows_human_camera(episode.step, self.spec.horizon_steps)
+        return (*self._settings.cameras, *([HUMAN_CAMERA] if shows_human else []))
 
     def _image(self, episode: _Episode, camera: str) -> ImageArray:
         """Return an image that shows the cue in its first rows and otherwise depends only on the state."""
@@ -356,8 +354,3 @@ def _check_ranges(arguments: Mapping[str, Any], *, n_items: int, where: str) -> 
     speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
     if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
         raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")
-
-
-def make_fake_env(settings: EnvSettings) -> FakeEnv:
-    """Make a fake environment; the factory's entry."""
-    return FakeEnv(settings)

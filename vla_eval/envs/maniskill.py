@@ -18,17 +18,8 @@ from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes
 from vla_eval.envs.cue_location import boxes_of_cue
-from vla_eval.envs.scenes import (
-    RENDERING_ADVICE,
-    describe,
-    render_backend,
-    share_vulkan,
-    take_human_image,
-    take_images,
-    to_array,
-)
-from vla_eval.envs.shaders import use_lean_shaders
-from vla_eval.errors import RenderingError, TaskArgumentError, check_names
+from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
+from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.appearance import with_appearance
@@ -49,22 +40,17 @@ ROBOT = "robot_uids"
 gc.freeze()
 
 
-def make_maniskill_env(settings: EnvSettings) -> "ManiSkillEnv":
-    """Make the environment of a task.
-
-    Raises:
-        UnknownNameError: no such task, argument or camera.
-        TaskArgumentError: the arguments are impossible.
-        RenderingError: cameras are wanted and the renderer does not start.
-    """
-    return ManiSkillEnv(settings)
-
-
 class ManiSkillEnv:
     """`SimEnv` on ManiSkill; see the module docstring."""
 
     def __init__(self, settings: EnvSettings) -> None:
-        """Build the scenes."""
+        """Build the scenes.
+
+        Raises:
+            UnknownNameError: no such task, argument or camera.
+            TaskArgumentError: the arguments are impossible.
+            RenderingError: cameras are wanted and the renderer does not start.
+        """
         row = task_spec(settings.task)
         check_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}
@@ -137,13 +123,6 @@ class ManiSkillEnv:
             env.close()
         self._envs = []
 
-    def _shows_human(self, info: Any, slots: list[int]) -> bool:
-        stride = self._settings.human_camera_stride
-        if stride is None:
-            return False
-        steps = [int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots]
-        return any(step % stride == 0 or step == self.spec.horizon_steps for step in steps)
-
     def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
         """Return (environment index, its requested slots), in order."""
         grouped: dict[int, list[int]] = {}
@@ -159,13 +138,10 @@ class ManiSkillEnv:
         images = {}
         if render.intersection(slots):
             images = take_images(env, self._settings.cameras)
-            if self._shows_human(info, slots):
+            steps = (int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots)
+            if any(self._settings.shows_human_camera(step, self.spec.horizon_steps) for step in steps):
                 images[HUMAN_CAMERA] = take_human_image(env)
-        state = {
-            "tcp_pose": env.agent.tcp.pose.raw_pose,
-            "qpos": env.agent.robot.get_qpos(),
-            "qvel": env.agent.robot.get_qvel(),
-        }
+        state = robot_state(env)
         if env.PROMPT_DIMS:
             state["task_cue"] = env.prompt()
         results = {}
@@ -187,30 +163,19 @@ class ManiSkillEnv:
 
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
-    backend, robot, mode = render_backend(settings), _robot(settings, kwargs), control_mode_of(kwargs)
+    robot, mode = _robot(settings, kwargs), control_mode_of(kwargs)
     if robot in ARMS and mode not in ARMS[robot].control_modes:
         raise TaskArgumentError(
             f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
             f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
         )
-    share_vulkan(backend)
-    if backend != "none":
-        use_lean_shaders()
-    try:
-        return with_appearance(cls, settings.appearance)(
-            num_envs=num_envs,
-            obs_mode="none",
-            reward_mode="normalized_dense",
-            sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
-            render_backend=backend,
-            **{**kwargs, ROBOT: robot, CONTROL_MODE: mode},
-        )
-    except RuntimeError as exc:
-        if backend == "none" or settings.sim_backend == "gpu":
-            raise
-        raise RenderingError(
-            f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
-        ) from exc
+    return build(
+        with_appearance(cls, settings.appearance),
+        settings,
+        num_envs=num_envs,
+        sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
+        **{**kwargs, ROBOT: robot, CONTROL_MODE: mode},
+    )
 
 
 def _robot(settings: EnvSettings, kwargs: Mapping[str, Any]) -> str:
@@ -247,15 +212,13 @@ def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: M
         check_argument(known[name], value, name=name, task=task)
 
 
-def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: object) -> int:
+def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: int | None) -> int:
     """Return the length of an episode: as requested, or as in the row.
 
     Raises:
-        TaskArgumentError: not a number, or too short for a step of the choice.
+        TaskArgumentError: too short for a step of the choice.
     """
     horizon_steps = row.default_horizon_steps(longest_wait_steps) if wanted is None else wanted
-    if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
-        raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
     if longest_wait_steps >= horizon_steps:
         raise TaskArgumentError(
             f"{row.id}: cue_steps and delay_steps can be {longest_wait_steps} together, but the episode ends "

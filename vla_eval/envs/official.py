@@ -20,24 +20,9 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.envs.official_episode import OfficialEpisode, waiting_of
 from vla_eval.envs.official_mug import provide_mug
-from vla_eval.envs.scenes import (
-    RENDERING_ADVICE,
-    describe,
-    render_backend,
-    share_vulkan,
-    take_human_image,
-    take_images,
-    to_array,
-)
-from vla_eval.envs.shaders import use_lean_shaders
+from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
 from vla_eval.envs.true_states import with_true_states
-from vla_eval.errors import (
-    MissingDependencyError,
-    RenderingError,
-    SpecMismatchError,
-    TaskArgumentError,
-    check_names,
-)
+from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
 from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import PrivilegedState
@@ -54,23 +39,18 @@ LARGEST_SEED = 2**32 - 1  # of numpy's RandomState, which ManiSkill draws from
 gc.freeze()
 
 
-def make_official_env(settings: EnvSettings) -> "OfficialEnv":
-    """Make the environment of an official task.
-
-    Raises:
-        UnknownNameError: no such task, argument or camera.
-        TaskArgumentError: the settings ask for what the official environments cannot do.
-        MissingDependencyError: the package, or the asset of the shell game's mug, is not installed.
-        RenderingError: cameras are wanted and the renderer does not start.
-    """
-    return OfficialEnv(settings)
-
-
 class OfficialEnv:
     """`SimEnv` on the official package; see the module docstring."""
 
     def __init__(self, settings: EnvSettings) -> None:
-        """Build the scenes."""
+        """Build the scenes.
+
+        Raises:
+            UnknownNameError: no such task, argument or camera.
+            TaskArgumentError: the settings ask for what the official environments cannot do.
+            MissingDependencyError: the package, or the asset of the shell game's mug, is not installed.
+            RenderingError: cameras are wanted and the renderer does not start.
+        """
         row = task_spec(settings.task)
         check_names("argument", settings.kwargs, ARGUMENTS, where=row.id)
         check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
@@ -152,15 +132,12 @@ class OfficialEnv:
             for hidden in env._hidden_objects:
                 hidden.hide_visual()
             images = take_images(env, self._settings.cameras)
-            stride = self._settings.human_camera_stride
-            if stride is not None and (step % stride == 0 or step == self.spec.horizon_steps):
+            if self._settings.shows_human_camera(step, self.spec.horizon_steps):
                 images[HUMAN_CAMERA] = take_human_image(env)
-        robot = env.agent.robot
-        state = {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
         return Observation(
             step=step,
             images={name: batch[0].copy() for name, batch in images.items()},
-            state={name: to_array(batch[0]) for name, batch in state.items()},
+            state={name: to_array(batch[0]) for name, batch in robot_state(env).items()},
             privileged=true_state,
         )
 
@@ -211,28 +188,16 @@ def _check_possible(settings: EnvSettings, row: TaskSpec) -> None:
 
 
 def _build(cls: Any, settings: EnvSettings) -> Any:
-    backend = render_backend(settings)
-    share_vulkan(backend)
-    if backend != "none":
-        use_lean_shaders()
-    try:
-        # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
-        return cls(
-            num_envs=1,
-            obs_mode="none",
-            reward_mode="normalized_dense",
-            control_mode=ACTION.control_mode,
-            robot_uids=ROBOT,
-            sim_backend="physx_cpu",
-            render_backend=backend,
-            reconfiguration_freq=1,
-        )
-    except RuntimeError as exc:
-        if backend == "none":
-            raise
-        raise RenderingError(
-            f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
-        ) from exc
+    # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
+    return build(
+        cls,
+        settings,
+        num_envs=1,
+        control_mode=ACTION.control_mode,
+        robot_uids=ROBOT,
+        sim_backend="physx_cpu",
+        reconfiguration_freq=1,
+    )
 
 
 def _wording(row: TaskSpec, info: Any) -> dict[str, str]:

@@ -11,7 +11,7 @@ import torch
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import FloatArray, ImageArray
-from vla_eval.envs.shaders import check_no_environment_map
+from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import RenderingError
 
 RENDERING_ADVICE = (
@@ -46,6 +46,32 @@ def share_vulkan(backend: str) -> None:
         _kept.clear()
     elif not _kept:
         _kept.append(sapien.render.RenderMaterial())
+
+
+def build(cls: Any, settings: EnvSettings, **arguments: Any) -> Any:
+    """Return a ManiSkill environment that renders only on request.
+
+    Raises:
+        RenderingError: cameras are wanted and the renderer does not start.
+    """
+    backend = render_backend(settings)
+    share_vulkan(backend)
+    if backend != "none":
+        use_lean_shaders()
+    try:
+        return cls(obs_mode="none", reward_mode="normalized_dense", render_backend=backend, **arguments)
+    except RuntimeError as exc:
+        if backend == "none" or settings.sim_backend == "gpu":
+            raise
+        raise RenderingError(
+            f"{settings.task}: the renderer '{backend}' did not start: {exc}. {RENDERING_ADVICE}"
+        ) from exc
+
+
+def robot_state(env: Any) -> dict[str, Any]:
+    """Return the states that every task offers, as (B, …) tensors."""
+    robot = env.agent.robot
+    return {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
 
 
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:

@@ -5,6 +5,7 @@ constant action leads to a constant speed. Measured with mani_skill 3.0.1 on a P
 of 1 moves the tool centre point by 16, 32, 37, 39, 39 … mm per control step.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +84,19 @@ def towards(goal_m: Vector, arm: ArmState) -> Vector:
     """Return the (3,) translation that moves the arm to a point: half the distance per step, at most 1."""
     translation: Vector = np.clip(POSITION_GAIN_PER_M * (goal_m - arm.position_m), -1, 1)
     return translation
+
+
+def follow(
+    goal_of: Callable[[ArmState], Vector], state: PrivilegedState, n_actions: int, *, gripper: float
+) -> NDArray[np.float32]:
+    """Return (n_actions, 7) that move the arm to the point that is its goal at each step of the model."""
+    arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+    rows = []
+    for _ in range(n_actions):
+        translation = towards(goal_of(arm), arm)
+        rows.append(action_row(translation, gripper))
+        arm = advance(arm, translation)
+    return np.stack(rows)
 
 
 def turn_towards(yaw_rad: float, arm: ArmState) -> float:

@@ -5,17 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import (
-    GRIPPER_CLOSED,
-    GRIPPER_OPEN,
-    ArmState,
-    Vector,
-    action_row,
-    advance,
-    advance_gripper,
-    gripper_state,
-    towards,
-)
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 HOVER_M = 0.08
@@ -45,10 +35,10 @@ MEAN_FIRST_X_M = 0.0
 class _Play:
     """State of the model: arm, cube, the cube's target, and the controller's internal state."""
 
-    arm: ArmState
-    cube_m: Vector
-    goal_m: Vector
-    home_m: Vector
+    arm: model.ArmState
+    cube_m: model.Vector
+    goal_m: model.Vector
+    home_m: model.Vector
     was_there: bool
     closing: bool
     caution: float
@@ -62,7 +52,7 @@ class _Play:
 class CarryExpert:
     """One episode's expert; with an imagined home it moves the cube back to that position."""
 
-    def __init__(self, *, imagined_home_m: Vector | None) -> None:
+    def __init__(self, *, imagined_home_m: model.Vector | None) -> None:
         """Store the position to which the cube goes back, if it is not the one observed at the start."""
         self._imagined_home_m = imagined_home_m
         self._was_there = False
@@ -73,7 +63,7 @@ class CarryExpert:
         """Return (n_actions, 7), planned from this state and earlier ones."""
         home_m = state.bodies["first_place"].position_m[:2]
         play = _Play(
-            arm=gripper_state(state),
+            arm=model.gripper_state(state),
             cube_m=state.bodies["cube"].position_m[:2],
             goal_m=state.bodies["goal"].position_m[:2],
             home_m=home_m if self._imagined_home_m is None else self._imagined_home_m,
@@ -97,7 +87,7 @@ def plan_from_one_frame(state: PrivilegedState, n_actions: int) -> NDArray[np.fl
     The cube was dragged straight to the disc, and only until it was on it. So the way back is the line from
     the disc's centre through the cube, wherever on it the cube is. The disc's colour says which way to go.
     """
-    arm = gripper_state(state)
+    arm = model.gripper_state(state)
     cube_m, goal_m = (state.bodies[name].position_m[:2] for name in ("cube", "goal"))
     held = arm.width_m < HELD_WIDTH_M
     stalled = held and float(np.linalg.norm(state.tcp_velocity_m_s)) < STALLED_M_S
@@ -113,11 +103,11 @@ def plan_from_one_frame(state: PrivilegedState, n_actions: int) -> NDArray[np.fl
     return _rows(play, n_actions)
 
 
-def _on_the_way_back_m(cube_m: Vector, goal_m: Vector) -> Vector:
+def _on_the_way_back_m(cube_m: model.Vector, goal_m: model.Vector) -> model.Vector:
     """Return the place on the line from disc to cube that is as far from the robot as first places are."""
     offset_m = cube_m - goal_m
     times = (MEAN_FIRST_X_M - goal_m[0]) / min(float(offset_m[0]), -1e-3)
-    place_m: Vector = goal_m + times * offset_m
+    place_m: model.Vector = goal_m + times * offset_m
     return place_m
 
 
@@ -126,7 +116,7 @@ def _rows(play: _Play, n_actions: int) -> NDArray[np.float32]:
     for _ in range(n_actions):
         play = _decide(play)
         translation, gripper = _command(play)
-        rows.append(action_row(translation, gripper))
+        rows.append(model.action_row(translation, gripper))
         play = _advance(play, translation, gripper)
     return np.stack(rows)
 
@@ -137,33 +127,33 @@ def _decide(play: _Play) -> _Play:
     return replace(play, closing=play.closing or (over and low))
 
 
-def _grasp_place_m(play: _Play) -> Vector:
-    place_m: Vector = play.cube_m - np.array([BEHIND_M, 0.0])
+def _grasp_place_m(play: _Play) -> model.Vector:
+    place_m: model.Vector = play.cube_m - np.array([BEHIND_M, 0.0])
     return place_m
 
 
-def _command(play: _Play) -> tuple[Vector, float]:
+def _command(play: _Play) -> tuple[model.Vector, float]:
     """Return translation and gripper command."""
     arm = play.arm
     if not play.closing:
         place = _grasp_place_m(play)
         over = float(np.linalg.norm(place - arm.position_m[:2])) < OVER_M
-        return towards(np.array([*place, GRASP_M if over else HOVER_M]), arm), GRIPPER_OPEN
+        return model.towards(np.array([*place, GRASP_M if over else HOVER_M]), arm), model.GRIPPER_OPEN
     if not play.held:
-        return np.zeros(3), GRIPPER_CLOSED
+        return np.zeros(3), model.GRIPPER_CLOSED
     shift = (play.home_m if play.was_there else play.goal_m) - play.cube_m
     distance = float(np.linalg.norm(shift))
     if play.was_there and distance < BACK_M:
         shift = np.zeros(2)
     elif not play.was_there:
         shift *= max(distance - AIM_M, 0.0) / max(distance, 1e-6)
-    translation = towards(np.array([*(arm.position_m[:2] + shift), CARRY_M]), arm)
-    return play.caution * translation, GRIPPER_CLOSED
+    translation = model.towards(np.array([*(arm.position_m[:2] + shift), CARRY_M]), arm)
+    return play.caution * translation, model.GRIPPER_CLOSED
 
 
-def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
+def _advance(play: _Play, translation: model.Vector, gripper: float) -> _Play:
     """Return the model's state one control step later: a held object moves with the hand."""
-    arm = advance_gripper(advance(play.arm, translation), 0.0, gripper, held_width_m=CUBE_WIDTH_M)
+    arm = model.advance_gripper(model.advance(play.arm, translation), 0.0, gripper, held_width_m=CUBE_WIDTH_M)
     moved = (arm.position_m - play.arm.position_m)[:2] if play.held else np.zeros(2)
     return replace(play, arm=arm, cube_m=play.cube_m + moved)
 

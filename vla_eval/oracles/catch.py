@@ -9,20 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import (
-    FULL_SPEED_M_S,
-    GRIPPER_CLOSED,
-    GRIPPER_OPEN,
-    POSITION_GAIN_PER_M,
-    STEP_SECONDS,
-    ArmState,
-    Vector,
-    action_row,
-    advance,
-    advance_gripper,
-    gripper_state,
-    towards,
-)
+from vla_eval.oracles import arm_model as model
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, IMAGINED_Y_M, ROLLING_SHARE, UNSEEN_STEPS
 from vla_eval.task_state import PrivilegedState
 
@@ -43,9 +30,9 @@ MIN_REACH_M = 0.32  # closer to the base the inverse kinematics finds no pose at
 class _Play:
     """State of the model: arm, ball in the plane of the table, and the controller's internal state."""
 
-    arm: ArmState
-    ball_m: Vector
-    ball_velocity_m_s: Vector
+    arm: model.ArmState
+    ball_m: model.Vector
+    ball_velocity_m_s: model.Vector
     meet_y_m: float
     stage: str
 
@@ -54,7 +41,11 @@ class CatchExpert:
     """One episode's expert; with an imagined ball it catches that one."""
 
     def __init__(
-        self, *, meet_y_m: float, nominal_speed_m_s: float, imagined_ball: tuple[Vector, Vector] | None
+        self,
+        *,
+        meet_y_m: float,
+        nominal_speed_m_s: float,
+        imagined_ball: tuple[model.Vector, model.Vector] | None,
     ) -> None:
         """Store where to wait and what to expect, and the imagined ball if the real one must not be used."""
         self._meet_y_m = meet_y_m
@@ -66,7 +57,7 @@ class CatchExpert:
         """Return (n_actions, 7), planned from this state alone (and, blind, from the imagined ball)."""
         ball_m, velocity_m_s = self._ball(state, step)
         play = _Play(
-            arm=gripper_state(state),
+            arm=model.gripper_state(state),
             ball_m=ball_m,
             ball_velocity_m_s=velocity_m_s,
             meet_y_m=self._meet_y_m,
@@ -78,20 +69,20 @@ class CatchExpert:
             if index == 0:
                 self._stage = play.stage
             translation = _command(play)
-            gripper = GRIPPER_CLOSED if play.stage in ("close", "stop") else GRIPPER_OPEN
-            rows.append(action_row(translation, gripper))
+            gripper = model.GRIPPER_CLOSED if play.stage in ("close", "stop") else model.GRIPPER_OPEN
+            rows.append(model.action_row(translation, gripper))
             play = _advance(play, translation, gripper)
         if self._imagined_ball is not None:
             self._imagined_ball, self._stage = (play.ball_m, play.ball_velocity_m_s), play.stage
         return np.stack(rows)
 
-    def _ball(self, state: PrivilegedState, step: int) -> tuple[Vector, Vector]:
+    def _ball(self, state: PrivilegedState, step: int) -> tuple[model.Vector, model.Vector]:
         if self._imagined_ball is not None:
             return self._imagined_ball
         if step < UNSEEN_STEPS:
             velocity = np.array([0.0, self._nominal_speed_m_s])
             start = np.array([np.mean(LANE_X_M), np.mean(IMAGINED_Y_M)])
-            return start + velocity * step * STEP_SECONDS, velocity
+            return start + velocity * step * model.STEP_SECONDS, velocity
         body = state.bodies["ball"]
         return body.position_m[:2], body.velocity_m_s[:2]
 
@@ -111,20 +102,20 @@ def _decide(play: _Play) -> _Play:
     return replace(play, stage=stage)
 
 
-def _command(play: _Play) -> Vector:
+def _command(play: _Play) -> model.Vector:
     """Return the (3,) translation that the controller commands in this stage."""
     arm = play.arm
     if play.stage == "wait":
-        return towards(np.array([*_waiting_place_m(play), HOVER_M]), arm)
+        return model.towards(np.array([*_waiting_place_m(play), HOVER_M]), arm)
     height = HOVER_M if play.stage == "chase" else GRASP_M
-    rise = float(np.clip(POSITION_GAIN_PER_M * (height - arm.position_m[2]), -1, 1))
+    rise = float(np.clip(model.POSITION_GAIN_PER_M * (height - arm.position_m[2]), -1, 1))
     if play.stage == "stop":
         return np.array([0.0, 0.0, rise])
     velocity = play.ball_velocity_m_s + TRACK_GAIN_PER_S * (play.ball_m - arm.position_m[:2])
-    return np.clip(np.array([*(velocity / FULL_SPEED_M_S), rise]), -1, 1)
+    return np.clip(np.array([*(velocity / model.FULL_SPEED_M_S), rise]), -1, 1)
 
 
-def _waiting_place_m(play: _Play) -> Vector:
+def _waiting_place_m(play: _Play) -> model.Vector:
     """Return (x, y) over the ball's lane where the arm waits for it."""
     v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
     y = play.meet_y_m
@@ -135,11 +126,15 @@ def _waiting_place_m(play: _Play) -> Vector:
     return np.array([x, y])
 
 
-def _advance(play: _Play, translation: Vector, gripper: float) -> _Play:
+def _advance(play: _Play, translation: model.Vector, gripper: float) -> _Play:
     """Return the model's state one control step later: the ball rolls, or moves with the hand."""
-    arm = advance_gripper(advance(play.arm, translation), 0.0, gripper, held_width_m=BALL_DIAMETER_M)
-    velocity = arm.step_m[:2] / STEP_SECONDS if play.stage == "stop" else play.ball_velocity_m_s
-    return replace(play, arm=arm, ball_m=play.ball_m + velocity * STEP_SECONDS, ball_velocity_m_s=velocity)
+    arm = model.advance_gripper(
+        model.advance(play.arm, translation), 0.0, gripper, held_width_m=BALL_DIAMETER_M
+    )
+    velocity = arm.step_m[:2] / model.STEP_SECONDS if play.stage == "stop" else play.ball_velocity_m_s
+    return replace(
+        play, arm=arm, ball_m=play.ball_m + velocity * model.STEP_SECONDS, ball_velocity_m_s=velocity
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

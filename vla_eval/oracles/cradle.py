@@ -14,17 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import (
-    FULL_SPEED_M_S,
-    GRIPPER_CRADLE,
-    POSITION_GAIN_PER_M,
-    STEP_SECONDS,
-    ArmState,
-    Vector,
-    action_row,
-    advance,
-    arm_state,
-)
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 HEIGHT_M = 0.022  # of the tool centre point while waiting and pushing: the ball's centre is at 0.02
@@ -87,10 +77,10 @@ class _Play:
     """
 
     tactics: CradleTactics
-    arm: ArmState
-    ball_m: Vector
-    ball_velocity_m_s: Vector
-    goal_m: Vector
+    arm: model.ArmState
+    ball_m: model.Vector
+    ball_velocity_m_s: model.Vector
+    goal_m: model.Vector
     stage: str = "wait"
     side_speed_m_s: float = 0.0
 
@@ -122,21 +112,21 @@ class CradleExpert:
         for _ in range(n_actions):
             play = _decide(play)
             velocity = _command(play)
-            rows.append(action_row(velocity / FULL_SPEED_M_S, GRIPPER_CRADLE))
-            play = _advance(play, np.clip(velocity / FULL_SPEED_M_S, -1, 1))
+            rows.append(model.action_row(velocity / model.FULL_SPEED_M_S, model.GRIPPER_CRADLE))
+            play = _advance(play, np.clip(velocity / model.FULL_SPEED_M_S, -1, 1))
         self._stage, self._side_speed_m_s = play.stage, play.side_speed_m_s
         self._imagined_play = play
         return np.stack(rows)
 
     def _present(self, state: PrivilegedState, step: int) -> _Play:
-        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+        arm = model.arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         goal = state.bodies["goal"].position_m[:2]
         if self._imagined:
             ball, velocity = self._imagined_ball(goal)
         elif step < UNSEEN_STEPS:
             velocity = np.array(self._tactics.nominal_velocity_m_s)
             ball = np.array([goal[0] - GOAL_OFFSET_X_M, np.mean(IMAGINED_Y_M)])
-            ball = ball + velocity * step * STEP_SECONDS
+            ball = ball + velocity * step * model.STEP_SECONDS
         else:
             body = state.bodies["ball"]
             ball, velocity = body.position_m[:2], body.velocity_m_s[:2]
@@ -150,7 +140,7 @@ class CradleExpert:
             side_speed_m_s=self._side_speed_m_s,
         )
 
-    def _imagined_ball(self, goal_m: Vector) -> tuple[Vector, Vector]:
+    def _imagined_ball(self, goal_m: model.Vector) -> tuple[model.Vector, model.Vector]:
         """Return position and velocity of the imagined ball: as drawn, or as predicted by the model."""
         if self._imagined_play is None:
             start = np.array([goal_m[0] - GOAL_OFFSET_X_M, self._drawn_y_m])
@@ -172,14 +162,14 @@ def _decide(play: _Play) -> _Play:
     return replace(play, stage=stage)
 
 
-def _command(play: _Play) -> Vector:
+def _command(play: _Play) -> model.Vector:
     """Return the (3,) velocity in m/s that the controller commands in this stage."""
     tcp = play.arm.position_m
-    height = POSITION_GAIN_PER_M * (HEIGHT_M - tcp[2]) * FULL_SPEED_M_S
+    height = model.POSITION_GAIN_PER_M * (HEIGHT_M - tcp[2]) * model.FULL_SPEED_M_S
     if play.stage == "wait":
         place = np.array([*_waiting_place_m(play), HEIGHT_M])
-        velocity: Vector = POSITION_GAIN_PER_M * (place - tcp) * FULL_SPEED_M_S
-        return np.clip(velocity, -FULL_SPEED_M_S, FULL_SPEED_M_S)
+        velocity: model.Vector = model.POSITION_GAIN_PER_M * (place - tcp) * model.FULL_SPEED_M_S
+        return np.clip(velocity, -model.FULL_SPEED_M_S, model.FULL_SPEED_M_S)
     tracking = TRACK_GAIN_PER_S * float(play.ball_m[1] - tcp[1])
     ball_v_x, ball_v_y = (float(v) for v in play.ball_velocity_m_s)
     if play.stage == "follow":
@@ -191,7 +181,7 @@ def _command(play: _Play) -> Vector:
     return np.array([forward, _next_side_speed_m_s(play) + tracking, height])
 
 
-def _waiting_place_m(play: _Play) -> Vector:
+def _waiting_place_m(play: _Play) -> model.Vector:
     """Return (x, y) beside the lane from which a push carries the ball to the goal."""
     lane_x = float(play.ball_m[0])
     v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
@@ -212,7 +202,7 @@ def _push_speeds_m_s(play: _Play) -> tuple[float, float]:
     wanted = to_goal_x * side / to_goal_y if abs(to_goal_y) > 1e-6 else PUSH_SPEED_RANGE_M_S[1]
     least, most = PUSH_SPEED_RANGE_M_S
     forward = min(max(wanted, least), most) if to_goal_y > 0 else most
-    seconds = max(to_goal_x / forward, STEP_SECONDS)
+    seconds = max(to_goal_x / forward, model.STEP_SECONDS)
     return forward, to_goal_y / seconds
 
 
@@ -222,18 +212,18 @@ def _next_side_speed_m_s(play: _Play) -> float:
     return play.side_speed_m_s + change
 
 
-def _advance(play: _Play, translation: Vector) -> _Play:
+def _advance(play: _Play, translation: model.Vector) -> _Play:
     """Return the model's state one control step later: the ball rolls, or moves with the cradle."""
-    arm = advance(play.arm, translation)
+    arm = model.advance(play.arm, translation)
     velocity = play.ball_velocity_m_s
     side_speed = play.side_speed_m_s
     if play.stage == "push":
         side_speed = _next_side_speed_m_s(play)
-        velocity = arm.step_m[:2] / STEP_SECONDS
+        velocity = arm.step_m[:2] / model.STEP_SECONDS
     return replace(
         play,
         arm=arm,
-        ball_m=play.ball_m + velocity * STEP_SECONDS,
+        ball_m=play.ball_m + velocity * model.STEP_SECONDS,
         ball_velocity_m_s=velocity,
         side_speed_m_s=side_speed,
     )

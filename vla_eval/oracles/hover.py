@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import GRIPPER_OPEN, Vector, action_row, advance, arm_state, towards
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 TOUCH_MARGIN = 1.2  # close enough is 1.2 times the height at which the arm comes to rest
@@ -28,22 +28,18 @@ class HoverExpert:
     descend_to_m: float
 
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
-        """Return (n_actions, 7) that move the arm towards a candidate, planned from `state` alone."""
+        """Return (n_actions, 7) that move the arm model.towards a candidate, planned from `state` alone."""
         centre = state.candidate_positions_m[candidate]
-        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
-        rows = []
-        for _ in range(n_actions):
-            translation = towards(self._goal(centre, arm.position_m), arm)
-            rows.append(action_row(translation, GRIPPER_OPEN))
-            arm = advance(arm, translation)
-        return np.stack(rows)
+        return model.follow(
+            lambda arm: self._goal(centre, arm.position_m), state, n_actions, gripper=model.GRIPPER_OPEN
+        )
 
     def is_done(self, state: PrivilegedState, candidate: int) -> bool:
         """Whether the arm is close enough to a candidate to touch it, if it rests there."""
         distance_m = np.linalg.norm(state.tcp_position_m - state.candidate_positions_m[candidate])
         return bool(distance_m <= TOUCH_MARGIN * self.rest_above_m)
 
-    def _goal(self, centre: Vector, tcp: Vector) -> Vector:
+    def _goal(self, centre: model.Vector, tcp: model.Vector) -> model.Vector:
         goal = centre.copy()
         if np.linalg.norm((centre - tcp)[:2]) < self.over_radius_m:
             goal[2] += self.rest_above_m

@@ -3,15 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import (
-    GRIPPER_CLOSED,
-    ArmState,
-    Vector,
-    action_row,
-    advance,
-    arm_state,
-    towards,
-)
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 TRAVEL_M = 0.16  # of the tool centre point over the table: above all mugs, 8.1 cm high
@@ -31,13 +23,9 @@ class PushExpert:
         mug_m = state.bodies[f"mug_{candidate}"].position_m
         goal_m = state.bodies[f"goal_{candidate}"].position_m
         end_x_m = float(goal_m[0]) - DEPTH_IN_GOAL_M - CONTACT_M
-        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
-        rows = []
-        for _ in range(n_actions):
-            translation = towards(_goal(mug_m, end_x_m, arm), arm)
-            rows.append(action_row(translation, GRIPPER_CLOSED))
-            arm = advance(arm, translation)
-        return np.stack(rows)
+        return model.follow(
+            lambda arm: _goal(mug_m, end_x_m, arm), state, n_actions, gripper=model.GRIPPER_CLOSED
+        )
 
     def is_done(self, state: PrivilegedState, candidate: int) -> bool:
         """Whether the mug is in its goal."""
@@ -46,7 +34,7 @@ class PushExpert:
         return bool(goal_m[0] - mug_m[0] < DEPTH_IN_GOAL_M + 0.015)
 
 
-def _goal(mug_m: Vector, end_x_m: float, arm: ArmState) -> Vector:
+def _goal(mug_m: model.Vector, end_x_m: float, arm: model.ArmState) -> model.Vector:
     """Return the next target of the tool centre point."""
     x, y, z = (float(v) for v in arm.position_m)
     behind_x, mug_y = float(mug_m[0]) - BEHIND_M, float(mug_m[1])

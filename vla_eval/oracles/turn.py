@@ -11,19 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import (
-    GRIPPER_CLOSED,
-    GRIPPER_OPEN,
-    ArmState,
-    Vector,
-    action_row,
-    advance,
-    advance_gripper,
-    gripper_state,
-    towards,
-    turn_towards,
-    wrapped_rad,
-)
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 # Joint 7 starts at π/4 and its range is ±2.9 rad: the wrist can turn farther to the left than to the right.
@@ -50,10 +38,10 @@ class _Play:
     plan is made. If it moved there and down in one plan, it would sometimes hit the peg.
     """
 
-    arm: ArmState
-    peg_m: Vector
+    arm: model.ArmState
+    peg_m: model.Vector
     peg_yaw_rad: float
-    goal_m: Vector
+    goal_m: model.Vector
     grasp_yaw_rad: float
     left_rad: float
     closing: bool
@@ -79,17 +67,17 @@ class TurnExpert:
             if index == 0:
                 self._closing = play.closing
             translation, turn, gripper = _command(play)
-            rows.append(action_row(translation, gripper, turn))
+            rows.append(model.action_row(translation, gripper, turn))
             play = _advance(play, translation, turn, gripper)
         return np.stack(rows)
 
     def _present(self, state: PrivilegedState) -> _Play:
-        arm = gripper_state(state)
+        arm = model.gripper_state(state)
         peg, goal = state.bodies["peg"], state.bodies["goal"]
         if self._goal_yaw_rad is None:
             by_rad = self._imagined_angle_rad
             self._goal_yaw_rad = goal.yaw_rad if by_rad is None else peg.yaw_rad + by_rad
-        left_rad = wrapped_rad(self._goal_yaw_rad - peg.yaw_rad)
+        left_rad = model.wrapped_rad(self._goal_yaw_rad - peg.yaw_rad)
         if self._grasp_offset_rad is None:
             grasp_yaw_rad = _grasp_yaw_rad(arm.yaw_rad, peg.yaw_rad, left_rad)
             self._grasp_offset_rad = grasp_yaw_rad - peg.yaw_rad
@@ -100,7 +88,7 @@ class TurnExpert:
             peg_m=peg.position_m,
             peg_yaw_rad=peg.yaw_rad,
             goal_m=goal.position_m,
-            grasp_yaw_rad=arm.yaw_rad + wrapped_rad(wanted_rad - arm.yaw_rad),
+            grasp_yaw_rad=arm.yaw_rad + model.wrapped_rad(wanted_rad - arm.yaw_rad),
             left_rad=left_rad,
             closing=self._closing,
         )
@@ -109,7 +97,7 @@ class TurnExpert:
 
 def _grasp_yaw_rad(wrist_rad: float, peg_rad: float, left_rad: float) -> float:
     """Return the wrist's yaw of the grasp with the shortest rotation within the wrist's range."""
-    nearest = wrist_rad + wrapped_rad(peg_rad - wrist_rad, math.pi)
+    nearest = wrist_rad + model.wrapped_rad(peg_rad - wrist_rad, math.pi)
     least, most = WRIST_RANGE_RAD
 
     def way(yaw_rad: float) -> tuple[bool, float]:
@@ -135,29 +123,29 @@ def _is_over(play: _Play) -> bool:
     return _over_m(play) < OVER_M and abs(play.grasp_yaw_rad - play.arm.yaw_rad) < DESCEND_RAD
 
 
-def _command(play: _Play) -> tuple[Vector, float, float]:
+def _command(play: _Play) -> tuple[model.Vector, float, float]:
     """Return translation, turn and gripper command."""
     arm = play.arm
     if not play.closing:
         down = play.may_descend and _is_over(play)
         goal = np.array([*play.peg_m[:2], GRASP_M if down else HOVER_M])
-        translation = towards(goal, arm)
+        translation = model.towards(goal, arm)
         if down:
             translation[2] = max(translation[2], -DESCENT)
-        return translation, turn_towards(play.grasp_yaw_rad, arm), GRIPPER_OPEN
+        return translation, model.turn_towards(play.grasp_yaw_rad, arm), model.GRIPPER_OPEN
     held = arm.width_m < HELD_WIDTH_M
     # Move the centre back to its first position, in case the grasp has moved it.
     shift = (play.goal_m - play.peg_m)[:2] if held else np.zeros(2)
     goal = np.array([*(arm.position_m[:2] + shift), GRASP_M])
     turns = held and abs(play.left_rad) > AT_ANGLE_RAD
-    turn = turn_towards(arm.yaw_rad + play.left_rad, arm) if turns else 0.0
-    return towards(goal, arm), turn, GRIPPER_CLOSED
+    turn = model.turn_towards(arm.yaw_rad + play.left_rad, arm) if turns else 0.0
+    return model.towards(goal, arm), turn, model.GRIPPER_CLOSED
 
 
-def _advance(play: _Play, translation: Vector, turn: float, gripper: float) -> _Play:
+def _advance(play: _Play, translation: model.Vector, turn: float, gripper: float) -> _Play:
     """Return the model's state one control step later: a held object turns and moves with the hand."""
     held = play.closing and play.arm.width_m < HELD_WIDTH_M
-    arm = advance_gripper(advance(play.arm, translation), turn, gripper, held_width_m=PEG_WIDTH_M)
+    arm = model.advance_gripper(model.advance(play.arm, translation), turn, gripper, held_width_m=PEG_WIDTH_M)
     if not held:
         return replace(play, arm=arm)
     turned_rad = arm.yaw_rad - play.arm.yaw_rad

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.oracles.arm_model import GRIPPER_OPEN, ArmState, Vector, action_row, advance, arm_state
+from vla_eval.oracles import arm_model as model
 from vla_eval.task_state import PrivilegedState
 
 # Action per metre of distance: a third of the distance per step. A higher gain is a little faster with one
@@ -45,29 +45,29 @@ class LowFlight:
             in_order: touch them in the given order; otherwise always the nearest remaining one.
         """
         goals = {index: self._resting_point(state.candidate_positions_m[index]) for index in wanted}
-        arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+        arm = model.arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         rows = []
         for _ in range(n_actions):
             index = _next_index(goals, arm.position_m, in_order=in_order)
             goal = arm.position_m if index is None else goals[index]
             translation = np.clip(GAIN_PER_M * (goal - arm.position_m), -1, 1)
-            rows.append(action_row(translation, GRIPPER_OPEN))
-            arm = advance(arm, translation)
+            rows.append(model.action_row(translation, model.GRIPPER_OPEN))
+            arm = model.advance(arm, translation)
             if index is not None and self._touches(arm, goals[index]):
                 del goals[index]
         return np.stack(rows)
 
-    def _resting_point(self, centre: Vector) -> Vector:
+    def _resting_point(self, centre: model.Vector) -> model.Vector:
         point = centre.copy()
         point[2] = 2 * centre[2] + self.above_top_m  # a cube on the table is twice as high as its centre
         return point
 
-    def _touches(self, arm: ArmState, goal: Vector) -> bool:
+    def _touches(self, arm: model.ArmState, goal: model.Vector) -> bool:
         near = np.linalg.norm(goal - arm.position_m) <= self.near_m
         return bool(near and np.linalg.norm(arm.step_m) <= self.slow_m_per_step)
 
 
-def _next_index(goals: dict[int, Vector], tcp: Vector, *, in_order: bool) -> int | None:
+def _next_index(goals: dict[int, model.Vector], tcp: model.Vector, *, in_order: bool) -> int | None:
     if not goals:
         return None
     if in_order:

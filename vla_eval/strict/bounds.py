@@ -1,10 +1,12 @@
-"""How large the numbers of a recipe may be. Knows nothing of what they mean.
+"""How large the numbers of a recipe may be: an annotation of each field. Knows nothing of what they mean.
 
 The upper bounds lie far above what anyone needs. With them a typo gives a message at the start. Without them
 it would fill the memory, or fail in every episode.
 """
 
+import functools
 from collections.abc import Mapping
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from vla_eval.errors import RecipeError
 
@@ -19,19 +21,46 @@ MAX_TRAINING_STEPS = 1_000_000_000
 MAX_BATCH = 1_000_000
 MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX = 16, 2048  # height and width of an image that is rendered
 
-Bounds = tuple[float, float]
-"""(least, most), both allowed."""
+
+class Bounds(NamedTuple):
+    """Least and most, both allowed: `Annotated[int, Bounds(1, 9)]`."""
+
+    least: float
+    most: float
 
 
-def check_bounds(recipe: object, bounds: Mapping[str, Bounds], *, prefix: str = "") -> None:
+Episodes = Annotated[int, Bounds(1, MAX_EPISODES)]
+Steps = Annotated[int, Bounds(1, MAX_STEPS)]
+TrainingSteps = Annotated[int, Bounds(1, MAX_TRAINING_STEPS)]
+Slots = Annotated[int, Bounds(1, MAX_SLOTS)]
+Workers = Annotated[int | Literal["auto"], Bounds(1, MAX_PROCESSES)]
+SecondsAllowed = Annotated[float, Bounds(0.001, MAX_SECONDS)]
+
+
+@functools.cache
+def _bounds_of(cls: type) -> dict[str, Bounds]:
+    """Return field -> bounds of a dataclass, also where they are part of a union (`Steps | None`)."""
+    return {
+        name: mark
+        for name, hint in get_type_hints(cls, include_extras=True).items()
+        for part in (hint, *getattr(hint, "__args__", ()))
+        for mark in getattr(part, "__metadata__", ())
+        if isinstance(mark, Bounds)
+    }
+
+
+def check_bounds(
+    recipe: object, bounds: Mapping[str, tuple[float, float]] | None = None, *, prefix: str = ""
+) -> None:
     """Raise `RecipeError` unless the numbers in these attributes are within their bounds.
 
     Args:
         recipe: the object; attributes that are None or a word are passed over.
-        bounds: attribute -> (least, most).
+        bounds: attribute -> (least, most); None: as the dataclass annotates its fields.
         prefix: what stands before the attributes' names in the message: `finetune.`.
     """
-    for name, (least, most) in bounds.items():
+    cls: Any = type(recipe)  # Any: mypy does not see that a class can be hashed
+    for name, (least, most) in (_bounds_of(cls) if bounds is None else bounds).items():
         value = getattr(recipe, name)
         for number in value if isinstance(value, tuple | list) else (value,):
             if number is None or isinstance(number, str):

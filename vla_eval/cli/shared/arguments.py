@@ -6,12 +6,16 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vla_eval.config.files import Folder, load_recipe
 from vla_eval.errors import RecipeError
+from vla_eval.results.formats import FORMATS
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds
+from vla_eval.strict.decoding import decode
 from vla_eval.strict.renamed import warn_renamed
 
 if TYPE_CHECKING:
@@ -53,26 +57,6 @@ def workers_argument(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"expected 'auto' or a number, found '{text}'") from exc
 
 
-def add_workers(parser: argparse.ArgumentParser, *, default: str | None = None) -> None:
-    """Declare `--workers W`; without a default the recipe says how many."""
-    parser.add_argument(
-        "--workers",
-        type=workers_argument,
-        default=default,
-        metavar="W",
-        help="processes, or 'auto': one per core",
-    )
-
-
-def add_allow_environment_change(parser: argparse.ArgumentParser, *, consequence: str = "") -> None:
-    """Declare `--allow-environment-change`."""
-    parser.add_argument(
-        "--allow-environment-change",
-        action="store_true",
-        help=f"resume although package versions or the machine have changed{consequence}",
-    )
-
-
 def seeds_argument(text: str) -> range:
     """Read the value of `--seeds`: `1-100`, or one seed."""
     first, _, last = text.partition("-")
@@ -97,16 +81,6 @@ def shard_argument(text: str) -> Shard:
         raise argparse.ArgumentTypeError(str(exc)) from exc
 
 
-def add_shard(parser: argparse.ArgumentParser) -> None:
-    """Declare `--shard I/N`."""
-    parser.add_argument(
-        "--shard",
-        type=shard_argument,
-        metavar="I/N",
-        help="run only part I of N, to OUT-shard-I-of-N; `mikasa-vla merge` puts them together",
-    )
-
-
 def descriptor_argument(text: str) -> int:
     """Read the number of an open file descriptor that is none of input and results."""
     try:
@@ -122,31 +96,9 @@ def descriptor_argument(text: str) -> int:
     return descriptor
 
 
-def add_json_progress(parser: argparse.ArgumentParser) -> None:
-    """Declare `--json-progress FD`."""
-    parser.add_argument(
-        "--json-progress",
-        type=descriptor_argument,
-        metavar="FD",
-        help="also write progress as JSON lines to this file descriptor; 2: in place of the bar",
-    )
-
-
 def set_flags(data: dict[str, Any], args: argparse.Namespace, names: Sequence[str]) -> None:  # Any: YAML
     """Set the fields of a recipe whose flags were given."""
     data.update({name: value for name in names if (value := getattr(args, name)) is not None})
-
-
-def add_overrides(parser: argparse.ArgumentParser, *, help: str) -> None:
-    """Declare `--set A.B=C`, as often as one likes."""
-    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="A.B=C", help=help)
-
-
-def add_dry_run(parser: argparse.ArgumentParser) -> None:
-    """Declare `--dry-run`; what it assumes are flags of each verb."""
-    parser.add_argument(
-        "--dry-run", action="store_true", help="show what would run and what it takes; run nothing"
-    )
 
 
 def positive_argument(text: str) -> float:
@@ -166,6 +118,88 @@ def memory_argument(text: str) -> float:
         if text.endswith(unit):
             return positive_argument(text.removesuffix(unit)) * n_bytes
     raise argparse.ArgumentTypeError(f"expected a size such as 80GB or 80GiB, found '{text}'")
+
+
+MANY: Mapping[str, Any] = {"nargs": "+", "action": "extend"}
+FLAGS: Mapping[str, Mapping[str, Any]] = {
+    "--task": {**MANY, "dest": "tasks", "metavar": "T", "help": "task ids"},
+    "--policy": {**MANY, "dest": "policies", "metavar": "P", "help": "names, files or folders"},
+    "--n-action-steps": {**MANY, "type": int, "metavar": "K", "help": "actions per inference"},
+    "--episodes": {"type": int, "metavar": "N"},
+    "--seed-start": {"type": int, "metavar": "S", "help": "seed of the first episode (1)"},
+    "--workers": {
+        "type": workers_argument,
+        "metavar": "W",
+        "help": "processes, or 'auto': one per core",
+    },
+    "--cluster": {
+        "metavar": "WHERE",
+        "help": "run on a Ray cluster: auto, local or ray://HOST:PORT (docs/cluster.md)",
+    },
+    "--out": {"type": Path, "metavar": "DIR"},
+    "--shard": {
+        "type": shard_argument,
+        "metavar": "I/N",
+        "help": "run only part I of N, to OUT-shard-I-of-N; `mikasa-vla merge` puts them together",
+    },
+    "--json-progress": {
+        "type": descriptor_argument,
+        "metavar": "FD",
+        "help": "also write progress as JSON lines to this file descriptor; 2: in place of the bar",
+    },
+    "--set": {"action": "append", "default": [], "dest": "overrides", "metavar": "A.B=C"},
+    "--dry-run": {"action": "store_true", "help": "show what would run and what it takes; run nothing"},
+    "--allow-environment-change": {
+        "action": "store_true",
+        "help": "resume although package versions or the machine have changed",
+    },
+    "--format": {"choices": FORMATS, "default": "markdown", "help": "(markdown)"},
+}
+"""What argparse takes of the flags that several verbs have; without a help, each says its own."""
+
+
+def add_flags(parser: argparse.ArgumentParser, *flags: str, **own_helps: str) -> None:
+    """Declare flags of the table, those with a help of the verb's own by their names (`seed_start="…"`)."""
+    helps = {flag: FLAGS[flag].get("help") for flag in flags}
+    helps |= {f"--{name.replace('_', '-')}": text for name, text in own_helps.items()}
+    for flag, text in helps.items():
+        parser.add_argument(flag, **{**FLAGS[flag], "help": text})
+
+
+def read_config[T](
+    cls: type[T],
+    edit: Callable[[dict[str, Any]], None],  # Any: plain data of YAML
+    *,
+    folder: Folder,
+    name: str | None,
+    start: Mapping[str, Any],
+    asks: str,
+    needed: Mapping[str, str],
+    example: str,
+) -> T:
+    """Return a configuration: the file, or what stands for it, with the flags on top.
+
+    Args:
+        cls: its dataclass.
+        edit: puts the flags on top.
+        folder: where configurations of this kind are.
+        name: the file; None: none was named.
+        start: fields that stand for a file.
+        asks: what to name where neither a file nor enough flags are given.
+        needed: field -> flag that must be there without a file.
+        example: a command.
+
+    Raises:
+        VlaEvalError: see `load_recipe`; or a needed flag is missing.
+    """
+    if name is not None:
+        return load_recipe(folder, name, cls, edit=edit).value
+    data = dict(start)
+    edit(data)
+    for field, flag in needed.items():
+        if field not in data:
+            raise RecipeError(f"Name {asks}; {flag} is missing. Example: mikasa-vla {example}")
+    return decode(cls, data, where="command line")
 
 
 def add_old_flag(

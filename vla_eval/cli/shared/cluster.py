@@ -10,15 +10,6 @@ from vla_eval.workers.local import LOCAL
 from vla_eval.workers.needed_files import Needed
 
 
-def add_cluster(parser: argparse.ArgumentParser) -> None:
-    """Declare `--cluster`."""
-    parser.add_argument(
-        "--cluster",
-        metavar="WHERE",
-        help="run on a Ray cluster: auto, local or ray://HOST:PORT (docs/cluster.md)",
-    )
-
-
 @contextlib.contextmanager
 def backend_of(
     args: argparse.Namespace,

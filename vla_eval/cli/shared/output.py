@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.cli.shared.arguments import add_flags
 from vla_eval.cli.terminal.screen import print_markdown, screen_width
 from vla_eval.errors import unknown_name
-from vla_eval.results.formats import FORMATS, PRESETS
+from vla_eval.results.formats import PRESETS
 from vla_eval.storage.shard import Shard
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ DEFAULT_BOARD = "leaderboard_mikasa"
 
 def add_table_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the table is printed."""
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(markdown)")
+    add_flags(parser, "--format")
     parser.add_argument("--wide", action="store_true", help="every column, and a row per run")
     parser.add_argument(
         "--preset",

@@ -21,7 +21,7 @@ from vla_eval.tasks.spec import MemoryType, PhaseSource, TaskSpec
 NAMESPACE_90 = "mikasa_vla/"
 NAMESPACE_ORIGINAL = "mikasa_official/"
 TABLE = "official_90.csv"
-ENTRY_POINT = "vla_eval.envs.official:make_official_env"
+ENTRY_POINT = "vla_eval.envs.official:OfficialEnv"
 _AS_PACKAGE = "as the official package has it"
 
 
