@@ -11,10 +11,11 @@ from vla_eval.cli.main import main
 from vla_eval.page.build import build_page
 from vla_eval.probe.choice_pairs import choice_pairs
 from vla_eval.probe.find_worlds import find_probes
-from vla_eval.probe.interventions import ProbeSettings, plan_probe
+from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.sections import probe_sections
 from vla_eval.probe.report_text import probe_texts
 from vla_eval.probe.world_records import by_policy
+from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import RunDescription, StoredRun
 from vla_eval.viz.filmstrip import read_strip

@@ -8,6 +8,7 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -29,30 +30,37 @@ SCRIPT = "episodes.js"
 N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
+class PageOptions(TypedDict, total=False):
+    """What a page is made with.
+
+    Attributes:
+        baseline, protocols: as for `build_table`.
+        probes: those that the run folders are of.
+        published: as for `render`.
+    """
+
+    baseline: str | None
+    probes: Sequence[ProbeSection]
+    protocols: Sequence[str]
+    published: str | None
+
+
 def build_page(
-    runs: Sequence[StoredRun],
-    *,
-    baseline: str | None = None,
-    probes: Sequence[ProbeSection] = (),
-    protocols: Sequence[str] = (),
-    published: str | None = None,
-    folder: Path | None = None,
+    runs: Sequence[StoredRun], *, folder: Path | None = None, **options: Unpack[PageOptions]
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
     Args:
         runs: what the run folders hold. Timings and videos are read from the folders themselves.
-        baseline: as for `build_table`.
-        probes: those that the run folders are of.
-        protocols: as for `build_table`.
-        published: as for `render`.
         folder: where the page will be, for links to captures; None: the current folder.
+        options: what it is made with.
 
     Raises:
         ReportError: there is no episode yet.
         UnknownNameError: there is no such baseline or protocol.
     """
-    material = gather(runs, baseline=baseline, protocols=protocols)
+    published = options.get("published")
+    material = gather(runs, baseline=options.get("baseline"), protocols=options.get("protocols", ()))
     chunks = rates.chunk_plots(material)
     templates = _templates()
     script = templates.get_template(SCRIPT).render()
@@ -61,7 +69,7 @@ def build_page(
         summary=_summary(material),
         version=__version__,
         material=material,
-        probes=probes,
+        probes=options.get("probes", ()),
         verdicts=verdicts(material.table),
         episodes=episode_list(material, folder),
         script=Markup(script),
@@ -84,32 +92,14 @@ def build_page(
     )
 
 
-def write_page(
-    runs: Sequence[StoredRun],
-    folder: Path,
-    *,
-    baseline: str | None = None,
-    probes: Sequence[ProbeSection] = (),
-    protocols: Sequence[str] = (),
-    published: str | None = None,
-) -> Path:
-    """Write the page and return its path.
-
-    Args:
-        runs: as for `build_page`.
-        folder: created if it does not exist.
-        baseline: as for `build_page`.
-        probes: as for `build_page`.
-        protocols: as for `build_table`.
-        published: as for `render`.
+def write_page(runs: Sequence[StoredRun], folder: Path, **options: Unpack[PageOptions]) -> Path:
+    """Write the page into a folder, which is made if it is not there, and return its path.
 
     Raises:
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(
-        runs, baseline=baseline, probes=probes, protocols=protocols, published=published, folder=folder
-    )
+    page = build_page(runs, folder=folder, **options)
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,15 +140,10 @@ def with_code(text: str) -> Markup:
 def _summary(material: Material) -> str:
     rows = material.table.rows
     counts = (
-        (sum(row[EPISODES].n_episodes for row in rows), "episodes with a result"),
-        (sum(row[EPISODES].n_errors for row in rows), "errors"),
-        (len(material.tasks), "tasks"),
-        (len(material.colors), "policies"),
-        (len(material.runs), "run folders"),
+        (sum(row[EPISODES].n_episodes for row in rows), "episode with a result", "episodes with a result"),
+        (sum(row[EPISODES].n_errors for row in rows), "error", "errors"),
+        (len(material.tasks), "task", "tasks"),
+        (len(material.colors), "policy", "policies"),
+        (len(material.runs), "run folder", "run folders"),
     )
-    return ", ".join(f"{n} {noun if n != 1 else _singular(noun)}" for n, noun in counts)
-
-
-def _singular(noun: str) -> str:
-    words = {"policies": "policy", "episodes with a result": "episode with a result"}
-    return words.get(noun, noun.removesuffix("s"))
+    return ", ".join(f"{n} {one if n == 1 else several}" for n, one, several in counts)

@@ -4,27 +4,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable
+from vla_eval.page.tables import UNKNOWN, Column, MatrixCell, PageTable, shaded
 from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
 from vla_eval.tasks.objects.item_names import item_names
-
-TITLES: dict[Cause, str] = {
-    "right": "right choice",
-    "not_finished": "right choice, not finished",
-    "forgot": "forgot",
-    "position_habit": "position habit",
-    "never_chose": "never chose",
-    "could_not_move": "could not move",
-}
-EXPLANATIONS: dict[Cause, str] = {
-    "right": "the first candidate touched was right, and the episode succeeded (by memory or by luck)",
-    "not_finished": "the first candidate touched was right, but the task was not completed",
-    "forgot": "a wrong candidate was touched first",
-    "position_habit": "a wrong candidate was touched first, at the place that wrong choices prefer",
-    "never_chose": "the arm moved but touched no candidate",
-    "could_not_move": f"the arm was never {MOVED_M * 100:.0f} cm from where it began",
-}
-KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
 
 
 class Explanation(NamedTuple):
@@ -32,6 +14,27 @@ class Explanation(NamedTuple):
 
     title: str
     rule: str
+
+
+EXPLANATIONS: dict[Cause, Explanation] = {
+    "right": Explanation(
+        "right choice",
+        "the first candidate touched was right, and the episode succeeded (by memory or by luck)",
+    ),
+    "not_finished": Explanation(
+        "right choice, not finished",
+        "the first candidate touched was right, but the task was not completed",
+    ),
+    "forgot": Explanation("forgot", "a wrong candidate was touched first"),
+    "position_habit": Explanation(
+        "position habit", "a wrong candidate was touched first, at the place that wrong choices prefer"
+    ),
+    "never_chose": Explanation("never chose", "the arm moved but touched no candidate"),
+    "could_not_move": Explanation(
+        "could not move", f"the arm was never {MOVED_M * 100:.0f} cm from where it began"
+    ),
+}
+KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,11 +80,11 @@ def choices(material: Material) -> Choices | None:
         for row, report in found
     ]
     return Choices(
-        explanations=tuple(Explanation(TITLES[cause], EXPLANATIONS[cause]) for cause in CAUSES),
+        explanations=tuple(EXPLANATIONS.values()),
         table=PageTable(
             columns=(
                 Column("policy"),
-                *(Column(TITLES[cause], "number") for cause in CAUSES),
+                *(Column(EXPLANATIONS[cause].title, "number") for cause in CAUSES),
                 Column("habit of place"),
                 Column("habit of item"),
             ),
@@ -133,20 +136,12 @@ def _matrices(report: ChoiceReport, task: str) -> tuple[Matrix, ...]:
 
 def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:
     counts = report.confusion[kind]
-    most = max(counts.values())
     names = _names(report, kind, task)
     chosen: list[int | None] = [*range(report.n_candidates), None]
-    rows = [
-        [
-            MatrixCell(n, DARKEST * n / most, target == choice)
-            for choice in chosen
-            for n in (counts.get((target, choice), 0),)
-        ]
-        for target in range(report.n_candidates)
-    ]
+    rows = [[counts.get((target, choice), 0) for choice in chosen] for target in range(report.n_candidates)]
     return Matrix(
         kind=KIND_NAMES[kind],
         names=names,
         choices=tuple("none" if i is None else names[i] for i in chosen),
-        rows=tuple(map(tuple, rows)),
+        rows=shaded(rows, lambda target, choice: target == choice),
     )

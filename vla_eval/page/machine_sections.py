@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.page.material import Material, errors_of
+from vla_eval.page.material import Material
 from vla_eval.page.tables import UNKNOWN, PageTable, page_table
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import thumbnail_file, video_file
@@ -60,7 +60,9 @@ def latency(material: Material) -> LatencyTable:
 
 def errors_table(material: Material) -> PageTable | None:
     """Return errors by cause, the most frequent first; None if there are none."""
-    errors = [(record, record.error) for record in errors_of(material) if record.error is not None]
+    runs = (run for row in material.table.rows for run in row.episodes.runs)
+    records = (record for run in runs for record in run.records.values())
+    errors = [(record, record.error) for record in records if record.error is not None]
     counts = Counter((error.kind, error.stage) for _, error in errors)
     rows = []
     for (kind, stage), n in counts.most_common():

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.records import EpisodeKey, EpisodeTiming
 from vla_eval.results.report import build_table
 from vla_eval.results.success_table import Row, Table
 from vla_eval.storage.run_folder import StoredRun
@@ -74,14 +74,3 @@ def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequen
         timings={str(run.path): read_timings(run.path) for run in runs},
         colors={policy: number for number, policy in enumerate(policies)},
     )
-
-
-def errors_of(material: Material) -> list[EpisodeRecord]:
-    """Return all episodes that ended in an error and are in the table."""
-    return [
-        record
-        for row in material.table.rows
-        for run in row.episodes.runs
-        for record in run.records.values()
-        if record.outcome == "error"
-    ]

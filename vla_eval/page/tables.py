@@ -1,6 +1,6 @@
 """Tables as the page's templates show them. Knows nothing of results or of HTML."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -20,6 +20,22 @@ class MatrixCell(NamedTuple):
     n: int
     opacity: float
     is_right: bool
+
+
+def shaded(
+    counts: Sequence[Sequence[int]], is_right: Callable[[int, int], bool]
+) -> tuple[tuple[MatrixCell, ...], ...]:
+    """Return the cells of a matrix of counts, the most frequent one the darkest.
+
+    Args:
+        counts: of each row; one of them is above 0.
+        is_right: whether the cell of this row and column is outlined as right.
+    """
+    most = max(map(max, counts))
+    return tuple(
+        tuple(MatrixCell(n, DARKEST * n / most, is_right(y, x)) for x, n in enumerate(row))
+        for y, row in enumerate(counts)
+    )
 
 
 class Column(NamedTuple):

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vla_eval.probe.interventions import SWAPS, World
 from vla_eval.probe.quantities import Pair, follows, pair_up
 from vla_eval.probe.world_records import Worlds, compared_with
+from vla_eval.probe.worlds import SWAPS, World
 from vla_eval.tasks.objects.item_names import item_names
 
 NO_CHOICE = "none"

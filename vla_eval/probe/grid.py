@@ -4,6 +4,7 @@ Where K does not divide the phases, how much of the cue falls between two infere
 first one is. So every first inference below K is run there. Knows nothing of records or statistics.
 """
 
+import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -23,6 +24,7 @@ DEFAULT_GRID_CUES = (1, 2, 3, 5)
 
 ORACLE = "oracle"
 CUE_READER = "cue_reader"
+_NAME = re.compile(r"grid_(?P<axis>delay|cue)_(?P<level>\d+)_from_(?P<first>\d+)")  # after the task
 CONTROLS = (ORACLE, CUE_READER)
 """Arms that forget nothing: one knows the cue in any case, one only from the frames of its inferences."""
 
@@ -65,6 +67,26 @@ class GridWorld:
     first_inference_step: int
     phases: Phases
     config: EvalConfig
+
+    @property
+    def place(self) -> tuple[str, str, int, int]:
+        """What distinguishes it from the other worlds of a grid."""
+        return self.task, self.axis, self.level, self.first_inference_step
+
+
+def named_grid_world(task: str, name: str, config: EvalConfig) -> GridWorld | None:
+    """Return the world that is called so, after its task; None if it is not the name of one."""
+    named = _NAME.fullmatch(name)
+    if named is None:
+        return None
+    return GridWorld(
+        task=task,
+        axis="delay" if named["axis"] == "delay" else "cue",
+        level=int(named["level"]),
+        first_inference_step=int(named["first"]),
+        phases=fixed_phases(task_spec(task), config.env),
+        config=config,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

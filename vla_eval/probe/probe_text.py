@@ -8,7 +8,7 @@ from vla_eval.probe.retention import HalfLife, Range
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
-from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate
+from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
 from vla_eval.results.estimates import Interval
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
@@ -66,10 +66,7 @@ def json_row(row: ProbeRow) -> JsonRow:
         **_json_share("reliability", swap.reliability if swap else None),
         **_json_share("follows", row.followed),
         "n_without_choice": row.n_without_choice,
-        "n_success_once": row.success.n if row.success else None,
-        "success_once": row.success.rate if row.success else None,
-        "ci_low": row.success.interval.low if row.success else None,
-        "ci_high": row.success.interval.high if row.success else None,
+        **success_json(row.success),
         "chance": row.chance,
         "left": row.left,
         **_ends("left", row.left_interval),

@@ -186,12 +186,7 @@ def _sign_test(pairs: Sequence[Pair]) -> float | None:
 
 def paired_p(pairs: Sequence[Pair]) -> float | None:
     """Return p of the exact McNemar test on whether episodes follow the cue; None without a pair."""
-    counts = {(one, two): 0 for one in (True, False) for two in (True, False)}
-    for pair in pairs:
-        counts[follows(pair.drawn), follows(pair.other)] += 1
-    test = mcnemar_exact(
-        PairCounts(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
-    )
+    test = mcnemar_exact(PairCounts.of((follows(pair.drawn), follows(pair.other)) for pair in pairs))
     return None if test is None else test.p_value
 
 

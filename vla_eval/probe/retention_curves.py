@@ -6,10 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vla_eval.probe.interventions import delay_of
 from vla_eval.probe.quantities import Share, follows, pair_up
 from vla_eval.probe.retention import HalfLife, half_life
 from vla_eval.probe.world_records import Records, Worlds, chance_of, records_in, results_of
+from vla_eval.probe.worlds import delay_of
 
 RetentionOf = Literal["follows", "warranted_choice"]
 LEAST_POINTS = 2

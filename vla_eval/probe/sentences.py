@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 
-from vla_eval.probe.interventions import CONTROLS, CONTROLS_OF_ONE, SWAPS
+from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import MISTAKES
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
+from vla_eval.probe.worlds import AS_DRAWN, CONTROLS, CONTROLS_OF_ONE, SWAPS
 
 ORACLE = "oracle"
 LEAST_MISTAKES = 5  # with fewer, their kinds say nothing
@@ -39,21 +40,12 @@ def _clause(row: ProbeRow) -> str | None:
         return f"follows {what}{after} in {_of(row.swap.warranted_choice)} pairs{_of_pairs(row)}"
     if row.followed is None or row.intervention in SWAPS:
         return None
-    where = {
-        "none": "follows the cue in",
-        "blank": "with a blank cue in",
-        "freeze": "with the first frame of the cue throughout in",
-        "mask": f"{_hidden(row)} in",
-        "shuffle": "with the items shown in another order than is right in",
-        "late": f"with a cue that begins at step {row.level} in",
-        "appearance": f"with another {row.level} in",
-        "cue": f"with a cue of {row.level} steps in",
-        "distractor": f"with a distractor for {row.level} steps in",
-        "interference": "after a motion of the arm in the delay in",
-        "instruction": f"with the instructions '{row.level}' in",
-        "delay": f"after a delay of {row.level} steps in",
-        "reset": f"after a reset of its memory at step {row.level} in",
-    }[row.intervention]
+    if row.intervention == AS_DRAWN:
+        where = "follows the cue in"
+    elif row.intervention == "mask":
+        where = f"{_hidden(row)} in"
+    else:
+        where = INTERVENTIONS[row.intervention].clause.format(level=row.level)
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
     idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
     return f"{where} {_of(row.followed)}{chance}{idle}{_over_delay(row)}"

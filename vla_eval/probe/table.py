@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of, label_of
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
@@ -21,6 +20,7 @@ from vla_eval.probe.quantities import (
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
 from vla_eval.probe.world_records import Records, Worlds, by_policy, chance_of, compared_with, results_of
+from vla_eval.probe.worlds import SWAPS, Intervention, Level, World, delay_of, label_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from vla_eval.probe.interventions import Intervention, Level, World
 from vla_eval.probe.quantities import follows
+from vla_eval.probe.worlds import Intervention, Level, World
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.comparison import CHANCE_POLICY
 

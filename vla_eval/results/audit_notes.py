@@ -2,25 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 
-from vla_eval.results.shipped_audit import AuditProtocol, TaskAudit, protocol_of, shipped_audits
+from vla_eval.results.shipped_audit import (
+    OTHER_VERDICTS,
+    ROADS,
+    AuditProtocol,
+    TaskAudit,
+    protocol_of,
+    shipped_audits,
+)
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 
-ROADS: Mapping[str, str] = {
-    "can be toured": "by touching one candidate after another",
-    "body can store the cue": "by storing the cue in the gripper",
-    "won by staying at the cue": "by staying where the cue was shown",
-    "won from single frames": "from single frames",
-    "won without acting": "without acting",
-    "won by chance motions": "by chance motions",
-    "won without the cue": "without the cue",
-}
-"""A shortcut in the words of the audit -> how the task is won by it."""
-OTHER_VERDICTS: Mapping[str, str] = {
-    "needs memory": "no shortcut found",
-    "not decided": "not decided by so few episodes",
-    "not audited: no scripted control": "not audited, for lack of a scripted control",
-}
 RULES: Mapping[AuditProtocol, str] = {
     "paper": "the paper's rule",
     "strict": "the strict rule",

@@ -5,13 +5,15 @@ is None, never 0. Knows nothing of episodes, tasks or files.
 """
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from scipy import stats
 
 CONFIDENCE = 0.95
+LEVEL = 0.05  # of tests
 
 
 class Interval(NamedTuple):
@@ -35,6 +37,12 @@ class PairCounts(NamedTuple):
     only_first: int
     only_second: int
     neither: int
+
+    @classmethod
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> "PairCounts":
+        """Count pairs by whether the first and the second succeeded."""
+        counts = Counter(outcomes)
+        return cls(*(counts[one, two] for one in (True, False) for two in (True, False)))
 
     @property
     def n_pairs(self) -> int:

@@ -4,8 +4,9 @@ import math
 
 from scipy import stats
 
+from vla_eval.results.estimates import LEVEL
+
 POWER = 0.8
-LEVEL = 0.05
 
 
 def episodes_to_settle(

@@ -10,9 +10,10 @@ from typing import Any
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.cue import CueFrames, cue_frames
+from vla_eval.results.estimates import LEVEL
 from vla_eval.results.formats import By
 from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
-from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
+from vla_eval.results.power import discordance_of_independent, episodes_to_settle
 from vla_eval.storage.run_folder import StoredRun
 
 DEFAULT_DIFFERENCE = 0.1

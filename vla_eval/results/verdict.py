@@ -6,14 +6,11 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 from vla_eval.results.comparison import CHANCE_POLICY, Comparison
+from vla_eval.results.estimates import LEVEL
 from vla_eval.results.latex_preset import CONTROLS
 from vla_eval.results.own_statistics import CHOICES, EPISODES, SUCCESS
-from vla_eval.results.relative_statistics import CHANCE, PAIRED
+from vla_eval.results.relative_statistics import CHANCE, PAIRED, SMALLEST_SHOWN_P
 from vla_eval.results.success_table import Row, Table
-
-LEVEL = 0.05
-SMALLEST_SAID_P = 0.001
-
 
 Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
 
@@ -147,4 +144,4 @@ def _choice(row: Row) -> str:
 
 
 def _p(value: float) -> str:
-    return f"p < {SMALLEST_SAID_P}" if value < SMALLEST_SAID_P else f"p = {value:.3f}"
+    return f"p < {SMALLEST_SHOWN_P}" if value < SMALLEST_SHOWN_P else f"p = {value:.3f}"

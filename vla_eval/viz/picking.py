@@ -1,7 +1,7 @@
 """Find the rerun files of a run for the viewer, or explain why there are none."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vla_eval.errors import ViewingError, unknown_name
@@ -42,13 +42,7 @@ def pick(run: StoredRun, wish: Wish) -> list[Path]:
 
 
 def _fits(record: EpisodeRecord, wish: Wish) -> bool:
-    pairs = (
-        (wish.task, record.task),
-        (wish.policy, record.policy),
-        (wish.n_action_steps, record.n_action_steps),
-        (wish.seed, record.seed),
-    )
-    return all(wanted is None or wanted == found for wanted, found in pairs)
+    return all(wanted in (None, getattr(record, name)) for name, wanted in asdict(wish).items())
 
 
 def _why_none(run: StoredRun, wished: Sequence[EpisodeRecord], wish: Wish) -> str:

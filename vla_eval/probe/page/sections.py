@@ -6,10 +6,9 @@ from vla_eval.page.charts import Chart, curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
 from vla_eval.page.probe_section import PairMatrix, ProbeSection
 from vla_eval.page.rates import Plots, Sign, printed_on_page
-from vla_eval.page.tables import DARKEST, UNKNOWN, MatrixCell, PageTable, page_table
+from vla_eval.page.tables import UNKNOWN, PageTable, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.find_worlds import FoundGridWorld, FoundProbe, find_probes
-from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
+from vla_eval.probe.find_worlds import FoundProbe, find_probes
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_text import printed_grid
 from vla_eval.probe.page.films import film_pairs
@@ -30,12 +29,12 @@ def probe_sections(runs: Sequence[StoredRun]) -> list[ProbeSection]:
         if probe.worlds:
             sections.append(_probe_section(probe))
         if probe.grid:
-            sections.append(_grid_section(f"{probe.folder}: grid", probe.grid))
+            sections.append(_grid_section(probe))
     return sections
 
 
 def _probe_section(probe: FoundProbe) -> ProbeSection:
-    table, pairs = found_table(probe.worlds), found_pairs(probe.worlds)
+    table, pairs = probe.table(), probe.pairs()
     return ProbeSection(
         title=str(probe.folder),
         table=_page_table(printed_probe(table)),
@@ -48,10 +47,10 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
     )
 
 
-def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
-    table = found_grid(worlds)
+def _grid_section(probe: FoundProbe) -> ProbeSection:
+    table = probe.grid_table()
     return ProbeSection(
-        title=title,
+        title=f"{probe.folder}: grid",
         table=_page_table(printed_grid(table)),
         sentences=tuple(grid_sentences(table)),
         notes=tuple(grid_notes(table)),
@@ -116,18 +115,10 @@ def _points_in_words(curve: Retention) -> str:
 
 
 def _matrix(pairs: ChoicePairs) -> PairMatrix:
-    most = max(pairs.counts.values())
     indices = range(len(pairs.names))
     return PairMatrix(
         title=f"{pairs.world.task}, {pairs.policy} · K={pairs.n_action_steps}: as drawn (rows), "
         f"{pairs.world.label} (columns)",
         names=pairs.names,
-        rows=tuple(
-            tuple(
-                MatrixCell(n, DARKEST * n / most, pairs.is_right(row, column))
-                for column in indices
-                for n in (pairs.count(row, column),)
-            )
-            for row in indices
-        ),
+        rows=shaded([[pairs.count(row, column) for column in indices] for row in indices], pairs.is_right),
     )
