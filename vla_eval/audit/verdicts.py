@@ -1,4 +1,4 @@
-"""What the counts of controls say of a task, in words. Knows nothing of runs.
+"""The verdict on a task, from the counts of its controls. Knows nothing of runs.
 
 No audit proves that a task needs memory. It finds shortcuts among those that its controls try.
 """

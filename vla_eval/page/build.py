@@ -73,7 +73,8 @@ def build_page(
         verdicts=verdicts(material.table),
         episodes=episode_list(material, folder),
         script=Markup(script),
-        script_hash=_script_hash(script),
+        # What the page's policy allows to run: this script and no other.
+        script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
         n_open_matrices=N_OPEN_MATRICES,
         results=rates.results(material),
         sides=rates.side_sections(material.table, published=published),
@@ -107,12 +108,6 @@ def write_page(runs: Sequence[StoredRun], folder: Path, **options: Unpack[PageOp
     except OSError as exc:
         raise ReportError(f"{path}: cannot be written ({exc.strerror or exc}). Name another --html.") from exc
     return path
-
-
-def _script_hash(script: str) -> str:
-    """Return what the page's policy allows to run: this script and no other."""
-    digest = hashlib.sha256(script.encode()).digest()
-    return f"sha256-{base64.b64encode(digest).decode()}"
 
 
 def _templates() -> Environment:

@@ -93,7 +93,10 @@ def choices(material: Material) -> Choices | None:
         ),
         missing=_missing([report for _, report in found]),
         matrices={
-            material.name_of(row, with_task=True): _matrices(report, row.task) for row, report in found
+            material.name_of(row, with_task=True): tuple(
+                _matrix(report, kind, row.task) for kind in KIND_NAMES if report.confusion[kind]
+            )
+            for row, report in found
         },
     )
 
@@ -127,11 +130,6 @@ def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
 
 def _names(report: ChoiceReport, kind: Kind, task: str) -> tuple[str, ...]:
     return item_names(task if kind == "item" else "", report.n_candidates)
-
-
-def _matrices(report: ChoiceReport, task: str) -> tuple[Matrix, ...]:
-    kinds: tuple[Kind, ...] = ("item", "place")
-    return tuple(_matrix(report, kind, task) for kind in kinds if report.confusion[kind])
 
 
 def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:

@@ -53,7 +53,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
                 "task": row.task,
                 "policy": row.policy,
                 "k": row.n_action_steps,
-                "setting": material.variants[row.variant] if row.variant else None,
+                "setting": material.table.variants[row.variant] if row.variant else None,
                 "items": item_names(row.task, n_candidates) if n_candidates else [],
             }
         )

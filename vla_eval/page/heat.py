@@ -63,7 +63,7 @@ def heat_chart(heat: HeatMap) -> Chart:
 
 
 def heat_png(maps: Sequence[HeatMap]) -> bytes:
-    """Return one PNG file of heat maps beside each other; the same maps give the same bytes."""
+    """Return one PNG file of heat maps side by side; the same maps give the same bytes."""
     with own_style():
         width = sum(heat.size_px[0] for heat in maps)
         height = max(heat.size_px[1] for heat in maps) + TITLE_PX

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from vla_eval.page.material import Material
 from vla_eval.page.tables import UNKNOWN, PageTable, page_table
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.notes import UNCOMMITTED, has_uncommitted_changes
 from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
@@ -189,7 +190,7 @@ def reproduction(run: StoredRun) -> Reproduction:
         title=f"{run.path} ({description.name})",
         commands="\n".join([*_setup_commands(description.environment), *commands]) if any(commands) else "",
         lock="\n".join(_lock(run)),
-        warning=_warning(description.environment),
+        warning=UNCOMMITTED.capitalize() if has_uncommitted_changes(description.environment) else "",
         listings=(
             _listing("Recipes, sha256", dict(description.recipes), "No recipe hashes were recorded."),
             _listing("Normalization statistics", statistics, "No policy of this run normalises."),
@@ -223,13 +224,6 @@ def _lock(run: StoredRun) -> list[str]:
         *(["# sha256"] if run.description.recipes else []),
         *(f"{digest}  {name}" for name, digest in run.description.recipes.items()),
     ]
-
-
-def _warning(environment: Mapping[str, JsonValue]) -> str:
-    source = environment.get("vla_eval")
-    if isinstance(source, Mapping) and source.get("changes") is not None:
-        return "Made with uncommitted changes to the package, which the commit does not contain."
-    return ""
 
 
 def _listing(title: str, values: dict[str, str], missing: str) -> Listing:

@@ -44,13 +44,7 @@ class Material:
         """
         parts = [row.task] if with_task and len(self.tasks) > 1 else []
         name = " · ".join([*parts, row.policy, f"K={row.n_action_steps}"])
-        return f"{name} ({self.variants[row.variant]})" if row.variant else name
-
-    @property
-    def variants(self) -> dict[str, str]:
-        """The settings in which run folders differ, each with its letter."""
-        told = dict.fromkeys(row.variant for row in self.table.rows if row.variant)
-        return {variant: chr(ord("a") + i) for i, variant in enumerate(told)}
+        return f"{name} ({self.table.variants[row.variant]})" if row.variant else name
 
 
 def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequence[str] = ()) -> Material:

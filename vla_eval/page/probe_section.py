@@ -29,7 +29,7 @@ class FilmFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filmstrip:
-    """One episode: what it is, and frames of it."""
+    """Frames of one episode, and its caption."""
 
     caption: str
     frames: tuple[FilmFrame, ...]
@@ -54,7 +54,7 @@ class ProbeSection:
         notes: what a reader has to know.
         plots: curves; None where there are none.
         curves_table: numbers of the curves; None where there are none.
-        heat: heat maps by what they are of.
+        heat: heat maps by their title.
         matrices: pairs by choice.
         films: pairs of episodes.
     """

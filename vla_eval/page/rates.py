@@ -11,6 +11,7 @@ from vla_eval.errors import ReportError
 from vla_eval.page.charts import (
     Bar,
     Chart,
+    Curves,
     LineKind,
     Point,
     Series,
@@ -129,7 +130,7 @@ def success_plots(material: Material) -> Plots:
 
 def chunk_plots(material: Material) -> Plots:
     """Draw success against n_action_steps, with lines of chance and ceiling."""
-    charts: list[Chart] = []
+    charts: list[Curves] = []
     colors: dict[str, int] = {}
     for task in material.tasks:
         rows = [row for row in material.rows_of(task) if row[SUCCESS].success_once is not None]
@@ -143,15 +144,17 @@ def chunk_plots(material: Material) -> Plots:
                 f"{material.name_of(row)}: {_rate(row[SUCCESS].success_once)}" for row in own
             )
             charts.append(
-                curves(
-                    _by_chunk(material, own),
+                Curves(
+                    series=_by_chunk(material, own),
                     title=f"{task}: success against K" + (f", {variant}" if variant else ""),
                     description=described,
                     x_title="K, actions executed per inference",
                     x_ticks=sizes,
                 )
             )
-    return Plots(legend=(*_signs(colors, is_line=False), *_reference_signs()), charts=tuple(charts))
+    return Plots(
+        legend=(*_signs(colors, is_line=False), *_reference_signs()), charts=tuple(map(curves, charts))
+    )
 
 
 def chunk_sweep(material: Material) -> Sweep:
@@ -194,7 +197,7 @@ def paired_table(material: Material) -> PageTable | None:
 
 def steps_plots(material: Material) -> Plots:
     """Draw the time to success: the share of episodes that have succeeded by each step."""
-    charts: list[Chart] = []
+    charts: list[Curves] = []
     colors: dict[str, int] = {}
     for task, size, variant in _settings(material):
         rows = [
@@ -210,15 +213,15 @@ def steps_plots(material: Material) -> Plots:
         colors |= {row.policy: material.colors[row.policy] for row in rows}
         means = "; ".join(f"{material.name_of(row)}: {_steps(row)}" for row in rows)
         charts.append(
-            curves(
-                series,
+            Curves(
+                series=series,
                 title=f"{task}, K={size}" + (f", {variant}" if variant else ""),
                 description=f"Mean steps until success: {means}",
                 x_title="control step",
                 x_ticks=_round_ticks(horizon),
             )
         )
-    return Plots(legend=_signs(colors, is_line=True), charts=tuple(charts))
+    return Plots(legend=_signs(colors, is_line=True), charts=tuple(map(curves, charts)))
 
 
 def _signs(colors: dict[str, int], *, is_line: bool) -> tuple[Sign, ...]:

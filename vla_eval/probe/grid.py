@@ -31,7 +31,7 @@ CONTROLS = (ORACLE, CUE_READER)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridSettings:
-    """What a grid goes over, beside the chunk lengths of the evaluation.
+    """What a grid varies, in addition to the chunk lengths of the evaluation.
 
     Attributes:
         axes: which phases get other lengths.

@@ -1,7 +1,5 @@
 """What a grid says, in words: which drops chunk and phase explain, and which they do not."""
 
-from collections.abc import Sequence
-
 from vla_eval.probe.grid_table import GridCell, GridTable
 
 
@@ -64,7 +62,7 @@ def _rate(cell: GridCell) -> str:
 
 
 def grid_notes(table: GridTable) -> list[str]:
-    """Return what a reader of the table has to know, errors included."""
+    """Return the notes that a reader of the table needs, errors included."""
     found = [
         "Success once, over all first inferences; 95 % intervals (Wilson) count a seed as one episode. cue "
         "frames: how many the policy is given (oracle reads the true state). late: steps of the response "
@@ -77,14 +75,12 @@ def grid_notes(table: GridTable) -> list[str]:
             "Same inferences: cue_reader for a policy that reads only the last frame (it knows what was in "
             "view at its own inferences, and guesses the rest); oracle for one that reads every frame."
         )
-    found += _unknown(table.cells)
+    unknown = dict.fromkeys(
+        cell.policy for cell in table.cells if any(part.n_seen is None for part in cell.parts)
+    )
+    found += [f"{name}: no episode has a result, so that what it reads is not known." for name in unknown]
     if table.n_errors:
         found.append(
             f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
         )
     return found
-
-
-def _unknown(cells: Sequence[GridCell]) -> list[str]:
-    names = dict.fromkeys(cell.policy for cell in cells if any(part.n_seen is None for part in cell.parts))
-    return [f"{name}: no episode has a result, so that what it reads is not known." for name in names]

@@ -141,7 +141,7 @@ def _cells(runs: Sequence[_Run]) -> list[GridCell]:
 
 
 def _reads_every(runs: Sequence[_Run], policy: str) -> bool | None:
-    """Return whether a policy is given every frame; None while no record tells.
+    """Return whether a policy is given every frame; None while no record shows it.
 
     With one inference per frame both are the same.
     """

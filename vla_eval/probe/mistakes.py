@@ -30,7 +30,7 @@ class _Touches(NamedTuple):
 
 
 class _Mistake(NamedTuple):
-    """The first mistake of an episode, and how probable it was that a wrong item lies beside a due one."""
+    """The first mistake of an episode, and the probability that a wrong item lies next to a due one."""
 
     kind: MistakeKind
     chance_of_place: float | None
@@ -43,10 +43,10 @@ class Mistakes:
     Attributes:
         n_episodes: episodes whose touches are known.
         n_order: an item that was shown, but out of turn.
-        n_place: an item that was not shown, at a place beside that of one that was due.
+        n_place: an item that was not shown, at a place next to that of one that was due.
         n_identity: another item that was not shown.
-        expected_place: so many of the last two kinds would be beside a due item if the wrong items were drawn
-            at random; None where the items are places themselves.
+        expected_place: so many of the last two kinds would be next to a due item if the wrong items were
+            drawn at random; None where the items are places themselves.
         n_incomplete: no mistake, but fewer touches than are right.
     """
 
@@ -98,10 +98,10 @@ def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | Non
 def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
     """Return how many items are kept, corrected for guessing.
 
-    Of the first touches, as many as items were shown, some are right. Who keeps k of L items and touches
-    others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The number
-    kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of the
-    bootstrap over episodes.
+    Of the first touches, as many as items were shown, some are right. A policy that keeps k of L items and
+    touches others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The
+    number kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of
+    the bootstrap over episodes.
 
     Returns:
         None if touches are not known, one item is right, or all of them are.
@@ -167,10 +167,7 @@ def _first_mistake(episode: _Touches, spec: TaskSpec) -> _Mistake | None:
         if spec.cue_marks_place:
             return _Mistake("place", None)
         wrong = [i for i in range(episode.n_candidates) if i not in episode.right]
-        beside = [i for i in wrong if _is_beside(i, due, episode.places)]
+        places = episode.places
+        beside = [i for i in wrong if any(abs(places[i] - places[other]) == 1 for other in due)]
         return _Mistake("place" if touched in beside else "identity", len(beside) / len(wrong))
     return None
-
-
-def _is_beside(candidate: int, due: Sequence[int], places: tuple[int, ...]) -> bool:
-    return any(abs(places[candidate] - places[other]) == 1 for other in due)

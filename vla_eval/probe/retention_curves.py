@@ -111,10 +111,9 @@ def _curve(task: str, key: tuple[str, int], of: RetentionOf, levels: Mapping[int
         policy=key[0],
         n_action_steps=key[1],
         of=of,
-        points=tuple(_point(delay, levels[delay]) for delay in delays),
+        points=tuple(
+            RetentionPoint(delay, Share(sum(one.outcomes.values()), len(one.outcomes)), one.chance)
+            for delay, one in sorted(levels.items(), key=lambda item: item[0])
+        ),
         half_life=None if chance is None else half_life(held, chance),
     )
-
-
-def _point(delay: int, level: _Level) -> RetentionPoint:
-    return RetentionPoint(delay, Share(sum(level.outcomes.values()), len(level.outcomes)), level.chance)

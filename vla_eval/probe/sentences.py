@@ -115,7 +115,7 @@ def _steps(steps: float | None, half: HalfLife) -> str:
 
 
 def notes(table: ProbeTable) -> list[str]:
-    """Return what a reader of the table has to know, errors and failed controls included."""
+    """Return the notes that a reader of the table needs, errors and failed controls included."""
     found = [*_columns(table.rows), *_failed_controls(table.rows), *_chunk_and_phase(table.rows)]
     if table.n_errors:
         found.append(

@@ -36,7 +36,7 @@ def compared_with(world: World, worlds: Worlds) -> Records:
 
 
 def results_of(records: Iterable[EpisodeRecord]) -> list[EpisodeRecord]:
-    """Return the records that are no errors."""
+    """Return the records with a result."""
     return [record for record in records if record.outcome != "error"]
 
 

@@ -44,7 +44,7 @@ class SweepRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """Rows, grouped so that each reference is beside the rows that are compared with it."""
+    """Rows, grouped so that each reference stands with the rows that are compared with it."""
 
     by: By
     rows: tuple[SweepRow, ...]

@@ -84,7 +84,7 @@ def _finding(row: Row) -> Finding:
 
 
 def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
-    """Say what was found of a policy at one or several K; the group has the largest difference first."""
+    """Return the finding on a policy at one or several K; the group has the largest difference first."""
     name, finding, row = _name(group, rows), _finding(group[0]), group[0]
     if finding == "no result":
         return f"{name} has no result yet."

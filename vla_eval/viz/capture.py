@@ -78,7 +78,7 @@ class EpisodeCapture:
 
         Args:
             jobs: the batch.
-            tapes: what was taped of it.
+            tapes: the tapes of its episodes.
             records: its results, in the order of the jobs.
             env: what the environment offers.
             heartbeat: called before each file: the watchdog gives each the time of a step.

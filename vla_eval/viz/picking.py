@@ -34,15 +34,15 @@ def pick(run: StoredRun, wish: Wish) -> list[Path]:
         known = {str(getattr(record, name)) for record in run.records}
         if wanted is not None and str(wanted) not in known:
             raise unknown_name(name, str(wanted), known, where=str(run.path))
-    wished = [record for record in run.records if _fits(record, wish)]
+    wished = [
+        record
+        for record in run.records
+        if all(wanted in (None, getattr(record, name)) for name, wanted in asdict(wish).items())
+    ]
     found = [rrd_file(run.path, record) for record in wished if rrd_file(run.path, record).is_file()]
     if not found:
         raise ViewingError(_why_none(run, wished, wish))
     return found
-
-
-def _fits(record: EpisodeRecord, wish: Wish) -> bool:
-    return all(wanted in (None, getattr(record, name)) for name, wanted in asdict(wish).items())
 
 
 def _why_none(run: StoredRun, wished: Sequence[EpisodeRecord], wish: Wish) -> str:

@@ -24,7 +24,7 @@ def heat_maps(table: GridTable) -> dict[Group, list[HeatMap]]:
 def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
     """Write a PNG file per task and phase, `OUT_TASK_delay.png`, and return their paths.
 
-    They are beside the folder and not in it, so that all it holds are run folders.
+    They go next to the folder, which holds run folders alone.
 
     Args:
         table: the grid.

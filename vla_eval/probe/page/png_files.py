@@ -1,4 +1,4 @@
-"""PNG files beside the folder of a probe, so that all that it holds are run folders."""
+"""PNG files next to the folder of a probe, which holds run folders alone."""
 
 from pathlib import Path
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from vla_eval.page.charts import Chart, curves, reference_sign, sign
+from vla_eval.page.charts import curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
 from vla_eval.page.probe_section import PairMatrix, ProbeSection
 from vla_eval.page.rates import Plots, Sign, printed_on_page
@@ -13,9 +13,8 @@ from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_text import printed_grid
 from vla_eval.probe.page.films import film_pairs
 from vla_eval.probe.page.heat_maps import heat_maps
-from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, retention_lines
+from vla_eval.probe.page.retention_plot import CURVES, by_kind, line_colors, line_name, retention_lines
 from vla_eval.probe.probe_text import printed_probe
-from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
 from vla_eval.results.printed_table import PrintedTable
@@ -67,15 +66,12 @@ def _page_table(table: PrintedTable) -> PageTable:
 
 def _retention_plots(table: ProbeTable) -> Plots:
     """Draw the retention curves, one chart per task and kind of curve; delays on a logarithmic axis."""
-    names = {name: number for number, name in enumerate(dict.fromkeys(map(line_name, table.retention)))}
-    charts: list[Chart] = []
-    for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
-        own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
-        charts.append(_chart(task, of, own, names))
+    colors = line_colors(table.retention)
     legend = (
-        *(Sign(name, sign(number, is_line=False)) for name, number in names.items()),
+        *(Sign(name, sign(number, is_line=False)) for name, number in colors.items()),
         Sign("chance", reference_sign("chance")),
     )
+    charts = (curves(retention_lines(own, colors)) for own in by_kind(table.retention))
     return Plots(legend=legend, charts=tuple(charts))
 
 
@@ -95,23 +91,6 @@ def _half_lives(table: ProbeTable) -> PageTable:
         numbers=("chance",),
         caption="Half-lives; —: at the shortest delay no better than chance",
     )
-
-
-def _chart(task: str, of: str, own: Sequence[Retention], names: dict[str, int]) -> Chart:
-    lines = retention_lines(own, names)
-    said = "; ".join(f"{line_name(curve)}: {_points_in_words(curve)}" for curve in own)
-    return curves(
-        lines.series,
-        title=f"{task}: {CURVES[of]}",
-        description=said,
-        x_title=X_TITLE,
-        x_ticks=lines.x_ticks,
-        x_labels=lines.x_labels,
-    )
-
-
-def _points_in_words(curve: Retention) -> str:
-    return ", ".join(f"{p.share.n} of {p.share.of} after {p.delay_steps}" for p in curve.points)
 
 
 def _matrix(pairs: ChoicePairs) -> PairMatrix:

@@ -124,7 +124,7 @@ def _with_figure(row: ProtocolRow, groups: Sequence[RowEpisodes]) -> ProtocolRow
 def _departures(
     protocol: Protocol, label: RowKey, found: Mapping[str, RowEpisodes], tasks: Sequence[str]
 ) -> Iterator[str]:
-    """Yield what is missing or too much of tasks, K, runs and seeds."""
+    """Yield missing and additional tasks, K, runs and seeds."""
     absent = [task for task in tasks if task not in found]
     if absent:
         yield f"{len(found)} of {len(tasks)} tasks, without {some_of(absent)}"
