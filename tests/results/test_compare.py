@@ -15,8 +15,13 @@ from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.evaluation.evaluate import evaluate
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
-from vla_eval.results.power import discordance_of_independent, episodes_to_settle
-from vla_eval.results.sweep import Sweep, SweepRow, compare_runs
+from vla_eval.results.sweep import (
+    Sweep,
+    SweepRow,
+    compare_runs,
+    discordance_of_independent,
+    episodes_to_settle,
+)
 from vla_eval.results.sweep_format import render_sweep
 
 TASK = "RememberColor3-v0"

@@ -156,8 +156,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> "ProbeSettings":
     from vla_eval.probe.interventions import INTERVENTIONS
-    from vla_eval.probe.views import APPEARANCES, MASKS
-    from vla_eval.probe.worlds import ProbeSettings
+    from vla_eval.probe.worlds import APPEARANCES, MASKS, ProbeSettings
 
     chosen: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(getattr(args, name), name) for name in FLAGS

@@ -8,8 +8,7 @@ from typing import NamedTuple
 from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
-from vla_eval.probe.views import APPEARANCES
-from vla_eval.probe.worlds import AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World
+from vla_eval.probe.worlds import APPEARANCES, AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World
 from vla_eval.tasks.catalog import task_spec
 
 OWN_ARGUMENTS = (

@@ -31,6 +31,13 @@ class Share(NamedTuple):
     n: int
     of: int
 
+    @classmethod
+    def of_records(
+        cls, records: Sequence[EpisodeRecord], holds: Callable[[EpisodeRecord], bool]
+    ) -> "Share | None":
+        """Return the share of episodes for which something holds; None without an episode."""
+        return cls(sum(map(holds, records)), len(records)) if records else None
+
     @property
     def rate(self) -> float:
         """The share."""

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from vla_eval.config.appearance import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.cue_view import CueViewKind
 from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
-from vla_eval.probe.views import APPEARANCES, MASKS
 from vla_eval.tasks.spec import TaskSpec
 
 Intervention = str
@@ -28,6 +29,22 @@ CONTROLS_OF_ONE = ("body_memory",)
 
 ITEMS = ("items", "cubes")
 """Kinds of candidates that can be shown, and so can distract."""
+
+
+MASKS: Mapping[str, CueViewKind] = {
+    "cue": "hidden",
+    "elsewhere": "hidden_elsewhere",
+    "later": "hidden_later",
+}
+"""What of the image is hidden: the cue, as much of the same frames, the same place in the delay."""
+
+APPEARANCES: Mapping[str, AppearanceSettings] = {
+    "light": AppearanceSettings(light=0.6),
+    "camera": AppearanceSettings(camera_shift_m=0.03, camera_turn_deg=3.0),
+    "table": AppearanceSettings(table_rgb=(0.5, 0.5, 0.5)),
+    "hue": AppearanceSettings(hue_deg=10.0),
+}
+"""Changes that leave each colour nearer to itself than to any other of the nine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
