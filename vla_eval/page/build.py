@@ -20,7 +20,7 @@ from vla_eval.page.episode_list import episode_list
 from vla_eval.page.material import Material, gather
 from vla_eval.page.probe_section import ProbeSection
 from vla_eval.results.own_statistics import EPISODES
-from vla_eval.results.table_formats import render
+from vla_eval.results.table_formats import render, side_tables
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun
 
@@ -77,7 +77,7 @@ def build_page(
         script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
         n_open_matrices=N_OPEN_MATRICES,
         results=rates.results(material),
-        sides=rates.side_sections(material.table, published=published),
+        sides=side_tables(material.table, published=published),
         success=rates.success_plots(material),
         chunks=chunks,
         sweep=rates.chunk_sweep(material) if chunks.charts else None,

@@ -1,11 +1,14 @@
 """The page's section on choices: targets, first choices and causes of failure."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import UNKNOWN, Column, MatrixCell, PageTable, shaded
-from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.page.tables import MatrixCell, shaded
+from vla_eval.results.choice_causes import MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of
+from vla_eval.results.success_table import Row
 from vla_eval.tasks.objects.item_names import item_names
 
 
@@ -59,7 +62,7 @@ class Choices:
     """
 
     explanations: tuple[Explanation, ...]
-    table: PageTable
+    table: PrintedTable
     missing: tuple[str, ...]
     matrices: dict[str, tuple[Matrix, ...]]
 
@@ -70,27 +73,15 @@ def choices(material: Material) -> Choices | None:
     found = [(row, report) for row, report in reports if report is not None]
     if not found:
         return None
-    rows = [
-        [
-            material.name_of(row, with_task=True),
-            *(str(report.causes[cause]) for cause in CAUSES),
-            _habit(report, "place", row.task),
-            _habit(report, "item", row.task),
-        ]
-        for row, report in found
+    columns: list[Column[tuple[Row, ChoiceReport]]] = [
+        Column("policy", lambda of: material.name_of(of[0], with_task=True), False),
+        *(Column(title, partial(_n_episodes, cause)) for cause, (title, _) in EXPLANATIONS.items()),
+        Column("habit of place", lambda of: _habit(of[1], "place", of[0].task), False),
+        Column("habit of item", lambda of: _habit(of[1], "item", of[0].task), False),
     ]
     return Choices(
         explanations=tuple(EXPLANATIONS.values()),
-        table=PageTable(
-            columns=(
-                Column("policy"),
-                *(Column(EXPLANATIONS[cause].title, "number") for cause in CAUSES),
-                Column("habit of place"),
-                Column("habit of item"),
-            ),
-            rows=tuple(map(tuple, rows)),
-            caption="Episodes by cause",
-        ),
+        table=PrintedTable(columns=columns, rows=cells_of(columns, found)),
         missing=_missing([report for _, report in found]),
         matrices={
             material.name_of(row, with_task=True): tuple(
@@ -117,10 +108,14 @@ def _missing(reports: list[ChoiceReport]) -> tuple[str, ...]:
     return tuple(said)
 
 
+def _n_episodes(cause: Cause, of: tuple[Row, ChoiceReport]) -> str:
+    return str(of[1].causes[cause])
+
+
 def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
     habit = report.habits[kind]
     if habit is None:
-        return UNKNOWN
+        return UNDEFINED
     if not habit.is_found:
         return f"not shown (p={habit.p_value:.2g})"
     share = f"{habit.n_chosen}/{habit.n_possible}"

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import UNKNOWN, PageTable, page_table
+from vla_eval.page.tables import page_table
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.notes import UNCOMMITTED, has_uncommitted_changes
+from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
@@ -27,7 +28,7 @@ MAX_MESSAGE = 400  # characters of an error's message
 class LatencyTable:
     """Times of inferences; `n_unknown` rows have no timing. No table if none has."""
 
-    table: PageTable | None
+    table: PrintedTable | None
     n_unknown: int
 
 
@@ -59,7 +60,7 @@ def latency(material: Material) -> LatencyTable:
     return LatencyTable(table=table if rows else None, n_unknown=n_unknown)
 
 
-def errors_table(material: Material) -> PageTable | None:
+def errors_table(material: Material) -> PrintedTable | None:
     """Return errors by cause, the most frequent first; None if there are none."""
     runs = (run for row in material.table.rows for run in row.episodes.runs)
     records = (record for run in runs for record in run.records.values())
@@ -138,7 +139,7 @@ def _video(one: _Captured) -> Video:
     if record.n_candidates:
         names = item_names(record.task, record.n_candidates)
         chosen = "none" if record.first_choice is None else names[record.first_choice]
-        name += f", target {UNKNOWN if record.target is None else names[record.target]}, chosen {chosen}"
+        name += f", target {UNDEFINED if record.target is None else names[record.target]}, chosen {chosen}"
     thumbnail = thumbnail_file(one.run.path, record)
     poster = _data_uri("image/jpeg", thumbnail) if thumbnail.is_file() else None
     return Video(name=name, src=_data_uri("video/mp4", one.video), poster=poster)
@@ -152,7 +153,7 @@ class Listing(NamedTuple):
     """Names and values behind a title; without a table, `missing` says so."""
 
     title: str
-    table: PageTable | None
+    table: PrintedTable | None
     missing: str
 
 

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from vla_eval.page.charts import Chart
 from vla_eval.page.rates import Plots
-from vla_eval.page.tables import MatrixCell, PageTable
+from vla_eval.page.tables import MatrixCell
+from vla_eval.results.printed_table import PrintedTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,11 +61,11 @@ class ProbeSection:
     """
 
     title: str
-    table: PageTable
+    table: PrintedTable
     sentences: tuple[str, ...]
     notes: tuple[str, ...]
     plots: Plots | None = None
-    curves_table: PageTable | None = None
+    curves_table: PrintedTable | None = None
     heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
     matrices: tuple[PairMatrix, ...] = ()
     films: tuple[FilmPair, ...] = ()

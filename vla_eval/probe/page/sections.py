@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from vla_eval.page.charts import curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
 from vla_eval.page.probe_section import PairMatrix, ProbeSection
-from vla_eval.page.rates import Plots, Sign, printed_on_page
-from vla_eval.page.tables import UNKNOWN, PageTable, page_table, shaded
+from vla_eval.page.rates import Plots, Sign
+from vla_eval.page.tables import page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.find_worlds import FoundProbe, find_probes
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
@@ -17,7 +17,7 @@ from vla_eval.probe.page.retention_plot import CURVES, by_kind, line_colors, lin
 from vla_eval.probe.probe_text import printed_probe
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
-from vla_eval.results.printed_table import PrintedTable
+from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.storage.run_folder import StoredRun
 
 
@@ -36,7 +36,7 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
     table, pairs = probe.table(), probe.pairs()
     return ProbeSection(
         title=str(probe.folder),
-        table=_page_table(printed_probe(table)),
+        table=printed_probe(table),
         sentences=tuple(sentences(table)),
         notes=(*notes(table), *probe.doubles),
         plots=_retention_plots(table) if table.retention else None,
@@ -50,7 +50,7 @@ def _grid_section(probe: FoundProbe) -> ProbeSection:
     table = probe.grid_table()
     return ProbeSection(
         title=f"{probe.folder}: grid",
-        table=_page_table(printed_grid(table)),
+        table=printed_grid(table),
         sentences=tuple(grid_sentences(table)),
         notes=tuple(grid_notes(table)),
         heat=tuple(
@@ -58,10 +58,6 @@ def _grid_section(probe: FoundProbe) -> ProbeSection:
             for (task, axis), maps in heat_maps(table).items()
         ),
     )
-
-
-def _page_table(table: PrintedTable) -> PageTable:
-    return printed_on_page(table, table.sentence or "Every row")
 
 
 def _retention_plots(table: ProbeTable) -> Plots:
@@ -75,13 +71,13 @@ def _retention_plots(table: ProbeTable) -> Plots:
     return Plots(legend=legend, charts=tuple(charts))
 
 
-def _half_lives(table: ProbeTable) -> PageTable:
+def _half_lives(table: ProbeTable) -> PrintedTable:
     rows = [
         [
             f"{curve.task} · {line_name(curve)}",
             CURVES[curve.of],
-            UNKNOWN if curve.half_life is None else half_life_text(curve.half_life),
-            UNKNOWN if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
+            UNDEFINED if curve.half_life is None else half_life_text(curve.half_life),
+            UNDEFINED if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
         ]
         for curve in table.retention
     ]
@@ -89,7 +85,6 @@ def _half_lives(table: ProbeTable) -> PageTable:
         rows,
         text=("policy", "curve", "half-life"),
         numbers=("chance",),
-        caption="Half-lives; —: at the shortest delay no better than chance",
     )
 
 
