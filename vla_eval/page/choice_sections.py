@@ -5,7 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import MatrixCell, shaded
+from vla_eval.page.tables import Matrix, shaded
 from vla_eval.results.choice_causes import MOVED_M, Cause, ChoiceReport, Kind, report_choices
 from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of
 from vla_eval.results.success_table import Row
@@ -38,16 +38,6 @@ EXPLANATIONS: dict[Cause, Explanation] = {
     ),
 }
 KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Matrix:
-    """Episodes by target (rows) and first choice (columns); right where the two are the same."""
-
-    kind: str
-    names: tuple[str, ...]
-    choices: tuple[str, ...]
-    rows: tuple[tuple[MatrixCell, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,8 +123,8 @@ def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:
     chosen: list[int | None] = [*range(report.n_candidates), None]
     rows = [[counts.get((target, choice), 0) for choice in chosen] for target in range(report.n_candidates)]
     return Matrix(
-        kind=KIND_NAMES[kind],
+        title=f"Episodes by {KIND_NAMES[kind]}: target (rows) and first choice (columns)",
         names=names,
-        choices=tuple("none" if i is None else names[i] for i in chosen),
+        columns=tuple("none" if i is None else names[i] for i in chosen),
         rows=shaded(rows, lambda target, choice: target == choice),
     )

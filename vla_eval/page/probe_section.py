@@ -5,20 +5,8 @@ from typing import NamedTuple
 
 from vla_eval.page.charts import Chart
 from vla_eval.page.rates import Plots
-from vla_eval.page.tables import MatrixCell
+from vla_eval.page.tables import Matrix
 from vla_eval.results.printed_table import PrintedTable
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairMatrix:
-    """Pairs by first choice in the world as drawn (rows) and in the other one (columns).
-
-    A cell is right if some of its pairs follow both cues.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    rows: tuple[tuple[MatrixCell, ...], ...]
 
 
 class FilmFrame(NamedTuple):
@@ -56,7 +44,8 @@ class ProbeSection:
         plots: curves; None where there are none.
         curves_table: numbers of the curves; None where there are none.
         heat: heat maps by their title.
-        matrices: pairs by choice.
+        matrices: pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is
+            right if some of its pairs follow both cues.
         films: pairs of episodes.
     """
 
@@ -67,5 +56,5 @@ class ProbeSection:
     plots: Plots | None = None
     curves_table: PrintedTable | None = None
     heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
-    matrices: tuple[PairMatrix, ...] = ()
+    matrices: tuple[Matrix, ...] = ()
     films: tuple[FilmPair, ...] = ()

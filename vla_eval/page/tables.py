@@ -17,6 +17,15 @@ class MatrixCell(NamedTuple):
     is_right: bool
 
 
+class Matrix(NamedTuple):
+    """Counts by two choices: the names of rows and columns, and the cells of each row."""
+
+    title: str
+    names: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[MatrixCell, ...], ...]
+
+
 def shaded(
     counts: Sequence[Sequence[int]], is_right: Callable[[int, int], bool]
 ) -> tuple[tuple[MatrixCell, ...], ...]:

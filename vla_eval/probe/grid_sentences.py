@@ -1,6 +1,7 @@
 """What a grid says, in words: which drops chunk and phase explain, and which they do not."""
 
 from vla_eval.probe.grid_table import GridCell, GridTable
+from vla_eval.probe.text_table import error_notes
 
 
 def grid_sentences(table: GridTable) -> list[str]:
@@ -29,21 +30,17 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
         f"{cell.policy} on {cell.task} succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at "
         f"{_where(best)}"
     )
-    same = f"{now.policy}, which has the same inferences and forgets nothing, "
+    rates = f"succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase"
     if not _is_below(now, at_best):
-        return (
-            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase do not explain "
-            "the drop."
+        said = f"{rates} do not explain the drop"
+    elif _is_below(cell, now):
+        said = f"{rates} explain a part of the drop, not all of it"
+    else:
+        said = (
+            f"falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the drop, not "
+            "memory"
         )
-    if _is_below(cell, now):
-        return (
-            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase explain a part of "
-            "the drop, not all of it."
-        )
-    return (
-        f"{drop}; {same}falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the "
-        "drop, not memory."
-    )
+    return f"{drop}; {now.policy}, which has the same inferences and forgets nothing, {said}."
 
 
 def _is_below(one: GridCell, other: GridCell) -> bool:
@@ -79,8 +76,4 @@ def grid_notes(table: GridTable) -> list[str]:
         cell.policy for cell in table.cells if any(part.n_seen is None for part in cell.parts)
     )
     found += [f"{name}: no episode has a result, so that what it reads is not known." for name in unknown]
-    if table.n_errors:
-        found.append(
-            f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
-        )
-    return found
+    return [*found, *error_notes(table.n_errors)]

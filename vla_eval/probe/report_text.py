@@ -32,6 +32,7 @@ def _pairs_text(pairs: ChoicePairs) -> str:
         f"(rows), {pairs.world.label} (columns)"
     )
     indices = range(len(pairs.names))
-    rows = [[pairs.names[row], *(str(pairs.count(row, column)) for column in indices)] for row in indices]
+    counts = [[str(pairs.counts.get((row, column), 0)) for column in indices] for row in indices]
+    rows = [[name, *own] for name, own in zip(pairs.names, counts, strict=True)]
     table = markdown_table(("drawn ↓ other →", *pairs.names), rows, [False, *(True for _ in indices)])
     return f"{title}\n\n{table}"

@@ -20,6 +20,12 @@ def rows_as_csv(rows: Sequence[JsonRow]) -> str:
     return csv_text(list(rows[0]), flat)
 
 
+def error_notes(n_errors: int) -> list[str]:
+    """Return the note on episodes without a result, if there are any."""
+    text = f"{n_errors} episodes ended in an error and are not counted; the same command retries them."
+    return [text] if n_errors else []
+
+
 def success_json(success: Share | None) -> JsonRow:
     """Return how many succeed, their share and its interval; undefined values are null."""
     return {

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from vla_eval.page.charts import curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
-from vla_eval.page.probe_section import PairMatrix, ProbeSection
+from vla_eval.page.probe_section import ProbeSection
 from vla_eval.page.rates import Plots, Sign
-from vla_eval.page.tables import page_table, shaded
+from vla_eval.page.tables import Matrix, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.find_worlds import FoundProbe, find_probes
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
@@ -88,11 +88,15 @@ def _half_lives(table: ProbeTable) -> PrintedTable:
     )
 
 
-def _matrix(pairs: ChoicePairs) -> PairMatrix:
+def _matrix(pairs: ChoicePairs) -> Matrix:
     indices = range(len(pairs.names))
-    return PairMatrix(
+    return Matrix(
         title=f"{pairs.world.task}, {pairs.policy} · K={pairs.n_action_steps}: as drawn (rows), "
         f"{pairs.world.label} (columns)",
         names=pairs.names,
-        rows=shaded([[pairs.count(row, column) for column in indices] for row in indices], pairs.is_right),
+        columns=pairs.names,
+        rows=shaded(
+            [[pairs.counts.get((row, column), 0) for column in indices] for row in indices],
+            lambda row, column: (row, column) in pairs.following,
+        ),
     )
