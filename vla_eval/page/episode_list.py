@@ -98,9 +98,7 @@ def _files(material: Material, folder: Path) -> dict[int, _Files]:
         for record in run.records:
             places = (video_file(run.path, record), rrd_file(run.path, record))
             if any(place.is_file() for place in places):
-                found[id(record)] = _Files(*(_address(place, folder) for place in places))
+                found[id(record)] = _Files(
+                    *(quote(os.path.relpath(one, folder)) if one.is_file() else None for one in places)
+                )
     return found
-
-
-def _address(file: Path, folder: Path) -> str | None:
-    return quote(os.path.relpath(file, folder)) if file.is_file() else None

@@ -80,7 +80,11 @@ def success_plots(material: Material) -> Plots:
             )
             for row in material.rows_of(task)
         ]
-        described = "; ".join(f"{bar.label}: {_rate(bar.value)} ({_interval(bar)})" for bar in bars)
+        described = "; ".join(
+            f"{bar.label}: {_rate(bar.value)} "
+            + ("(no interval)" if bar.low is None else f"({bar.low:.2f} to {bar.high:.2f})")
+            for bar in bars
+        )
         title = f"{task}: success once"
         charts.append(forest(bars, title=title, description=described, label_px=label_px))
     return Plots(legend=_reference_signs(), charts=tuple(charts))
@@ -155,7 +159,10 @@ def steps_plots(material: Material) -> Plots:
     """Draw the time to success: the share of episodes that have succeeded by each step."""
     charts: list[Curves] = []
     colors: dict[str, int] = {}
-    for task, size, variant in _settings(material):
+    settings = {(row.task, row.n_action_steps, row.variant) for row in material.table.rows}
+    # By task, then by K.
+    order = sorted(settings, key=lambda one: (material.tasks.index(one[0]), one[1], one[2] or ""))
+    for task, size, variant in order:
         rows = [
             row
             for row in material.rows_of(task)
@@ -186,12 +193,6 @@ def _signs(colors: dict[str, int], *, is_line: bool) -> tuple[Sign, ...]:
 
 def _reference_signs() -> tuple[Sign, ...]:
     return tuple(Sign(name, reference_sign(name)) for name in ("chance", "ceiling"))
-
-
-def _settings(material: Material) -> list[tuple[str, int, str | None]]:
-    """Return each task, K and variant once: by task, then by K."""
-    found = {(row.task, row.n_action_steps, row.variant) for row in material.table.rows}
-    return sorted(found, key=lambda one: (material.tasks.index(one[0]), one[1], one[2] or ""))
 
 
 def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
@@ -236,12 +237,6 @@ def _cumulative(material: Material, row: Row, horizon: int) -> Series:
     points = [Point(0, 0.0), *(Point(step, (i + 1) / len(results)) for i, step in enumerate(steps))]
     points.append(Point(horizon, points[-1].y))
     return Series(name=row.policy, color=material.colors[row.policy], points=tuple(points), is_step=True)
-
-
-def _interval(bar: Bar) -> str:
-    return (
-        f"{bar.low:.2f} to {bar.high:.2f}" if bar.low is not None and bar.high is not None else "no interval"
-    )
 
 
 def _rate(value: float | None) -> str:

@@ -118,7 +118,9 @@ def _said(row: Row) -> str:
     assert compared is not None  # as in every row whose chance was measured
     test = compared.test
     difference = f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]"
-    return f"{difference}, {_p(compared.corrected_p)}{_choice(row)}"
+    p = compared.corrected_p
+    said = f"p < {SMALLEST_SHOWN_P}" if p < SMALLEST_SHOWN_P else f"p = {p:.3f}"
+    return f"{difference}, {said}{_choice(row)}"
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -141,7 +143,3 @@ def _name(group: Sequence[Row], rows: Sequence[Row]) -> str:
 def _choice(row: Row) -> str:
     n_right = row[CHOICES].n_chose_right
     return "" if n_right is None else f"; first choice right in {n_right} of {row[EPISODES].n_episodes}"
-
-
-def _p(value: float) -> str:
-    return f"p < {SMALLEST_SHOWN_P}" if value < SMALLEST_SHOWN_P else f"p = {value:.3f}"
