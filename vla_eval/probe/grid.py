@@ -5,6 +5,7 @@ first one is. So every first inference below K is run there. Knows nothing of re
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -126,8 +127,7 @@ def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
         if spec.candidates is None:
             left_out.append(f"{spec.id}: it has no phases")
             continue
-        of_task = _Task(spec=spec, config=config, settings=settings)
-        found = [world for axis in settings.axes for world in of_task.worlds(axis)]
+        found = [world for axis in settings.axes for world in _worlds(spec, config, settings, axis)]
         worlds += found
         if not found:
             left_out.append(f"{spec.id}: no K has one of these first inferences")
@@ -141,46 +141,34 @@ def first_inferences(phases: Phases, n_action_steps: int) -> tuple[int, ...]:
     return (0,) if divides(phases, n_action_steps) else tuple(range(n_action_steps))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Task:
-    """One task of a grid."""
-
-    spec: TaskSpec
-    config: EvalConfig
-    settings: GridSettings
-
-    def worlds(self, axis: Axis) -> list[GridWorld]:
-        """Return the evaluations with other lengths of one phase."""
-        usual = fixed_phases(self.spec, self.config.env)
-        sizes = self.config.n_action_steps or DEFAULT_N_ACTION_STEPS
-        wanted = self.settings.first_inferences
-        worlds = []
-        for level in self.settings.delays if axis == "delay" else self.settings.cues:
-            env = {**self.config.env, **usual.with_length(axis, level)}
-            phases = fixed_phases(self.spec, env)
-            firsts = {k: first_inferences(phases, k) for k in sizes}
-            for first in range(max(sizes)):
-                own = tuple(k for k in sizes if first in firsts[k])
-                if own and (not wanted or first in wanted):
-                    shared = replace(self.config, n_action_steps=own, env=env)
-                    worlds.append(self._world(axis, level, first, phases, shared))
-        return worlds
-
-    def _world(self, axis: Axis, level: int, first: int, phases: Phases, shared: EvalConfig) -> GridWorld:
-        policies = shared.policies
-        controls = CONTROLS if self.settings.controls else ()
-        config = replace(
-            shared,
-            name=f"{self.spec.id}_grid_{axis}_{level}_from_{first}",
-            tasks=(self.spec.id,),
-            policies=(*policies, *(control for control in controls if control not in policies)),
-            chunking=replace(shared.chunking, first_inference_step=first),
-        )
-        return GridWorld(
-            task=self.spec.id,
-            axis=axis,
-            level=level,
-            first_inference_step=first,
-            phases=phases,
-            config=config,
-        )
+def _worlds(spec: TaskSpec, config: EvalConfig, settings: GridSettings, axis: Axis) -> Iterator[GridWorld]:
+    """Yield the evaluations of a task with other lengths of one phase."""
+    usual = fixed_phases(spec, config.env)
+    sizes = config.n_action_steps or DEFAULT_N_ACTION_STEPS
+    controls = CONTROLS if settings.controls else ()
+    policies = (*config.policies, *(control for control in controls if control not in config.policies))
+    for level in settings.delays if axis == "delay" else settings.cues:
+        env = {**config.env, **usual.with_length(axis, level)}
+        phases = fixed_phases(spec, env)
+        firsts = {k: first_inferences(phases, k) for k in sizes}
+        for first in range(max(sizes)):
+            own = tuple(k for k in sizes if first in firsts[k])
+            if not own or (settings.first_inferences and first not in settings.first_inferences):
+                continue
+            of_world = replace(
+                config,
+                name=f"{spec.id}_grid_{axis}_{level}_from_{first}",
+                tasks=(spec.id,),
+                policies=policies,
+                n_action_steps=own,
+                env=env,
+                chunking=replace(config.chunking, first_inference_step=first),
+            )
+            yield GridWorld(
+                task=spec.id,
+                axis=axis,
+                level=level,
+                first_inference_step=first,
+                phases=phases,
+                config=of_world,
+            )

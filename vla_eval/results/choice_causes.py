@@ -116,8 +116,8 @@ def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) 
         n_chosen = sum(n for (_, chosen), n in wrong.items() if chosen == index)
         if n_possible:
             p = min(1.0, p_above(n_chosen, n_possible, by_luck) * n_candidates)
-            numbers = {"index": index, "n_chosen": n_chosen, "n_possible": n_possible}
-            found.append(Habit(**numbers, by_luck=by_luck, p_value=p))
+            habit = Habit(index=index, n_chosen=n_chosen, n_possible=n_possible, by_luck=by_luck, p_value=p)
+            found.append(habit)
     return min(found, key=lambda habit: habit.p_value)
 
 
