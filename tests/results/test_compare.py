@@ -60,7 +60,7 @@ def test_each_k_is_compared_with_the_smallest_on_the_same_seeds() -> None:
     found = row(sweep, "p", 4).comparison
     assert found is not None and found.baseline == RowKey(TASK, "p", 1, None)
     test = found.test
-    assert (test.difference, test.n_pairs) == (-0.25, 4)
+    assert (test.difference, found.pairs.n_pairs) == (-0.25, 4)
     assert test.p_value == 1.0  # one differing pair: two-sided binomial of 0 in 1
     assert row(sweep, "p", 1).comparison is None
     assert row(sweep, "q", 8).comparison is None  # nothing of its own to compare with

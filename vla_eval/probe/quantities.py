@@ -60,7 +60,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwapQuantities:
-    """Quantities of pairs with swapped cues; `n_follow` and `n_against` are the counts of the sign test.
+    """Quantities of pairs with swapped cues.
 
     Attributes:
         sensitivity: pairs whose choice changes, or what else `change_of` says; None where none is known.
@@ -71,7 +71,6 @@ class SwapQuantities:
         p_value: exact two-sided sign test; None where there is no single right candidate.
     """
 
-    n_pairs: int
     change_of: ChangeOf | None
     sensitivity: Share | None
     actions_changed: Share | None
@@ -119,7 +118,6 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
     }
     n_successes = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs)
     return SwapQuantities(
-        n_pairs=n_pairs,
         change_of=change_of,
         sensitivity=by_change[change_of],
         actions_changed=None if spec.entry_point in CUE_IN_STATE else moved,

@@ -92,7 +92,7 @@ def _of_pairs(row: ProbeRow) -> str:
     """Return what independent choices without the cue would give; a constant choice gives 0."""
     if row.swap is None or row.chance is None:
         return ""
-    return f" (chance at most {row.chance**2 * row.swap.n_pairs:.0f})"
+    return f" (chance at most {row.chance**2 * row.n_pairs:.0f})"
 
 
 def _half_life(curve: Retention) -> str:

@@ -72,13 +72,11 @@ class PairedTest:
     Attributes:
         difference: difference of the success rates over the pairs.
         interval: its 95 % interval.
-        n_pairs: number of pairs.
         p_value: two-sided exact McNemar test.
     """
 
     difference: float
     interval: Interval
-    n_pairs: int
     p_value: float
 
 
@@ -160,7 +158,6 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     return PairedTest(
         difference=difference,
         interval=paired_interval(counts),
-        n_pairs=counts.n_pairs,
         p_value=min(1.0, p_value),
     )
 

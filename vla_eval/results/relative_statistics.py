@@ -35,7 +35,7 @@ def _paired_cells(comparisons: Sequence[Comparison | None]) -> dict[str, Cell]:
         cells |= dict.fromkeys(names)
         if one is not None:
             test, other = one.test, (one.baseline.policy, one.baseline.n_action_steps)
-            tested = (test.difference, *test.interval, test.n_pairs, one.corrected_p, test.p_value)
+            tested = (test.difference, *test.interval, one.pairs.n_pairs, one.corrected_p, test.p_value)
             cells |= zip(names, (*other, *tested), strict=True)
     return cells
 

@@ -153,17 +153,14 @@ def _env_arguments(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], Ma
     return found
 
 
-def episodes_to_settle(
-    difference: float, discordance: float, *, level: float = LEVEL, power: float = POWER
-) -> int:
-    """Return how many paired episodes a two-sided McNemar test needs to detect a difference.
+def episodes_to_settle(difference: float, discordance: float, *, level: float = LEVEL) -> int:
+    """Return how many paired episodes a two-sided McNemar test needs to detect a difference with `POWER`.
 
     Args:
         difference: of the two success rates, in (0, 1].
         discordance: share of episodes in which the two policies differ; raised to `difference` if it is
             smaller, which is impossible.
         level: of the test, after any correction for several comparisons, in (0, 1).
-        power: probability of detecting it, in (0, 1).
 
     Source: Connor 1987, "Sample size for testing differences in proportions for the paired-sample
     design", Biometrics 43(1):207-211, equation 3: n = (z_{1-level/2} √ψ + z_{power} √(ψ - δ²))² / δ².
@@ -171,7 +168,7 @@ def episodes_to_settle(
     """
     psi = max(discordance, difference)
     z_level = float(stats.norm.ppf(1 - level / 2))
-    z_power = float(stats.norm.ppf(power))
+    z_power = float(stats.norm.ppf(POWER))
     root = z_level * math.sqrt(psi) + z_power * math.sqrt(psi - difference**2)
     return math.ceil((root / difference) ** 2)
 
