@@ -111,7 +111,7 @@ def audit_configs(
                     tasks=of_kind,
                     policies=policies,
                     episodes=episodes,
-                    env={**PROTOCOLS[protocol], **given_env},
+                    env={**PROTOCOLS[protocol].arguments, **given_env},
                     workers=workers,
                     **{**(OFFICIAL_FIELDS if protocol == "official" else {}), **fields},
                 )

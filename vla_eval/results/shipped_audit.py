@@ -10,7 +10,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from vla_eval.errors import ReportError
 from vla_eval.strict.json_text import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
@@ -21,8 +21,22 @@ STRICT: Mapping[str, bool] = {
     "strict_choice": True,
     "phase_gate_success": True,
 }
-PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT, "official": {}}
-"""Name of a set of rules -> arguments of the tasks. The official package's tasks have one set, their own."""
+
+
+class Rules(NamedTuple):
+    """A set of rules: the arguments of the tasks, its words in a note, and the page with its audit."""
+
+    arguments: Mapping[str, bool]
+    words: str
+    page: str
+
+
+PROTOCOLS: Mapping[AuditProtocol, Rules] = {
+    "paper": Rules({}, "the paper's rule", "docs/audit.md"),
+    "strict": Rules(STRICT, "the strict rule", "docs/audit.md"),
+    "official": Rules({}, "the official rule", "docs/audit_official.md"),
+}
+"""The official package's tasks have one set, their own."""
 
 SHORTCUTS: Mapping[str, tuple[str, str]] = {
     "hold": ("won without acting", "without acting"),

@@ -33,10 +33,8 @@ def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
     Raises:
         ReportError: a file cannot be written.
     """
-    return [
-        write_beside(folder, f"{task}_{axis}", heat_png(maps))
-        for (task, axis), maps in heat_maps(table).items()
-    ]
+    found = heat_maps(table)
+    return write_beside(folder, {f"{task}_{axis}": heat_png(maps) for (task, axis), maps in found.items()})
 
 
 def _heat_map(policy: str, cells: list[GridCell]) -> HeatMap:

@@ -23,10 +23,8 @@ def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     Raises:
         ReportError: a file cannot be written.
     """
-    return [
-        write_beside(folder, f"{own[0].task}_{own[0].of}", retention_png(own))
-        for own in by_kind(table.retention)
-    ]
+    curves = by_kind(table.retention)
+    return write_beside(folder, {f"{own[0].task}_{own[0].of}": retention_png(own) for own in curves})
 
 
 def by_kind(curves: Sequence[Retention]) -> list[list[Retention]]:
