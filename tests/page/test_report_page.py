@@ -16,7 +16,7 @@ import pytest
 from vla_eval.cli.main import main
 from vla_eval.errors import ReportError
 from vla_eval.page.build import build_page, with_code, write_page
-from vla_eval.page.charts import MARKERS, Bar, Chart, Point, Series, curves, forest, sign
+from vla_eval.page.charts import MARKERS, Bar, Chart, Curves, Point, Series, curves, forest, sign
 from vla_eval.page.rates import _round_ticks
 from vla_eval.page.svg import PALETTE
 from vla_eval.records import EpisodeError, EpisodeRecord
@@ -241,7 +241,7 @@ def test_points_of_two_policies_at_one_k_are_beside_each_other() -> None:
     series = [
         Series(name=name, color=i, points=(Point(1, 0.5), Point(8, 0.5))) for i, name in enumerate("pq")
     ]
-    drawn = curves(series, title="t", description="d", x_title="K", x_ticks=[1, 8]).svg
+    drawn = drawn_curves(*series, x_ticks=[1, 8])
     first, _, second, _ = (
         float(x) for x in re.findall(r'class="marker"><path [^>]*translate\(([\d.]+) ', drawn)
     )
@@ -287,6 +287,10 @@ def test_nothing_is_loaded_from_anywhere(tmp_path: Path) -> None:
     assert {link.split(",")[0] for link in links} == {"data:", "data:video/mp4;base64"}
 
 
+def drawn_curves(*series: Series, x_ticks: list[float]) -> str:
+    return curves(Curves(series=series, title="t", description="d", x_title="K", x_ticks=x_ticks)).svg
+
+
 def one_bar(label: str = "a") -> Chart:
     bar = Bar(label=label, color=0, value=0.5, low=0.25, high=0.75, chance=0.3, ceiling=1.0)
     return forest([bar], title="t", description="d")
@@ -308,9 +312,7 @@ def test_a_rate_lies_where_it_belongs_and_no_result_is_said_in_words() -> None:
 
 def test_a_higher_rate_is_drawn_higher() -> None:
     points = (Point(1, 0.0), Point(8, 1.0))
-    drawn = curves(
-        [Series(name="p", color=0, points=points)], title="t", description="d", x_title="K", x_ticks=[1, 8]
-    ).svg
+    drawn = drawn_curves(Series(name="p", color=0, points=points), x_ticks=[1, 8])
     corners = re.search(r'<g class="curve"><path d="M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)"', drawn)
     assert corners is not None
     x1, y1, x2, y2 = map(float, corners.groups())
@@ -320,7 +322,7 @@ def test_a_higher_rate_is_drawn_higher() -> None:
 def test_a_rate_holds_until_the_step_of_the_next_success() -> None:
     points = (Point(0, 0.0), Point(50, 1.0), Point(100, 1.0))
     one = Series(name="p", color=0, points=points, is_step=True)
-    drawn = curves([one], title="t", description="d", x_title="step", x_ticks=[0, 100]).svg
+    drawn = drawn_curves(one, x_ticks=[0, 100])
     path = re.search(r'<g class="curve"><path d="M ([^"]*)"', drawn)
     assert path is not None
     corners = [tuple(map(float, corner.split())) for corner in path[1].split(" L ")]

@@ -41,7 +41,7 @@ def test_a_mistake_is_of_order_place_or_identity() -> None:
         CHAIN,
     )
     assert found is not None
-    assert (found.n_order, found.n_identity, found.n_place, found.n_incomplete) == (1, 1, 1, 2)
+    assert found.counts == {"order": 1, "identity": 1, "place": 1} and found.n_incomplete == 2
     assert (found.n_episodes, found.n_mistakes) == (7, 3)
     # Of the six that were not shown, none lies beside 0, and one (3) beside 2.
     assert found.expected_place == pytest.approx(0 + 1 / 6)
@@ -51,14 +51,14 @@ def test_in_a_set_the_order_is_no_mistake_and_all_that_are_left_are_due() -> Non
     found = mistakes([episode(2, 0, 1), episode(2, 3, 1), episode(1, 3, 2)], BUNCH)
     assert found is not None
     # After 2, the cubes 0 and 1 are due: 3 is beside neither. In the third, 2 comes later: so it is due.
-    assert (found.n_order, found.n_identity, found.n_place) == (0, 1, 1)
+    assert (found.counts["order"], found.counts["identity"], found.counts["place"]) == (0, 1, 1)
 
 
 def test_where_items_are_places_each_mistake_is_one_of_place() -> None:
     shells = task_spec("ShellGameTouch-v0")
     found = mistakes([episode(5, right=(0,)), episode(0, right=(0,))], shells)
     assert found is not None
-    assert (found.n_place, found.n_identity, found.expected_place) == (1, 0, None)
+    assert (found.counts["place"], found.counts["identity"], found.expected_place) == (1, 0, None)
 
 
 def test_records_without_touches_say_nothing() -> None:

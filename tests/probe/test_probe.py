@@ -14,8 +14,9 @@ from vla_eval.cli.main import main
 from vla_eval.config.appearance import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
-from vla_eval.probe.interventions import ProbeSettings, plan_probe
+from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.phases import CUE_STEPS, default_delay_steps, inferences, phases_of
+from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.memory_env import MemoryTableEnv
 from vla_eval.tasks.register import env_class

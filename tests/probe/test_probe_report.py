@@ -11,10 +11,11 @@ from vla_eval.cli.main import main
 from vla_eval.page.build import build_page
 from vla_eval.probe.choice_pairs import choice_pairs
 from vla_eval.probe.find_worlds import find_probes
-from vla_eval.probe.interventions import ProbeSettings, plan_probe
+from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.sections import probe_sections
 from vla_eval.probe.report_text import probe_texts
 from vla_eval.probe.world_records import by_policy
+from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import RunDescription, StoredRun
 from vla_eval.viz.filmstrip import read_strip
@@ -90,11 +91,9 @@ def test_pairs_are_counted_by_the_choices_in_both_worlds() -> None:
     none, swap = plan_probe(TASK_CONFIG, ProbeSettings(probes=("swap",))).worlds
     (pairs,) = choice_pairs([(none, by_policy(drawn)), (swap, by_policy(other))], "p", 1)
     assert pairs.names == ("red", "green", "blue", "none")
-    counts = [[pairs.count(row, column) for column in range(4)] for row in range(4)]
-    assert counts == [[1, 2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]]
-    assert [(row, column) for row in range(4) for column in range(4) if pairs.is_right(row, column)] == [
-        (0, 1)
-    ]
+    # By the indices of the names: as drawn, and in the other world.
+    assert dict(pairs.counts) == {(0, 1): 2, (0, 0): 1, (2, 3): 1}
+    assert dict(pairs.following) == {(0, 1): 2}
 
 
 def test_report_prints_and_shows_what_probe_printed(

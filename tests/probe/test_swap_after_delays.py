@@ -7,8 +7,9 @@ import pytest
 
 from tests.probe.test_probe import TASK_CONFIG, probe, rows_of
 from tests.probe.test_quantities import record
-from vla_eval.probe.interventions import ProbeSettings, plan_probe
+from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.table import probe_table
+from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.records import EpisodeRecord
 
 N_SEEDS = 12

@@ -7,11 +7,20 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
-from vla_eval.audit.verdicts import NEEDS_MEMORY, NOT_AUDITED, SHORTCUTS, UNDECIDED, WITHOUT_ACTING, verdict
+from vla_eval.audit.verdicts import verdict
 from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
-from vla_eval.results.audit_notes import OTHER_VERDICTS, ROADS, audit_notes
-from vla_eval.results.shipped_audit import STRICT, Counts, TaskAudit, protocol_of, shipped_audits
+from vla_eval.results.audit_notes import audit_notes
+from vla_eval.results.shipped_audit import (
+    NOT_AUDITED,
+    OTHER_VERDICTS,
+    ROADS,
+    STRICT,
+    Counts,
+    TaskAudit,
+    protocol_of,
+    shipped_audits,
+)
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import SUITES, TASKS, task_spec
 
@@ -67,8 +76,8 @@ def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -
 
 
 def test_every_verdict_of_an_audit_has_words_for_readers() -> None:
-    assert set(ROADS) == {*SHORTCUTS.values(), WITHOUT_ACTING}
-    assert set(OTHER_VERDICTS) == {NEEDS_MEMORY, UNDECIDED, NOT_AUDITED}
+    said = {word for one in shipped_audits().values() for word in one.verdict}
+    assert said <= {*ROADS, *OTHER_VERDICTS}
 
 
 def test_a_run_of_official_tasks_gets_their_audit() -> None:

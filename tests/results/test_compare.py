@@ -15,8 +15,13 @@ from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
-from vla_eval.results.power import discordance_of_independent, episodes_to_settle
-from vla_eval.results.sweep import Sweep, SweepRow, compare_runs
+from vla_eval.results.sweep import (
+    Sweep,
+    SweepRow,
+    compare_runs,
+    discordance_of_independent,
+    episodes_to_settle,
+)
 from vla_eval.results.sweep_format import render_sweep
 
 TASK = "RememberColor3-v0"
@@ -55,7 +60,7 @@ def test_each_k_is_compared_with_the_smallest_on_the_same_seeds() -> None:
     found = row(sweep, "p", 4).comparison
     assert found is not None and found.baseline == RowKey(TASK, "p", 1, None)
     test = found.test
-    assert (test.difference, test.n_pairs) == (-0.25, 4)
+    assert (test.difference, found.pairs.n_pairs) == (-0.25, 4)
     assert test.p_value == 1.0  # one differing pair: two-sided binomial of 0 in 1
     assert row(sweep, "p", 1).comparison is None
     assert row(sweep, "q", 8).comparison is None  # nothing of its own to compare with

@@ -9,6 +9,7 @@ import pytest
 
 from tests.results.stored_runs import episodes, has_note, stored
 from vla_eval.cli import report as report_verb
+from vla_eval.page.build import build_page
 from vla_eval.results import report, statistics
 from vla_eval.results.own_statistics import SUCCESS
 from vla_eval.results.printed_table import Column
@@ -39,6 +40,11 @@ def test_a_statistic_is_added_by_its_row_alone(with_toy: Table) -> None:
     assert [row["toy_cell"] for row in json.loads(render(with_toy, "json"))["rows"]] == [21, 28]
     assert "toy_cell" in statistics.column_names()  # of a table without rows, too
     assert "<28>" in render(with_toy, "markdown", columns=["policy", "toy"])
+
+
+def test_a_statistic_that_is_added_is_on_the_page(with_toy: Table) -> None:
+    page = build_page([stored(episodes("p", "++-"), episodes("random", "----"))])
+    assert "toy title" in page and "&lt;21&gt;" in page and "toy: 49 in all." in page
 
 
 def test_a_statistic_that_is_added_is_named_by_the_help(

@@ -15,7 +15,7 @@ from vla_eval.cue_view import GREY, CueBoxes, CueView, CueViewKind, CueViewSetti
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.maniskill import ManiSkillEnv
 from vla_eval.errors import TaskArgumentError
-from vla_eval.probe.views import APPEARANCES
+from vla_eval.probe.worlds import APPEARANCES
 from vla_eval.task_state import Phase
 from vla_eval.tasks.appearance import turned_hue
 from vla_eval.tasks.objects.items import COLORS

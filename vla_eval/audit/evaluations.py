@@ -111,7 +111,7 @@ def audit_configs(
                     tasks=of_kind,
                     policies=policies,
                     episodes=episodes,
-                    env={**PROTOCOLS[protocol], **given_env},
+                    env={**PROTOCOLS[protocol].arguments, **given_env},
                     workers=workers,
                     **{**(OFFICIAL_FIELDS if protocol == "official" else {}), **fields},
                 )
@@ -148,15 +148,10 @@ def read_audit(configs: Sequence[EvalConfig], out: Path) -> tuple[TaskAudit, ...
     audits = []
     for config in configs:
         records = read_run(out / config.name).records
-        protocol = _protocol_of(config)
+        (protocol,) = (one for one in PROTOCOLS if config.name.startswith(f"audit_{one}_"))
         for task in config.tasks:
             audits.append(audit_task(task, protocol, [r for r in records if r.task == task_spec(task).id]))
     return tuple(audits)
-
-
-def _protocol_of(config: EvalConfig) -> AuditProtocol:
-    (protocol,) = (one for one in PROTOCOLS if config.name.startswith(f"audit_{one}_"))
-    return protocol
 
 
 def audit_task(task: str, protocol: AuditProtocol, records: Sequence[EpisodeRecord]) -> TaskAudit:

@@ -1,4 +1,4 @@
-"""What the counts of controls say of a task, in words. Knows nothing of runs.
+"""The verdict on a task, from the counts of its controls. Knows nothing of runs.
 
 No audit proves that a task needs memory. It finds shortcuts among those that its controls try.
 """
@@ -6,23 +6,10 @@ No audit proves that a task needs memory. It finds shortcuts among those that it
 from collections.abc import Mapping
 
 from vla_eval.results.estimates import p_above, p_more
-from vla_eval.results.shipped_audit import Counts
+from vla_eval.results.shipped_audit import NEEDS_MEMORY, NOT_AUDITED, SHORTCUTS, UNDECIDED, Counts
 
 ALPHA = 0.001
 """Level of each test. All tasks need about 200 tests: less than one false finding in five audits."""
-
-NEEDS_MEMORY = "needs memory"
-NOT_AUDITED = "not audited: no scripted control"
-UNDECIDED = "not decided"
-SHORTCUTS = {
-    "random": "won by chance motions",
-    "tour": "can be toured",
-    "body_memory": "body can store the cue",
-    "cue_touch": "won by staying at the cue",
-    "cue_blind": "won without the cue",
-    "one_frame": "won from single frames",
-}
-WITHOUT_ACTING = "won without acting"
 
 
 def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: bool = True) -> tuple[str, ...]:
@@ -39,10 +26,11 @@ def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: boo
         scripted: whether the task has a scripted arm; without one, nothing but standing still is tried.
     """
     blind = counts.get("cue_blind")
-    found = [WITHOUT_ACTING] if "hold" in counts and counts["hold"].success_once else []
-    for control, words in SHORTCUTS.items():
-        if control in counts and _beats_memoryless(counts[control], chance, blind):
-            found.append(words)
+    found = [
+        words
+        for control, (words, _) in SHORTCUTS.items()
+        if control in counts and _finds_shortcut(control, counts[control], chance, blind)
+    ]
     if not scripted:
         found.append(NOT_AUDITED)
     if found:
@@ -60,7 +48,9 @@ def _beats_all(counts: Mapping[str, Counts], chance: float | None) -> bool:
     return beats_luck and all(beats(oracle, other) for other in others)
 
 
-def _beats_memoryless(counts: Counts, chance: float | None, blind: Counts | None) -> bool:
+def _finds_shortcut(control: str, counts: Counts, chance: float | None, blind: Counts | None) -> bool:
+    if control == "hold":
+        return counts.success_once > 0
     if chance is not None:
         return beats_chance(counts, chance)
     return blind is not None and beats(counts, blind)

@@ -38,7 +38,7 @@ N_RESETS = 5
 
 
 class Costs(NamedTuple):
-    """CPU milliseconds in one process, without other work beside it."""
+    """CPU milliseconds in one process, with nothing else running."""
 
     step_ms: float
     frame_ms: float

@@ -7,10 +7,11 @@ its own, as in an evaluation.
 import json
 import os
 import tempfile
-import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,37 +182,25 @@ def _served_rate(server: Server, n_sessions: int, seconds: float, free_before: i
     """Let so many sessions ask, each again as soon as it has its answer."""
     policies = [server.connect() for _ in range(n_sessions)]
     askers = [Asker(policy, seed=row, row=row) for row, policy in enumerate(policies)]
-    counts, failures = [0] * n_sessions, []
-    barrier = threading.Barrier(n_sessions + 1)
-    begun = [0.0]
 
-    def ask_on(index: int) -> None:
-        try:
-            askers[index].ask()
-            barrier.wait()
-            while time.perf_counter() - begun[0] < seconds or not begun[0]:
-                askers[index].ask()
-                counts[index] += 1
-        except BaseException as exc:  # for the thread that waits
-            failures.append(exc)
-            barrier.abort()
+    def ask_until(asker: Asker, end: float) -> int:
+        n = 0
+        while time.perf_counter() < end:
+            asker.ask()
+            n += 1
+        return n
 
-    threads = [threading.Thread(target=ask_on, args=(index,), daemon=True) for index in range(n_sessions)]
-    for thread in threads:
-        thread.start()
     try:
-        barrier.wait()
-        begun[0] = time.perf_counter()
-        for thread in threads:
-            thread.join()
-        elapsed = time.perf_counter() - begun[0]
-    finally:
+        with ThreadPoolExecutor(n_sessions) as pool:
+            list(pool.map(Asker.ask, askers))  # the first ones connect
+            begun = time.perf_counter()
+            n_asked = sum(pool.map(ask_until, askers, repeat(begun + seconds)))
+        elapsed = time.perf_counter() - begun
         resident, on_device = resident_bytes(server.pid), taken_bytes(free_before)
+    finally:
         for policy in policies:
             policy.close()
-    if failures:
-        raise failures[0]
-    return Load(per_second=sum(counts) / elapsed, resident_bytes=resident, device_bytes=on_device)
+    return Load(per_second=n_asked / elapsed, resident_bytes=resident, device_bytes=on_device)
 
 
 def _rounding(policy: str, n_rows: int, precision: str | None) -> Rounding:

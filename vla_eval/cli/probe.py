@@ -24,7 +24,7 @@ from vla_eval.workers.needed_files import Needed
 
 if TYPE_CHECKING:
     from vla_eval.probe.grid import GridSettings
-    from vla_eval.probe.interventions import ProbeSettings
+    from vla_eval.probe.worlds import ProbeSettings
 
 DESCRIPTION = """Run each task as it is and with one thing changed, on the same seeds, and compare.
 
@@ -138,8 +138,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> "ProbeSettings":
-    from vla_eval.probe.interventions import PROBES, ProbeSettings
-    from vla_eval.probe.views import APPEARANCES, MASKS
+    from vla_eval.probe.interventions import INTERVENTIONS
+    from vla_eval.probe.worlds import APPEARANCES, MASKS, ProbeSettings
 
     chosen: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(getattr(args, name), name) for name in LEAST if name != "first_inferences"
@@ -147,7 +147,7 @@ def _settings(args: argparse.Namespace) -> "ProbeSettings":
     if args.instructions is not None:
         chosen["instructions"] = tuple(dict.fromkeys(args.instructions))
     words = None if args.probes is None else [word for words in args.probes for word in words]
-    chosen["probes"] = _names(words, PROBES, kind="probe", flag="--probe")
+    chosen["probes"] = _names(words, INTERVENTIONS, kind="probe", flag="--probe")
     chosen["masks"] = _names(args.masks, MASKS, kind="mask", flag="--mask")
     chosen["appearances"] = _names(args.appearances, APPEARANCES, kind="appearance", flag="--appearance")
     given = {name: value for name, value in chosen.items() if value is not None}

@@ -44,7 +44,8 @@ def check_owners(_: Probe) -> Finding:
         "vla_eval": f"Another project has the same import name: pip uninstall vla-eval, then: {SET_UP}",
         "cv2": f"Whichever was installed last wins: pip uninstall opencv-python, then: {SET_UP}",
     }
-    shared = {name: owners for name in advice if len(owners := _owners(name)) > 1}
+    mapping = importlib.metadata.packages_distributions()
+    shared = {name: owners for name in advice if len(owners := sorted(set(mapping.get(name, ())))) > 1}
     if not shared:
         return Finding(status="ok", found="no package has two owners")
     return Finding(
@@ -93,9 +94,3 @@ def _public(version: str) -> str:
         return Version(version).public
     except InvalidVersion:
         return version
-
-
-def _owners(top_level: str) -> list[str]:
-    """Return the distributions that have files in a top-level package."""
-    mapping = importlib.metadata.packages_distributions()
-    return sorted(set(mapping.get(top_level, ())))

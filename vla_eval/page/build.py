@@ -8,6 +8,7 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -19,7 +20,7 @@ from vla_eval.page.episode_list import episode_list
 from vla_eval.page.material import Material, gather
 from vla_eval.page.probe_section import ProbeSection
 from vla_eval.results.own_statistics import EPISODES
-from vla_eval.results.table_formats import render
+from vla_eval.results.table_formats import render, side_tables
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun
 
@@ -29,30 +30,37 @@ SCRIPT = "episodes.js"
 N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
+class PageOptions(TypedDict, total=False):
+    """What a page is made with.
+
+    Attributes:
+        baseline, protocols: as for `build_table`.
+        probes: those that the run folders are of.
+        published: as for `render`.
+    """
+
+    baseline: str | None
+    probes: Sequence[ProbeSection]
+    protocols: Sequence[str]
+    published: str | None
+
+
 def build_page(
-    runs: Sequence[StoredRun],
-    *,
-    baseline: str | None = None,
-    probes: Sequence[ProbeSection] = (),
-    protocols: Sequence[str] = (),
-    published: str | None = None,
-    folder: Path | None = None,
+    runs: Sequence[StoredRun], *, folder: Path | None = None, **options: Unpack[PageOptions]
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
     Args:
         runs: what the run folders hold. Timings and videos are read from the folders themselves.
-        baseline: as for `build_table`.
-        probes: those that the run folders are of.
-        protocols: as for `build_table`.
-        published: as for `render`.
         folder: where the page will be, for links to captures; None: the current folder.
+        options: what it is made with.
 
     Raises:
         ReportError: there is no episode yet.
         UnknownNameError: there is no such baseline or protocol.
     """
-    material = gather(runs, baseline=baseline, protocols=protocols)
+    published = options.get("published")
+    material = gather(runs, baseline=options.get("baseline"), protocols=options.get("protocols", ()))
     chunks = rates.chunk_plots(material)
     templates = _templates()
     script = templates.get_template(SCRIPT).render()
@@ -61,14 +69,15 @@ def build_page(
         summary=_summary(material),
         version=__version__,
         material=material,
-        probes=probes,
+        probes=options.get("probes", ()),
         verdicts=verdicts(material.table),
         episodes=episode_list(material, folder),
         script=Markup(script),
-        script_hash=_script_hash(script),
+        # What the page's policy allows to run: this script and no other.
+        script_hash=f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}",
         n_open_matrices=N_OPEN_MATRICES,
         results=rates.results(material),
-        sides=rates.side_sections(material.table, published=published),
+        sides=side_tables(material.table, published=published),
         success=rates.success_plots(material),
         chunks=chunks,
         sweep=rates.chunk_sweep(material) if chunks.charts else None,
@@ -84,32 +93,14 @@ def build_page(
     )
 
 
-def write_page(
-    runs: Sequence[StoredRun],
-    folder: Path,
-    *,
-    baseline: str | None = None,
-    probes: Sequence[ProbeSection] = (),
-    protocols: Sequence[str] = (),
-    published: str | None = None,
-) -> Path:
-    """Write the page and return its path.
-
-    Args:
-        runs: as for `build_page`.
-        folder: created if it does not exist.
-        baseline: as for `build_page`.
-        probes: as for `build_page`.
-        protocols: as for `build_table`.
-        published: as for `render`.
+def write_page(runs: Sequence[StoredRun], folder: Path, **options: Unpack[PageOptions]) -> Path:
+    """Write the page into a folder, which is made if it is not there, and return its path.
 
     Raises:
         ReportError: there is no episode yet, or the page cannot be written there.
         UnknownNameError: there is no such baseline.
     """
-    page = build_page(
-        runs, baseline=baseline, probes=probes, protocols=protocols, published=published, folder=folder
-    )
+    page = build_page(runs, folder=folder, **options)
     path = folder / PAGE_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -117,12 +108,6 @@ def write_page(
     except OSError as exc:
         raise ReportError(f"{path}: cannot be written ({exc.strerror or exc}). Name another --html.") from exc
     return path
-
-
-def _script_hash(script: str) -> str:
-    """Return what the page's policy allows to run: this script and no other."""
-    digest = hashlib.sha256(script.encode()).digest()
-    return f"sha256-{base64.b64encode(digest).decode()}"
 
 
 def _templates() -> Environment:
@@ -150,15 +135,10 @@ def with_code(text: str) -> Markup:
 def _summary(material: Material) -> str:
     rows = material.table.rows
     counts = (
-        (sum(row[EPISODES].n_episodes for row in rows), "episodes with a result"),
-        (sum(row[EPISODES].n_errors for row in rows), "errors"),
-        (len(material.tasks), "tasks"),
-        (len(material.colors), "policies"),
-        (len(material.runs), "run folders"),
+        (sum(row[EPISODES].n_episodes for row in rows), "episode with a result", "episodes with a result"),
+        (sum(row[EPISODES].n_errors for row in rows), "error", "errors"),
+        (len(material.tasks), "task", "tasks"),
+        (len(material.colors), "policy", "policies"),
+        (len(material.runs), "run folder", "run folders"),
     )
-    return ", ".join(f"{n} {noun if n != 1 else _singular(noun)}" for n, noun in counts)
-
-
-def _singular(noun: str) -> str:
-    words = {"policies": "policy", "episodes with a result": "episode with a result"}
-    return words.get(noun, noun.removesuffix("s"))
+    return ", ".join(f"{n} {one if n == 1 else several}" for n, one, several in counts)

@@ -30,7 +30,7 @@ ROW_HEIGHT_PX = 24
 FOREST_WIDTH_PX = 760  # with its labels as wide as the page
 NARROW_FOREST_WIDTH_PX = 180  # with its labels it is legible on a phone
 CURVES_SIZE_PX = (320, 180)
-DODGE = 0.014  # of the axis: points of several series at one x are beside each other
+DODGE = 0.014  # of the axis: points of several series at one x stand side by side
 SIGN_SIZE_PX = (26, 16)
 
 LineKind = Literal["solid", "chance", "ceiling"]
@@ -138,18 +138,11 @@ def _forest(bars: Sequence[Bar], width_px: float, label_px: float) -> Figure:
     return figure
 
 
-def curves(
-    series: Sequence[Series],
-    *,
-    title: str,
-    description: str,
-    x_title: str,
-    x_ticks: Sequence[float],
-    x_labels: Sequence[str] | None = None,
-) -> Chart:
-    """Draw rates in [0, 1] over a number, one line per series.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Rates in [0, 1] over a number, one line per series.
 
-    Args:
+    Attributes:
         series: at least one point in all.
         title: of the plot.
         description: what it shows, for screen readers.
@@ -157,41 +150,43 @@ def curves(
         x_ticks: in increasing order; the first and the last are the ends of the axis.
         x_labels: what is written at each tick, if not its number.
     """
+
+    series: Sequence[Series]
+    title: str
+    description: str
+    x_title: str
+    x_ticks: Sequence[float]
+    x_labels: Sequence[str] | None = None
+
+
+def curves(drawn: Curves) -> Chart:
+    """Draw curves for a page."""
     with own_style():
-        figure = _curves(series, x_title=x_title, x_ticks=x_ticks, x_labels=x_labels)
-        return Chart(title, inline_svg(figure, label=f"{title}. {description}"))
+        return Chart(drawn.title, inline_svg(_curves(drawn), label=f"{drawn.title}. {drawn.description}"))
 
 
-def curves_png(
-    series: Sequence[Series],
-    *,
-    title: str,
-    x_title: str,
-    x_ticks: Sequence[float],
-    x_labels: Sequence[str] | None = None,
-) -> bytes:
+def curves_png(drawn: Curves) -> bytes:
     """Return a PNG file of `curves`, on paper, with the names of the series."""
     with own_style():
-        figure = _curves(series, x_title=x_title, x_ticks=x_ticks, x_labels=x_labels)
+        figure = _curves(drawn)
         figure.set(frameon=True, facecolor=PALETTE["paper"])
         (axes,) = figure.axes
-        named = sorted(series, key=lambda one: one.kind != "solid")  # lines of reference last
+        named = sorted(drawn.series, key=lambda one: one.kind != "solid")  # lines of reference last
         handles = [Line2D([], [], **_line(one), label=one.name) for one in named]
         # Beside the axes: with several series no corner is free.
         axes.legend(handles=handles, frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
-        axes.set_title(printable(title), pad=10)
+        axes.set_title(printable(drawn.title), pad=10)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=PNG_DPI, bbox_inches="tight", metadata={"Software": None})
         return file.getvalue()
 
 
-def _curves(
-    series: Sequence[Series], *, x_title: str, x_ticks: Sequence[float], x_labels: Sequence[str] | None
-) -> Figure:
+def _curves(drawn: Curves) -> Figure:
+    series, x_ticks = drawn.series, drawn.x_ticks
     figure, axes = _plot(*CURVES_SIZE_PX, left=40, right=12, top=10, bottom=44)
     margin = (x_ticks[-1] - x_ticks[0] or 1) * (0.03 + len(series) * DODGE / 2)
-    axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=x_title)
-    axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks] if x_labels is None else x_labels)
+    axes.set(xlim=(x_ticks[0] - margin, x_ticks[-1] + margin), ylim=(0, 1), xlabel=drawn.x_title)
+    axes.set_xticks(x_ticks, drawn.x_labels or [f"{tick:g}" for tick in x_ticks])
     axes.set_yticks(RATE_TICKS, [f"{tick:g}" for tick in RATE_TICKS])
     axes.grid(visible=False, axis="x")
     for one in _dodged(series, (x_ticks[-1] - x_ticks[0]) * DODGE):
@@ -264,7 +259,7 @@ def _line(series: Series) -> dict[str, Any]:  # Any: matplotlib's properties of 
 
 
 def _solid_line(number: int) -> dict[str, Any]:
-    return {"color": _color(number), "linestyle": (0, _dashes(number))}
+    return {"color": _color(number), "linestyle": (0, DASHES[number % len(DASHES)] or None)}
 
 
 def _reference_line(name: str) -> dict[str, Any]:
@@ -290,7 +285,3 @@ def _marker(axes: Axes, color: int, x: float, y: float) -> None:
 
 def _color(number: int) -> str:
     return COLORS[number % len(COLORS)]
-
-
-def _dashes(number: int) -> tuple[float, ...] | None:
-    return DASHES[number % len(DASHES)] or None

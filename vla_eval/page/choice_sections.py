@@ -1,30 +1,15 @@
 """The page's section on choices: targets, first choices and causes of failure."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from vla_eval.page.material import Material
-from vla_eval.page.tables import DARKEST, UNKNOWN, Column, MatrixCell, PageTable
-from vla_eval.results.choice_causes import CAUSES, MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.page.tables import Matrix, shaded
+from vla_eval.results.choice_causes import MOVED_M, Cause, ChoiceReport, Kind, report_choices
+from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of
+from vla_eval.results.success_table import Row
 from vla_eval.tasks.objects.item_names import item_names
-
-TITLES: dict[Cause, str] = {
-    "right": "right choice",
-    "not_finished": "right choice, not finished",
-    "forgot": "forgot",
-    "position_habit": "position habit",
-    "never_chose": "never chose",
-    "could_not_move": "could not move",
-}
-EXPLANATIONS: dict[Cause, str] = {
-    "right": "the first candidate touched was right, and the episode succeeded (by memory or by luck)",
-    "not_finished": "the first candidate touched was right, but the task was not completed",
-    "forgot": "a wrong candidate was touched first",
-    "position_habit": "a wrong candidate was touched first, at the place that wrong choices prefer",
-    "never_chose": "the arm moved but touched no candidate",
-    "could_not_move": f"the arm was never {MOVED_M * 100:.0f} cm from where it began",
-}
-KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
 
 
 class Explanation(NamedTuple):
@@ -34,14 +19,25 @@ class Explanation(NamedTuple):
     rule: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Matrix:
-    """Episodes by target (rows) and first choice (columns); right where the two are the same."""
-
-    kind: str
-    names: tuple[str, ...]
-    choices: tuple[str, ...]
-    rows: tuple[tuple[MatrixCell, ...], ...]
+EXPLANATIONS: dict[Cause, Explanation] = {
+    "right": Explanation(
+        "right choice",
+        "the first candidate touched was right, and the episode succeeded (by memory or by luck)",
+    ),
+    "not_finished": Explanation(
+        "right choice, not finished",
+        "the first candidate touched was right, but the task was not completed",
+    ),
+    "forgot": Explanation("forgot", "a wrong candidate was touched first"),
+    "position_habit": Explanation(
+        "position habit", "a wrong candidate was touched first, at the place that wrong choices prefer"
+    ),
+    "never_chose": Explanation("never chose", "the arm moved but touched no candidate"),
+    "could_not_move": Explanation(
+        "could not move", f"the arm was never {MOVED_M * 100:.0f} cm from where it began"
+    ),
+}
+KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's rightmost)"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +52,7 @@ class Choices:
     """
 
     explanations: tuple[Explanation, ...]
-    table: PageTable
+    table: PrintedTable
     missing: tuple[str, ...]
     matrices: dict[str, tuple[Matrix, ...]]
 
@@ -67,30 +63,21 @@ def choices(material: Material) -> Choices | None:
     found = [(row, report) for row, report in reports if report is not None]
     if not found:
         return None
-    rows = [
-        [
-            material.name_of(row, with_task=True),
-            *(str(report.causes[cause]) for cause in CAUSES),
-            _habit(report, "place", row.task),
-            _habit(report, "item", row.task),
-        ]
-        for row, report in found
+    columns: list[Column[tuple[Row, ChoiceReport]]] = [
+        Column("policy", lambda of: material.name_of(of[0], with_task=True), False),
+        *(Column(title, partial(_n_episodes, cause)) for cause, (title, _) in EXPLANATIONS.items()),
+        Column("habit of place", lambda of: _habit(of[1], "place", of[0].task), False),
+        Column("habit of item", lambda of: _habit(of[1], "item", of[0].task), False),
     ]
     return Choices(
-        explanations=tuple(Explanation(TITLES[cause], EXPLANATIONS[cause]) for cause in CAUSES),
-        table=PageTable(
-            columns=(
-                Column("policy"),
-                *(Column(TITLES[cause], "number") for cause in CAUSES),
-                Column("habit of place"),
-                Column("habit of item"),
-            ),
-            rows=tuple(map(tuple, rows)),
-            caption="Episodes by cause",
-        ),
+        explanations=tuple(EXPLANATIONS.values()),
+        table=PrintedTable(columns=columns, rows=cells_of(columns, found)),
         missing=_missing([report for _, report in found]),
         matrices={
-            material.name_of(row, with_task=True): _matrices(report, row.task) for row, report in found
+            material.name_of(row, with_task=True): tuple(
+                _matrix(report, kind, row.task) for kind in KIND_NAMES if report.confusion[kind]
+            )
+            for row, report in found
         },
     )
 
@@ -111,10 +98,14 @@ def _missing(reports: list[ChoiceReport]) -> tuple[str, ...]:
     return tuple(said)
 
 
+def _n_episodes(cause: Cause, of: tuple[Row, ChoiceReport]) -> str:
+    return str(of[1].causes[cause])
+
+
 def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
     habit = report.habits[kind]
     if habit is None:
-        return UNKNOWN
+        return UNDEFINED
     if not habit.is_found:
         return f"not shown (p={habit.p_value:.2g})"
     share = f"{habit.n_chosen}/{habit.n_possible}"
@@ -126,27 +117,14 @@ def _names(report: ChoiceReport, kind: Kind, task: str) -> tuple[str, ...]:
     return item_names(task if kind == "item" else "", report.n_candidates)
 
 
-def _matrices(report: ChoiceReport, task: str) -> tuple[Matrix, ...]:
-    kinds: tuple[Kind, ...] = ("item", "place")
-    return tuple(_matrix(report, kind, task) for kind in kinds if report.confusion[kind])
-
-
 def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:
     counts = report.confusion[kind]
-    most = max(counts.values())
     names = _names(report, kind, task)
     chosen: list[int | None] = [*range(report.n_candidates), None]
-    rows = [
-        [
-            MatrixCell(n, DARKEST * n / most, target == choice)
-            for choice in chosen
-            for n in (counts.get((target, choice), 0),)
-        ]
-        for target in range(report.n_candidates)
-    ]
+    rows = [[counts.get((target, choice), 0) for choice in chosen] for target in range(report.n_candidates)]
     return Matrix(
-        kind=KIND_NAMES[kind],
+        title=f"Episodes by {KIND_NAMES[kind]}: target (rows) and first choice (columns)",
         names=names,
-        choices=tuple("none" if i is None else names[i] for i in chosen),
-        rows=tuple(map(tuple, rows)),
+        columns=tuple("none" if i is None else names[i] for i in chosen),
+        rows=shaded(rows, lambda target, choice: target == choice),
     )

@@ -53,7 +53,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
                 "task": row.task,
                 "policy": row.policy,
                 "k": row.n_action_steps,
-                "setting": material.variants[row.variant] if row.variant else None,
+                "setting": material.table.variants[row.variant] if row.variant else None,
                 "items": item_names(row.task, n_candidates) if n_candidates else [],
             }
         )
@@ -98,9 +98,7 @@ def _files(material: Material, folder: Path) -> dict[int, _Files]:
         for record in run.records:
             places = (video_file(run.path, record), rrd_file(run.path, record))
             if any(place.is_file() for place in places):
-                found[id(record)] = _Files(*(_address(place, folder) for place in places))
+                found[id(record)] = _Files(
+                    *(quote(os.path.relpath(one, folder)) if one.is_file() else None for one in places)
+                )
     return found
-
-
-def _address(file: Path, folder: Path) -> str | None:
-    return quote(os.path.relpath(file, folder)) if file.is_file() else None

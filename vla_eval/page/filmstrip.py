@@ -21,7 +21,7 @@ LEGEND = "viewer camera, not seen by the policy; green edge: success, orange: fa
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filmstrips:
-    """The sheets that were written, and the rows of which no episode was captured."""
+    """The sheets that were written, and the rows without a captured episode."""
 
     files: tuple[Path, ...]
     not_captured: tuple[str, ...]
@@ -58,7 +58,7 @@ def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
 
 
 def _columns(records: Sequence[EpisodeRecord]) -> tuple[str, str, str]:
-    """Return what stands above the moments of a row's episodes, see `viz.moments.Moments`."""
+    """Return the titles above the moments of a row's episodes, see `viz.moments.Moments`."""
     choosing = [record for record in records if record.n_candidates]
     if not choosing:
         return "start", "middle", "end"

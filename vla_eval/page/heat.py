@@ -10,7 +10,8 @@ from matplotlib.patches import Rectangle
 
 from vla_eval.page.charts import PX, Chart
 from vla_eval.page.svg import PALETTE, PNG_DPI, inline_svg, own_style
-from vla_eval.page.tables import DARKEST, UNKNOWN
+from vla_eval.page.tables import DARKEST
+from vla_eval.results.printed_table import UNDEFINED
 
 CELL_PX = (62, 34)
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 10, 8, 44
@@ -63,7 +64,7 @@ def heat_chart(heat: HeatMap) -> Chart:
 
 
 def heat_png(maps: Sequence[HeatMap]) -> bytes:
-    """Return one PNG file of heat maps beside each other; the same maps give the same bytes."""
+    """Return one PNG file of heat maps side by side; the same maps give the same bytes."""
     with own_style():
         width = sum(heat.size_px[0] for heat in maps)
         height = max(heat.size_px[1] for heat in maps) + TITLE_PX
@@ -101,4 +102,4 @@ def _draw(figure: Figure, heat: HeatMap, *, left: int, whole: tuple[int, int]) -
 
 
 def _shown(rate: float | None) -> str:
-    return UNKNOWN if rate is None else f"{rate:.2f}"
+    return UNDEFINED if rate is None else f"{rate:.2f}"

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.page.material import Material, errors_of
-from vla_eval.page.tables import UNKNOWN, PageTable, page_table
+from vla_eval.page.material import Material
+from vla_eval.page.tables import page_table
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.notes import UNCOMMITTED, has_uncommitted_changes
+from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
@@ -26,7 +28,7 @@ MAX_MESSAGE = 400  # characters of an error's message
 class LatencyTable:
     """Times of inferences; `n_unknown` rows have no timing. No table if none has."""
 
-    table: PageTable | None
+    table: PrintedTable | None
     n_unknown: int
 
 
@@ -58,9 +60,11 @@ def latency(material: Material) -> LatencyTable:
     return LatencyTable(table=table if rows else None, n_unknown=n_unknown)
 
 
-def errors_table(material: Material) -> PageTable | None:
+def errors_table(material: Material) -> PrintedTable | None:
     """Return errors by cause, the most frequent first; None if there are none."""
-    errors = [(record, record.error) for record in errors_of(material) if record.error is not None]
+    runs = (run for row in material.table.rows for run in row.episodes.runs)
+    records = (record for run in runs for record in run.records.values())
+    errors = [(record, record.error) for record in records if record.error is not None]
     counts = Counter((error.kind, error.stage) for _, error in errors)
     rows = []
     for (kind, stage), n in counts.most_common():
@@ -135,7 +139,7 @@ def _video(one: _Captured) -> Video:
     if record.n_candidates:
         names = item_names(record.task, record.n_candidates)
         chosen = "none" if record.first_choice is None else names[record.first_choice]
-        name += f", target {UNKNOWN if record.target is None else names[record.target]}, chosen {chosen}"
+        name += f", target {UNDEFINED if record.target is None else names[record.target]}, chosen {chosen}"
     thumbnail = thumbnail_file(one.run.path, record)
     poster = _data_uri("image/jpeg", thumbnail) if thumbnail.is_file() else None
     return Video(name=name, src=_data_uri("video/mp4", one.video), poster=poster)
@@ -149,7 +153,7 @@ class Listing(NamedTuple):
     """Names and values behind a title; without a table, `missing` says so."""
 
     title: str
-    table: PageTable | None
+    table: PrintedTable | None
     missing: str
 
 
@@ -187,7 +191,7 @@ def reproduction(run: StoredRun) -> Reproduction:
         title=f"{run.path} ({description.name})",
         commands="\n".join([*_setup_commands(description.environment), *commands]) if any(commands) else "",
         lock="\n".join(_lock(run)),
-        warning=_warning(description.environment),
+        warning=UNCOMMITTED.capitalize() if has_uncommitted_changes(description.environment) else "",
         listings=(
             _listing("Recipes, sha256", dict(description.recipes), "No recipe hashes were recorded."),
             _listing("Normalization statistics", statistics, "No policy of this run normalises."),
@@ -221,13 +225,6 @@ def _lock(run: StoredRun) -> list[str]:
         *(["# sha256"] if run.description.recipes else []),
         *(f"{digest}  {name}" for name, digest in run.description.recipes.items()),
     ]
-
-
-def _warning(environment: Mapping[str, JsonValue]) -> str:
-    source = environment.get("vla_eval")
-    if isinstance(source, Mapping) and source.get("changes") is not None:
-        return "Made with uncommitted changes to the package, which the commit does not contain."
-    return ""
 
 
 def _listing(title: str, values: dict[str, str], missing: str) -> Listing:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
+from vla_eval.records import EpisodeKey, EpisodeTiming
 from vla_eval.results.report import build_table
 from vla_eval.results.success_table import Row, Table
 from vla_eval.storage.run_folder import StoredRun
@@ -44,13 +44,7 @@ class Material:
         """
         parts = [row.task] if with_task and len(self.tasks) > 1 else []
         name = " · ".join([*parts, row.policy, f"K={row.n_action_steps}"])
-        return f"{name} ({self.variants[row.variant]})" if row.variant else name
-
-    @property
-    def variants(self) -> dict[str, str]:
-        """The settings in which run folders differ, each with its letter."""
-        told = dict.fromkeys(row.variant for row in self.table.rows if row.variant)
-        return {variant: chr(ord("a") + i) for i, variant in enumerate(told)}
+        return f"{name} ({self.table.variants[row.variant]})" if row.variant else name
 
 
 def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequence[str] = ()) -> Material:
@@ -74,14 +68,3 @@ def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequen
         timings={str(run.path): read_timings(run.path) for run in runs},
         colors={policy: number for number, policy in enumerate(policies)},
     )
-
-
-def errors_of(material: Material) -> list[EpisodeRecord]:
-    """Return all episodes that ended in an error and are in the table."""
-    return [
-        record
-        for row in material.table.rows
-        for run in row.episodes.runs
-        for record in run.records.values()
-        if record.outcome == "error"
-    ]

@@ -5,19 +5,8 @@ from typing import NamedTuple
 
 from vla_eval.page.charts import Chart
 from vla_eval.page.rates import Plots
-from vla_eval.page.tables import MatrixCell, PageTable
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairMatrix:
-    """Pairs by first choice in the world as drawn (rows) and in the other one (columns).
-
-    A cell is right if some of its pairs follow both cues.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    rows: tuple[tuple[MatrixCell, ...], ...]
+from vla_eval.page.tables import Matrix
+from vla_eval.results.printed_table import PrintedTable
 
 
 class FilmFrame(NamedTuple):
@@ -29,7 +18,7 @@ class FilmFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filmstrip:
-    """One episode: what it is, and frames of it."""
+    """Frames of one episode, and its caption."""
 
     caption: str
     frames: tuple[FilmFrame, ...]
@@ -54,17 +43,18 @@ class ProbeSection:
         notes: what a reader has to know.
         plots: curves; None where there are none.
         curves_table: numbers of the curves; None where there are none.
-        heat: heat maps by what they are of.
-        matrices: pairs by choice.
+        heat: heat maps by their title.
+        matrices: pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is
+            right if some of its pairs follow both cues.
         films: pairs of episodes.
     """
 
     title: str
-    table: PageTable
+    table: PrintedTable
     sentences: tuple[str, ...]
     notes: tuple[str, ...]
     plots: Plots | None = None
-    curves_table: PageTable | None = None
+    curves_table: PrintedTable | None = None
     heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
-    matrices: tuple[PairMatrix, ...] = ()
+    matrices: tuple[Matrix, ...] = ()
     films: tuple[FilmPair, ...] = ()

@@ -11,6 +11,7 @@ from vla_eval.errors import ReportError
 from vla_eval.page.charts import (
     Bar,
     Chart,
+    Curves,
     LineKind,
     Point,
     Series,
@@ -21,15 +22,14 @@ from vla_eval.page.charts import (
     sign,
 )
 from vla_eval.page.material import Material
-from vla_eval.page.tables import UNKNOWN, Column, PageTable, page_table
+from vla_eval.page.tables import page_table
 from vla_eval.results.own_statistics import EPISODES, STEPS, SUCCESS
-from vla_eval.results.printed_table import PrintedTable
+from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.results.relative_statistics import CEILING, CHANCE, PAIRED
-from vla_eval.results.success_table import Row, Table
+from vla_eval.results.success_table import Row
 from vla_eval.results.sweep import compare_runs
 from vla_eval.results.sweep_format import sweep_table
 from vla_eval.results.table_columns import lay_out
-from vla_eval.results.table_formats import side_tables
 
 MAX_STEP_TICKS = 7
 
@@ -49,59 +49,18 @@ class Plots:
     charts: tuple[Chart, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sweep:
-    """The table of `mikasa-vla compare`; if there is none, `refusal` says why."""
+class Results(NamedTuple):
+    """The table that `mikasa-vla report` prints, the JSON of each row, and the table of all columns."""
 
-    table: PageTable | None
-    notes: tuple[str, ...] = ()
-    refusal: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Results:
-    """The table that `mikasa-vla report` prints: what all rows share, the columns that fit, all columns."""
-
-    same: str
-    table: PageTable
-    wide: PageTable
+    table: PrintedTable
+    row_data: tuple[str, ...]
+    wide: PrintedTable
 
 
 def results(material: Material) -> Results:
-    """Return the table as the terminal has it, each row with its JSON, and the table of all columns."""
-    narrow = lay_out(material.table)
+    """Return the table as the terminal has it, and with all columns."""
     rows = tuple(json.dumps(row.to_dict(), ensure_ascii=False) for row in material.table.rows)
-    caption = "Success by task, policy and K (actions executed per inference)"
-    return Results(
-        same=narrow.sentence,
-        table=replace(printed_on_page(narrow, caption), row_data=rows),
-        wide=printed_on_page(lay_out(material.table, wide=True), "Every column"),
-    )
-
-
-class SideSection(NamedTuple):
-    """A table below the results: not of measured rows. Without rows it has notes only."""
-
-    title: str
-    table: PageTable | None
-    notes: tuple[str, ...]
-
-
-def side_sections(table: Table, *, published: str | None) -> tuple[SideSection, ...]:
-    """Return the tables that `mikasa-vla report` prints below the success table."""
-    return tuple(
-        SideSection(side.title, printed_on_page(side, side.title) if side.rows else None, tuple(side.notes))
-        for side in side_tables(table, published=published)
-    )
-
-
-def printed_on_page(table: PrintedTable, caption: str | None) -> PageTable:
-    """Return a table for reading as the templates take it."""
-    return PageTable(
-        columns=tuple(Column(one.title, "number" if one.is_number else "text") for one in table.columns),
-        rows=tuple(map(tuple, table.rows)),
-        caption=caption,
-    )
+    return Results(lay_out(material.table), rows, lay_out(material.table, wide=True))
 
 
 def success_plots(material: Material) -> Plots:
@@ -121,7 +80,11 @@ def success_plots(material: Material) -> Plots:
             )
             for row in material.rows_of(task)
         ]
-        described = "; ".join(f"{bar.label}: {_rate(bar.value)} ({_interval(bar)})" for bar in bars)
+        described = "; ".join(
+            f"{bar.label}: {_rate(bar.value)} "
+            + ("(no interval)" if bar.low is None else f"({bar.low:.2f} to {bar.high:.2f})")
+            for bar in bars
+        )
         title = f"{task}: success once"
         charts.append(forest(bars, title=title, description=described, label_px=label_px))
     return Plots(legend=_reference_signs(), charts=tuple(charts))
@@ -129,7 +92,7 @@ def success_plots(material: Material) -> Plots:
 
 def chunk_plots(material: Material) -> Plots:
     """Draw success against n_action_steps, with lines of chance and ceiling."""
-    charts: list[Chart] = []
+    charts: list[Curves] = []
     colors: dict[str, int] = {}
     for task in material.tasks:
         rows = [row for row in material.rows_of(task) if row[SUCCESS].success_once is not None]
@@ -143,32 +106,32 @@ def chunk_plots(material: Material) -> Plots:
                 f"{material.name_of(row)}: {_rate(row[SUCCESS].success_once)}" for row in own
             )
             charts.append(
-                curves(
-                    _by_chunk(material, own),
+                Curves(
+                    series=_by_chunk(material, own),
                     title=f"{task}: success against K" + (f", {variant}" if variant else ""),
                     description=described,
                     x_title="K, actions executed per inference",
                     x_ticks=sizes,
                 )
             )
-    return Plots(legend=(*_signs(colors, is_line=False), *_reference_signs()), charts=tuple(charts))
+    return Plots(
+        legend=(*_signs(colors, is_line=False), *_reference_signs()), charts=tuple(map(curves, charts))
+    )
 
 
-def chunk_sweep(material: Material) -> Sweep:
-    """Return the comparison of chunk lengths on the same episodes."""
+def chunk_sweep(material: Material) -> PrintedTable | str:
+    """Return the comparison of chunk lengths on the same episodes; if there is none, why."""
     try:
-        sweep = compare_runs(material.runs)
+        table = sweep_table(compare_runs(material.runs))
     except ReportError as exc:
-        return Sweep(table=None, refusal=str(exc))
-    table = sweep_table(sweep)
+        return str(exc)
     # On the page, all columns from the episodes on are aligned to the right, intervals included.
     n_texts = table.titles.index("episodes")
     columns = (replace(one, is_number=one.is_number or i >= n_texts) for i, one in enumerate(table.columns))
-    shown = replace(table, columns=tuple(columns))
-    return Sweep(table=printed_on_page(shown, None), notes=tuple(table.notes))
+    return replace(table, columns=tuple(columns))
 
 
-def paired_table(material: Material) -> PageTable | None:
+def paired_table(material: Material) -> PrintedTable | None:
     """Return the counts of each policy against each baseline; None if none is compared."""
     rows = []
     for row in material.table.rows:
@@ -194,9 +157,12 @@ def paired_table(material: Material) -> PageTable | None:
 
 def steps_plots(material: Material) -> Plots:
     """Draw the time to success: the share of episodes that have succeeded by each step."""
-    charts: list[Chart] = []
+    charts: list[Curves] = []
     colors: dict[str, int] = {}
-    for task, size, variant in _settings(material):
+    settings = {(row.task, row.n_action_steps, row.variant) for row in material.table.rows}
+    # By task, then by K.
+    order = sorted(settings, key=lambda one: (material.tasks.index(one[0]), one[1], one[2] or ""))
+    for task, size, variant in order:
         rows = [
             row
             for row in material.rows_of(task)
@@ -210,15 +176,15 @@ def steps_plots(material: Material) -> Plots:
         colors |= {row.policy: material.colors[row.policy] for row in rows}
         means = "; ".join(f"{material.name_of(row)}: {_steps(row)}" for row in rows)
         charts.append(
-            curves(
-                series,
+            Curves(
+                series=series,
                 title=f"{task}, K={size}" + (f", {variant}" if variant else ""),
                 description=f"Mean steps until success: {means}",
                 x_title="control step",
                 x_ticks=_round_ticks(horizon),
             )
         )
-    return Plots(legend=_signs(colors, is_line=True), charts=tuple(charts))
+    return Plots(legend=_signs(colors, is_line=True), charts=tuple(map(curves, charts)))
 
 
 def _signs(colors: dict[str, int], *, is_line: bool) -> tuple[Sign, ...]:
@@ -227,12 +193,6 @@ def _signs(colors: dict[str, int], *, is_line: bool) -> tuple[Sign, ...]:
 
 def _reference_signs() -> tuple[Sign, ...]:
     return tuple(Sign(name, reference_sign(name)) for name in ("chance", "ceiling"))
-
-
-def _settings(material: Material) -> list[tuple[str, int, str | None]]:
-    """Return each task, K and variant once: by task, then by K."""
-    found = {(row.task, row.n_action_steps, row.variant) for row in material.table.rows}
-    return sorted(found, key=lambda one: (material.tasks.index(one[0]), one[1], one[2] or ""))
 
 
 def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
@@ -279,14 +239,8 @@ def _cumulative(material: Material, row: Row, horizon: int) -> Series:
     return Series(name=row.policy, color=material.colors[row.policy], points=tuple(points), is_step=True)
 
 
-def _interval(bar: Bar) -> str:
-    return (
-        f"{bar.low:.2f} to {bar.high:.2f}" if bar.low is not None and bar.high is not None else "no interval"
-    )
-
-
 def _rate(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{value:.2f}"
+    return UNDEFINED if value is None else f"{value:.2f}"
 
 
 def _steps(row: Row) -> str:
@@ -300,4 +254,4 @@ def _chance(row: Row) -> float | None:
 
 
 def _p(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{value:.3g}"
+    return UNDEFINED if value is None else f"{value:.3g}"

@@ -1,14 +1,9 @@
-"""Tables as the page's templates show them. Knows nothing of results or of HTML."""
+"""Tables and matrices of the page. Knows nothing of results or of HTML."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-UNKNOWN = "—"
-LONGEST_WORD = 30  # characters: a cell with more is prose, and may be broken into lines
-
-ColumnKind = Literal["text", "number", "code"]
-
+from vla_eval.results.printed_table import Column, PrintedTable
 
 DARKEST = 0.65
 """Opacity of the most frequent cell of a matrix: text stays legible on it, in light and in dark."""
@@ -22,34 +17,29 @@ class MatrixCell(NamedTuple):
     is_right: bool
 
 
-class Column(NamedTuple):
-    """A column: its title, and the style of its cells."""
+class Matrix(NamedTuple):
+    """Counts by two choices: the names of rows and columns, and the cells of each row."""
 
     title: str
-    kind: ColumnKind = "text"
-
-    def css_class(self, cell: str) -> str | None:
-        """Return the class of one of its cells."""
-        if self.kind == "number":
-            return "number"
-        return "prose" if self.kind == "code" or len(cell) > LONGEST_WORD else None
+    names: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[MatrixCell, ...], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PageTable:
-    """A table whose first column names its rows.
+def shaded(
+    counts: Sequence[Sequence[int]], is_right: Callable[[int, int], bool]
+) -> tuple[tuple[MatrixCell, ...], ...]:
+    """Return the cells of a matrix of counts, the most frequent one the darkest.
 
-    Attributes:
-        columns: at least one.
-        rows: the cells of each row, as many as there are columns.
-        caption: what the table shows, for screen readers.
-        row_data: for each row its data as JSON; may be empty.
+    Args:
+        counts: of each row; one of them is above 0.
+        is_right: whether the cell of this row and column is outlined as right.
     """
-
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str | None = None
-    row_data: tuple[str, ...] = ()
+    most = max(map(max, counts))
+    return tuple(
+        tuple(MatrixCell(n, DARKEST * n / most, is_right(y, x)) for x, n in enumerate(row))
+        for y, row in enumerate(counts)
+    )
 
 
 def page_table(
@@ -58,15 +48,11 @@ def page_table(
     text: Sequence[str] = (),
     numbers: Sequence[str] = (),
     code: Sequence[str] = (),
-    caption: str | None = None,
-) -> PageTable:
-    """Return a table with columns of text first, then numbers, then code, by their titles."""
-    return PageTable(
-        columns=(
-            *(Column(title) for title in text),
-            *(Column(title, "number") for title in numbers),
-            *(Column(title, "code") for title in code),
-        ),
-        rows=tuple(tuple(row) for row in rows),
-        caption=caption,
-    )
+) -> PrintedTable:
+    """Return a table of these cells, with columns of text first, then numbers, then code, by their titles."""
+    columns = [
+        *(Column(title, str, False) for title in text),
+        *(Column(title, str) for title in numbers),
+        *(Column(title, str, False, is_code=True) for title in code),
+    ]
+    return PrintedTable(columns=columns, rows=rows)

@@ -3,21 +3,14 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import compress
 
-from vla_eval.probe.interventions import SWAPS, World
 from vla_eval.probe.quantities import Pair, follows, pair_up
 from vla_eval.probe.world_records import Worlds, compared_with
+from vla_eval.probe.worlds import SWAPS, World
 from vla_eval.tasks.objects.item_names import item_names
 
 NO_CHOICE = "none"
-
-
-class ChoicePair(NamedTuple):
-    """The first choices in the world as drawn and in the other one; None where nothing was touched."""
-
-    drawn: int | None
-    other: int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,8 +21,8 @@ class ChoicePairs:
         world: the other world.
         policy, n_action_steps: whose pairs they are.
         names: of the candidates, by index, and `NO_CHOICE` last.
-        counts: how many pairs have these choices; those without a pair are left out.
-        following: choices of pairs that follow the cue in both worlds.
+        counts: by the indices of the choices in `names`, in the world as drawn and in the other one: how many
+            pairs have these choices, and how many of them follow the cue in both worlds.
         pairs: the pairs themselves, by run and seed.
     """
 
@@ -37,21 +30,9 @@ class ChoicePairs:
     policy: str
     n_action_steps: int
     names: tuple[str, ...]
-    counts: Mapping[ChoicePair, int]
-    following: frozenset[ChoicePair]
+    counts: Mapping[tuple[int, int], int]
+    following: Mapping[tuple[int, int], int]
     pairs: tuple[Pair, ...]
-
-    def count(self, row: int, column: int) -> int:
-        """Return the number of pairs by the indices of `names`."""
-        return self.counts.get(self._choices(row, column), 0)
-
-    def is_right(self, row: int, column: int) -> bool:
-        """Whether some pair with these choices follows the cue in both worlds."""
-        return self._choices(row, column) in self.following
-
-    def _choices(self, row: int, column: int) -> ChoicePair:
-        last = len(self.names) - 1
-        return ChoicePair(None if row == last else row, None if column == last else column)
 
 
 def choice_pairs(worlds: Worlds, policy: str, n_action_steps: int) -> list[ChoicePairs]:
@@ -65,20 +46,22 @@ def choice_pairs(worlds: Worlds, policy: str, n_action_steps: int) -> list[Choic
         n_candidates = max((pair.drawn.n_candidates or 0 for pair in pairs), default=0)
         if not n_candidates:
             continue
-        followed = [pair for pair in pairs if follows(pair.drawn) and follows(pair.other)]
+        # `NO_CHOICE` follows the candidates.
+        drawn, other = (
+            [n_candidates if one.first_choice is None else one.first_choice for one in own]
+            for own in zip(*pairs, strict=True)
+        )
+        choices = list(zip(drawn, other, strict=True))
+        followed = [follows(pair.drawn) and follows(pair.other) for pair in pairs]
         found.append(
             ChoicePairs(
                 world=world,
                 policy=policy,
                 n_action_steps=n_action_steps,
                 names=(*item_names(world.task, n_candidates), NO_CHOICE),
-                counts=Counter(map(_choices, pairs)),
-                following=frozenset(map(_choices, followed)),
+                counts=Counter(choices),
+                following=Counter(compress(choices, followed)),
                 pairs=tuple(pairs),
             )
         )
     return found
-
-
-def _choices(pair: Pair) -> ChoicePair:
-    return ChoicePair(pair.drawn.first_choice, pair.other.first_choice)

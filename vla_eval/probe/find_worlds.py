@@ -1,38 +1,30 @@
-"""Find the worlds of probes and grids among run folders: their names say what was changed.
+"""Find the worlds of probes and grids among run folders; a probe is the worlds of one folder.
 
-A probe is the worlds of one folder. Knows nothing of statistics.
+Which world a run is of is stated by the name in its `run.json`, whatever the folder is called.
 """
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.probe.grid import GridWorld
-from vla_eval.probe.interventions import PROBES, Intervention, Level, World
-from vla_eval.probe.phases import fixed_phases
+from vla_eval.probe.choice_pairs import ChoicePairs, choice_pairs
+from vla_eval.probe.grid import GridWorld, named_grid_world
+from vla_eval.probe.grid_table import GridTable, grid_table
+from vla_eval.probe.interventions import INTERVENTIONS, named_world
+from vla_eval.probe.table import ProbeTable, policy_order, probe_table
+from vla_eval.probe.world_records import by_policy
+from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.results.grouping import config_names
 from vla_eval.storage.run_folder import StoredRun
-from vla_eval.tasks.catalog import TASKS, task_spec
-
-_INTERVENTIONS: tuple[Intervention, ...] = ("none", *PROBES)
-_GRID_NAME = re.compile(r"grid_(?P<axis>delay|cue)_(?P<level>\d+)_from_(?P<first>\d+)")
+from vla_eval.tasks.catalog import TASKS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FoundWorld:
-    """A world of a probe, and its run folder."""
+class Found[W]:
+    """A world, and its run folder."""
 
-    world: World
-    run: StoredRun
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoundGridWorld:
-    """A world of a grid, and its run folder."""
-
-    world: GridWorld
+    world: W
     run: StoredRun
 
 
@@ -42,15 +34,37 @@ class FoundProbe:
 
     Attributes:
         folder: where their run folders are.
-        worlds: of tasks whose world as drawn is there, too: by task, then in the order of `PROBES`.
+        worlds: of tasks whose world as drawn is there, too: by task, then in the order of `INTERVENTIONS`.
         grid: of a grid.
         doubles: notes on run folders that have the name of another one, and are left out.
     """
 
     folder: Path
-    worlds: tuple[FoundWorld, ...]
-    grid: tuple[FoundGridWorld, ...]
+    worlds: tuple[Found[World], ...]
+    grid: tuple[Found[GridWorld], ...]
     doubles: tuple[str, ...]
+
+    def table(self) -> ProbeTable:
+        """Return the table of the worlds, as `mikasa-vla probe` prints it."""
+        order = policy_order([one.run for one in self.worlds])
+        return probe_table(
+            [one.world for one in self.worlds], [one.run.records for one in self.worlds], order=order
+        )
+
+    def grid_table(self) -> GridTable:
+        """Return the table of the grid, as `mikasa-vla probe --grid` prints it."""
+        return grid_table([one.world for one in self.grid], [one.run.records for one in self.grid])
+
+    def pairs(self) -> list[ChoicePairs]:
+        """Return the pairs by choice of each policy: by task, then in the order of the policies."""
+        order = policy_order([one.run for one in self.worlds])
+        found = []
+        for task in dict.fromkeys(one.world.task for one in self.worlds):
+            own = [(one.world, by_policy(one.run.records)) for one in self.worlds if one.world.task == task]
+            keys = dict.fromkeys(key for _, records in own for key in records)
+            for policy, k in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
+                found += choice_pairs(own, policy, k)
+        return found
 
 
 def find_probes(runs: Sequence[StoredRun]) -> list[FoundProbe]:
@@ -67,10 +81,11 @@ def _probe(folder: Path, runs: Sequence[StoredRun]) -> FoundProbe:
     for run in runs:
         first.setdefault(run.description.name, run)
     doubles = [run for run in runs if run is not first[run.description.name]]
+    grid = _found(first.values(), named_grid_world)
     return FoundProbe(
         folder=folder,
-        worlds=_worlds(tuple(first.values())),
-        grid=_grid(tuple(first.values())),
+        worlds=_with_drawn(_found(first.values(), named_world)),
+        grid=tuple(sorted(grid, key=lambda one: one.world.place)),
         doubles=tuple(
             f"{run.path}: it has the name of {first[run.description.name].path}, and is not in this section."
             for run in doubles
@@ -78,79 +93,36 @@ def _probe(folder: Path, runs: Sequence[StoredRun]) -> FoundProbe:
     )
 
 
-def _worlds(runs: Sequence[StoredRun]) -> tuple[FoundWorld, ...]:
-    found: dict[tuple[str, Intervention, Level], FoundWorld] = {}
+def _found[W](runs: Iterable[StoredRun], named: Callable[[str, str, EvalConfig], W | None]) -> list[Found[W]]:
+    """Return the runs whose names, after that of their only task, are those of worlds."""
+    found = []
     for run in runs:
-        world = _world(run)
-        if world is not None:
-            found[world.task, world.intervention, world.level] = FoundWorld(world=world, run=run)
+        tasks, name = config_names(run, "tasks"), run.description.name
+        if len(tasks) != 1 or tasks[0] not in TASKS or not name.startswith(f"{tasks[0]}_"):
+            continue
+        env = run.description.config.get("env")
+        config = EvalConfig(  # the part that the table of a probe needs
+            name=name,
+            tasks=tasks,
+            policies=config_names(run, "policies"),
+            env=dict(env) if isinstance(env, dict) else {},
+        )
+        world = named(tasks[0], name.removeprefix(f"{tasks[0]}_"), config)
+        found += [] if world is None else [Found(world=world, run=run)]
+    return found
+
+
+def _with_drawn(found: Sequence[Found[World]]) -> tuple[Found[World], ...]:
+    """Return the worlds of the tasks that have others than the one as drawn, and that one, too."""
+    drawn = {one.world.task for one in found if one.world.intervention == AS_DRAWN}
     # A single world is an evaluation like any other.
-    tasks = dict.fromkeys(
-        task for task, intervention, _ in found if intervention != "none" and (task, "none", None) in found
-    )
-    ranks = {task: rank for rank, task in enumerate(tasks)}
-    own = [one for (task, _, _), one in found.items() if task in ranks]
+    tasks = [one.world.task for one in found if one.world.intervention != AS_DRAWN]
+    ranks = {task: rank for rank, task in enumerate(dict.fromkeys(tasks)) if task in drawn}
+    own = [one for one in found if one.world.task in ranks]
     return tuple(sorted(own, key=lambda one: (ranks[one.world.task], *_rank(one.world))))
 
 
 def _rank(world: World) -> tuple[int, int, str]:
     level = world.level
     number = level if isinstance(level, int) else 0
-    return _INTERVENTIONS.index(world.intervention), number, str(level)
-
-
-def _world(run: StoredRun) -> World | None:
-    """Return the world that a run folder is of; None if its name is not that of one."""
-    task, rest = _task_and_rest(run)
-    if task is None:
-        return None
-    for intervention in sorted(_INTERVENTIONS, key=len, reverse=True):  # `delay_swap` before `delay`
-        if rest == intervention or rest.startswith(f"{intervention}_"):
-            level = rest.removeprefix(intervention).removeprefix("_")
-            return World(task=task, intervention=intervention, level=_level(level), config=_config(run, task))
-    return None
-
-
-def _level(text: str) -> Level:
-    return None if not text else int(text) if text.isdecimal() else text
-
-
-def _grid(runs: Sequence[StoredRun]) -> tuple[FoundGridWorld, ...]:
-    found: dict[tuple[str, str, int, int], FoundGridWorld] = {}
-    for run in runs:
-        task, rest = _task_and_rest(run)
-        named = _GRID_NAME.fullmatch(rest)
-        if task is None or named is None:
-            continue
-        config = _config(run, task)
-        world = GridWorld(
-            task=task,
-            axis="delay" if named["axis"] == "delay" else "cue",
-            level=int(named["level"]),
-            first_inference_step=int(named["first"]),
-            phases=fixed_phases(task_spec(task), config.env),
-            config=config,
-        )
-        key = (task, world.axis, world.level, world.first_inference_step)
-        found[key] = FoundGridWorld(world=world, run=run)
-    return tuple(found[key] for key in sorted(found))
-
-
-def _task_and_rest(run: StoredRun) -> tuple[str | None, str]:
-    """Return the task of a run that has just one, and what follows it in the run's name."""
-    tasks = config_names(run, "tasks")
-    name = run.description.name
-    if len(tasks) != 1 or tasks[0] not in TASKS or not name.startswith(f"{tasks[0]}_"):
-        return None, ""
-    return tasks[0], name.removeprefix(f"{tasks[0]}_")
-
-
-def _config(run: StoredRun, task: str) -> EvalConfig:
-    """Return the part of the configuration that the table of a probe needs."""
-    env = run.description.config.get("env")
-    return EvalConfig(
-        name=run.description.name,
-        tasks=(task,),
-        policies=config_names(run, "policies"),
-        env=dict(env) if isinstance(env, dict) else {},
-    )
+    return [AS_DRAWN, *INTERVENTIONS].index(world.intervention), number, str(level)

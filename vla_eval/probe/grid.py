@@ -4,6 +4,8 @@ Where K does not divide the phases, how much of the cue falls between two infere
 first one is. So every first inference below K is run there. Knows nothing of records or statistics.
 """
 
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -23,13 +25,14 @@ DEFAULT_GRID_CUES = (1, 2, 3, 5)
 
 ORACLE = "oracle"
 CUE_READER = "cue_reader"
+_NAME = re.compile(r"grid_(?P<axis>delay|cue)_(?P<level>\d+)_from_(?P<first>\d+)")  # after the task
 CONTROLS = (ORACLE, CUE_READER)
 """Arms that forget nothing: one knows the cue in any case, one only from the frames of its inferences."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridSettings:
-    """What a grid goes over, beside the chunk lengths of the evaluation.
+    """What a grid varies, in addition to the chunk lengths of the evaluation.
 
     Attributes:
         axes: which phases get other lengths.
@@ -65,6 +68,26 @@ class GridWorld:
     first_inference_step: int
     phases: Phases
     config: EvalConfig
+
+    @property
+    def place(self) -> tuple[str, str, int, int]:
+        """What distinguishes it from the other worlds of a grid."""
+        return self.task, self.axis, self.level, self.first_inference_step
+
+
+def named_grid_world(task: str, name: str, config: EvalConfig) -> GridWorld | None:
+    """Return the world that is called so, after its task; None if it is not the name of one."""
+    named = _NAME.fullmatch(name)
+    if named is None:
+        return None
+    return GridWorld(
+        task=task,
+        axis="delay" if named["axis"] == "delay" else "cue",
+        level=int(named["level"]),
+        first_inference_step=int(named["first"]),
+        phases=fixed_phases(task_spec(task), config.env),
+        config=config,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,8 +127,7 @@ def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
         if spec.candidates is None:
             left_out.append(f"{spec.id}: it has no phases")
             continue
-        of_task = _Task(spec=spec, config=config, settings=settings)
-        found = [world for axis in settings.axes for world in of_task.worlds(axis)]
+        found = [world for axis in settings.axes for world in _worlds(spec, config, settings, axis)]
         worlds += found
         if not found:
             left_out.append(f"{spec.id}: no K has one of these first inferences")
@@ -119,46 +141,34 @@ def first_inferences(phases: Phases, n_action_steps: int) -> tuple[int, ...]:
     return (0,) if divides(phases, n_action_steps) else tuple(range(n_action_steps))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Task:
-    """One task of a grid."""
-
-    spec: TaskSpec
-    config: EvalConfig
-    settings: GridSettings
-
-    def worlds(self, axis: Axis) -> list[GridWorld]:
-        """Return the evaluations with other lengths of one phase."""
-        usual = fixed_phases(self.spec, self.config.env)
-        sizes = self.config.n_action_steps or DEFAULT_N_ACTION_STEPS
-        wanted = self.settings.first_inferences
-        worlds = []
-        for level in self.settings.delays if axis == "delay" else self.settings.cues:
-            env = {**self.config.env, **usual.with_length(axis, level)}
-            phases = fixed_phases(self.spec, env)
-            firsts = {k: first_inferences(phases, k) for k in sizes}
-            for first in range(max(sizes)):
-                own = tuple(k for k in sizes if first in firsts[k])
-                if own and (not wanted or first in wanted):
-                    shared = replace(self.config, n_action_steps=own, env=env)
-                    worlds.append(self._world(axis, level, first, phases, shared))
-        return worlds
-
-    def _world(self, axis: Axis, level: int, first: int, phases: Phases, shared: EvalConfig) -> GridWorld:
-        policies = shared.policies
-        controls = CONTROLS if self.settings.controls else ()
-        config = replace(
-            shared,
-            name=f"{self.spec.id}_grid_{axis}_{level}_from_{first}",
-            tasks=(self.spec.id,),
-            policies=(*policies, *(control for control in controls if control not in policies)),
-            chunking=replace(shared.chunking, first_inference_step=first),
-        )
-        return GridWorld(
-            task=self.spec.id,
-            axis=axis,
-            level=level,
-            first_inference_step=first,
-            phases=phases,
-            config=config,
-        )
+def _worlds(spec: TaskSpec, config: EvalConfig, settings: GridSettings, axis: Axis) -> Iterator[GridWorld]:
+    """Yield the evaluations of a task with other lengths of one phase."""
+    usual = fixed_phases(spec, config.env)
+    sizes = config.n_action_steps or DEFAULT_N_ACTION_STEPS
+    controls = CONTROLS if settings.controls else ()
+    policies = (*config.policies, *(control for control in controls if control not in config.policies))
+    for level in settings.delays if axis == "delay" else settings.cues:
+        env = {**config.env, **usual.with_length(axis, level)}
+        phases = fixed_phases(spec, env)
+        firsts = {k: first_inferences(phases, k) for k in sizes}
+        for first in range(max(sizes)):
+            own = tuple(k for k in sizes if first in firsts[k])
+            if not own or (settings.first_inferences and first not in settings.first_inferences):
+                continue
+            of_world = replace(
+                config,
+                name=f"{spec.id}_grid_{axis}_{level}_from_{first}",
+                tasks=(spec.id,),
+                policies=policies,
+                n_action_steps=own,
+                env=env,
+                chunking=replace(config.chunking, first_inference_step=first),
+            )
+            yield GridWorld(
+                task=spec.id,
+                axis=axis,
+                level=level,
+                first_inference_step=first,
+                phases=phases,
+                config=of_world,
+            )

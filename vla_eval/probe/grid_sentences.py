@@ -1,8 +1,7 @@
 """What a grid says, in words: which drops chunk and phase explain, and which they do not."""
 
-from collections.abc import Sequence
-
 from vla_eval.probe.grid_table import GridCell, GridTable
+from vla_eval.probe.text_table import error_notes
 
 
 def grid_sentences(table: GridTable) -> list[str]:
@@ -31,21 +30,17 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
         f"{cell.policy} on {cell.task} succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at "
         f"{_where(best)}"
     )
-    same = f"{now.policy}, which has the same inferences and forgets nothing, "
+    rates = f"succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase"
     if not _is_below(now, at_best):
-        return (
-            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase do not explain "
-            "the drop."
+        said = f"{rates} do not explain the drop"
+    elif _is_below(cell, now):
+        said = f"{rates} explain a part of the drop, not all of it"
+    else:
+        said = (
+            f"falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the drop, not "
+            "memory"
         )
-    if _is_below(cell, now):
-        return (
-            f"{drop}; {same}succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase explain a part of "
-            "the drop, not all of it."
-        )
-    return (
-        f"{drop}; {same}falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the "
-        "drop, not memory."
-    )
+    return f"{drop}; {now.policy}, which has the same inferences and forgets nothing, {said}."
 
 
 def _is_below(one: GridCell, other: GridCell) -> bool:
@@ -64,7 +59,7 @@ def _rate(cell: GridCell) -> str:
 
 
 def grid_notes(table: GridTable) -> list[str]:
-    """Return what a reader of the table has to know, errors included."""
+    """Return the notes that a reader of the table needs, errors included."""
     found = [
         "Success once, over all first inferences; 95 % intervals (Wilson) count a seed as one episode. cue "
         "frames: how many the policy is given (oracle reads the true state). late: steps of the response "
@@ -77,14 +72,8 @@ def grid_notes(table: GridTable) -> list[str]:
             "Same inferences: cue_reader for a policy that reads only the last frame (it knows what was in "
             "view at its own inferences, and guesses the rest); oracle for one that reads every frame."
         )
-    found += _unknown(table.cells)
-    if table.n_errors:
-        found.append(
-            f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
-        )
-    return found
-
-
-def _unknown(cells: Sequence[GridCell]) -> list[str]:
-    names = dict.fromkeys(cell.policy for cell in cells if any(part.n_seen is None for part in cell.parts))
-    return [f"{name}: no episode has a result, so that what it reads is not known." for name in names]
+    unknown = dict.fromkeys(
+        cell.policy for cell in table.cells if any(part.n_seen is None for part in cell.parts)
+    )
+    found += [f"{name}: no episode has a result, so that what it reads is not known." for name in unknown]
+    return [*found, *error_notes(table.n_errors)]

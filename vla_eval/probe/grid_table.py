@@ -1,15 +1,18 @@
 """The table of a grid, from its run folders: a cell per policy, K and length, over all first inferences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.probe.grid import CUE_READER, ORACLE, Axis, GridWorld
+from vla_eval.probe.grid import CONTROLS, CUE_READER, ORACLE, Axis, GridWorld
 from vla_eval.probe.phases import Inferences, inferences
 from vla_eval.probe.quantities import Share, follows, wilson_of_rate
+from vla_eval.probe.world_records import Records, by_policy, results_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import Interval
 from vla_eval.storage.run_folder import read_run
+
+_Run = tuple[GridWorld, Records]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,61 +114,52 @@ def grid_table(worlds: Sequence[GridWorld], records: Sequence[Sequence[EpisodeRe
     """
     found: dict[tuple[str, Axis], list[_Run]] = {}
     for world, own in zip(worlds, records, strict=True):
-        found.setdefault((world.task, world.axis), []).append(_Run(world=world, records=own))
+        found.setdefault((world.task, world.axis), []).append((world, by_policy(own)))
     return GridTable(cells=tuple(cell for runs in found.values() for cell in _cells(runs)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Run:
-    world: GridWorld
-    records: Sequence[EpisodeRecord]
-
-    def of(self, policy: str, k: int) -> list[EpisodeRecord]:
-        return [r for r in self.records if (r.policy, r.n_action_steps) == (policy, k)]
 
 
 def _cells(runs: Sequence[_Run]) -> list[GridCell]:
     """Return the cells of one task and phase."""
-    policies = list(dict.fromkeys(record.policy for run in runs for record in run.records))
-    sizes = sorted({record.n_action_steps for run in runs for record in run.records})
-    levels = dict.fromkeys(run.world.level for run in runs)
-    reads_every = {policy: _reads_every(runs, policy) for policy in policies}
+    keys = dict.fromkeys(key for _, found in runs for key in found)
+    policies = list(dict.fromkeys(policy for policy, _ in keys))
+    levels = dict.fromkeys(world.level for world, _ in runs)
     cells = []
-    for policy in sorted(policies, key=lambda name: (name in (ORACLE, CUE_READER), policies.index(name))):
-        for k in sizes:
+    for policy in sorted(policies, key=lambda name: (name in CONTROLS, policies.index(name))):
+        every = _reads_every(
+            [record for _, found in runs for key in found if key[0] == policy for record in found[key]]
+        )
+        # The control that has the same inferences and forgets nothing.
+        control = ORACLE if every else CUE_READER
+        is_known = every is not None and policy not in CONTROLS and control in policies
+        for k in sorted({k for _, k in keys}):
             for level in levels:
-                own = [run for run in runs if run.world.level == level and run.of(policy, k)]
+                own = [
+                    (world, found) for world, found in runs if world.level == level and (policy, k) in found
+                ]
                 if own:
-                    cells.append(_cell(own, policy, k, reads_every, policies))
+                    cells.append(_cell(own, policy, k, every, control if is_known else None))
     return cells
 
 
-def _reads_every(runs: Sequence[_Run], policy: str) -> bool | None:
-    """Return whether a policy is given every frame; None while no record tells.
+def _reads_every(records: Sequence[EpisodeRecord]) -> bool | None:
+    """Return whether a policy is given every frame; None while no record shows it.
 
     With one inference per frame both are the same.
     """
     known = [
         (record.n_frames, record.n_inferences)
-        for run in runs
-        for record in run.records
-        if record.policy == policy and record.n_frames is not None and record.n_inferences is not None
+        for record in records
+        if record.n_frames is not None and record.n_inferences is not None
     ]
     return any(n_frames > n_inferences for n_frames, n_inferences in known) if known else None
 
 
 def _cell(
-    runs: Sequence[_Run],
-    policy: str,
-    k: int,
-    reads_every: Mapping[str, bool | None],
-    policies: Sequence[str],
+    runs: Sequence[_Run], policy: str, k: int, reads_every: bool | None, reference: str | None
 ) -> GridCell:
-    world, every = runs[0].world, reads_every[policy]
-    results = [record for run in runs for record in run.of(policy, k) if record.outcome != "error"]
+    world = runs[0][0]
+    results = [record for _, found in runs for record in results_of(found[policy, k])]
     chances = {record.chance_success for record in results}
-    reference = ORACLE if every else CUE_READER
-    is_control = policy in (ORACLE, CUE_READER)
     return GridCell(
         task=world.task,
         axis=world.axis,
@@ -173,23 +167,22 @@ def _cell(
         policy=policy,
         n_action_steps=k,
         n_cue_frames=world.phases.n_in_turn * world.phases.cue_steps,
-        parts=tuple(_part(run, run.of(policy, k), k, every) for run in runs),
+        parts=tuple(_part(one, found[policy, k], k, reads_every) for one, found in runs),
         n_seeds=len({(record.run, record.seed) for record in results}),
         chance=chances.pop() if len(chances) == 1 else None,
-        reference=None if is_control or every is None or reference not in policies else reference,
+        reference=reference,
     )
 
 
-def _part(run: _Run, records: Sequence[EpisodeRecord], k: int, reads_every: bool | None) -> GridPart:
-    results = [record for record in records if record.outcome != "error"]
-    phases, first = run.world.phases, run.world.first_inference_step
-    found = inferences(phases, k, first_inference_step=first)
-    n_frames = phases.n_in_turn * phases.cue_steps
+def _part(world: GridWorld, records: Sequence[EpisodeRecord], k: int, reads_every: bool | None) -> GridPart:
+    results = results_of(records)
+    found = inferences(world.phases, k, first_inference_step=world.first_inference_step)
+    n_frames = world.phases.n_in_turn * world.phases.cue_steps
     return GridPart(
-        first_inference_step=first,
+        first_inference_step=world.first_inference_step,
         inferences=found,
         n_seen=None if reads_every is None else n_frames if reads_every else len(found.cue_steps),
-        success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
-        followed=Share(sum(map(follows, results)), len(results)) if results else None,
+        success=Share.of_records(results, lambda record: bool(record.success_once)),
+        followed=Share.of_records(results, follows),
         n_errors=len(records) - len(results),
     )

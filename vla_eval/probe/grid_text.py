@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_table import GridCell, GridPart, GridTable
-from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate
+from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
 from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
@@ -88,10 +88,7 @@ def _json_part(part: GridPart) -> JsonRow:
         "n_cue_frames_seen": part.n_seen,
         "n_late_steps": part.inferences.n_late,
         "n_episodes": success.of if success else 0,
-        "n_success_once": success.n if success else None,
-        "success_once": success.rate if success else None,
-        "ci_low": success.interval.low if success else None,
-        "ci_high": success.interval.high if success else None,
+        **success_json(success),
         "n_follows": followed.n if followed else None,
         "n_errors": part.n_errors,
     }

@@ -3,9 +3,9 @@
 Pure functions of records. Records of earlier versions lack the touches: then all of it is undefined (None).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from vla_eval.results.estimates import Interval
 from vla_eval.tasks.spec import TaskSpec
 
 MistakeKind = Literal["order", "place", "identity"]
-MISTAKES: tuple[MistakeKind, ...] = ("order", "place", "identity")
+MISTAKES: tuple[MistakeKind, ...] = get_args(MistakeKind)
 TOLERANCE = 1e-6  # of an item, of the search for the number of items kept
 
 
@@ -30,7 +30,7 @@ class _Touches(NamedTuple):
 
 
 class _Mistake(NamedTuple):
-    """The first mistake of an episode, and how probable it was that a wrong item lies beside a due one."""
+    """The first mistake of an episode, and the probability that a wrong item lies next to a due one."""
 
     kind: MistakeKind
     chance_of_place: float | None
@@ -42,29 +42,22 @@ class Mistakes:
 
     Attributes:
         n_episodes: episodes whose touches are known.
-        n_order: an item that was shown, but out of turn.
-        n_place: an item that was not shown, at a place beside that of one that was due.
-        n_identity: another item that was not shown.
-        expected_place: so many of the last two kinds would be beside a due item if the wrong items were drawn
-            at random; None where the items are places themselves.
+        counts: by kind. `order`: an item that was shown, but out of turn; `place`: one that was not shown, at
+            a place next to that of one that was due; `identity`: another one that was not shown.
+        expected_place: so many of the last two kinds would be next to a due item if the wrong items were
+            drawn at random; None where the items are places themselves.
         n_incomplete: no mistake, but fewer touches than are right.
     """
 
     n_episodes: int
-    n_order: int
-    n_place: int
-    n_identity: int
+    counts: Mapping[MistakeKind, int]
     expected_place: float | None
     n_incomplete: int
-
-    def count(self, kind: MistakeKind) -> int:
-        """Return the number of mistakes of a kind."""
-        return {"order": self.n_order, "place": self.n_place, "identity": self.n_identity}[kind]
 
     @property
     def n_mistakes(self) -> int:
         """The number of episodes with a mistake."""
-        return sum(map(self.count, MISTAKES))
+        return sum(self.counts.values())
 
 
 class Capacity(NamedTuple):
@@ -84,9 +77,7 @@ def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | Non
     chances = [one.chance_of_place for one in first if one is not None and one.kind != "order"]
     return Mistakes(
         n_episodes=len(known),
-        n_order=kinds.count("order"),
-        n_place=kinds.count("place"),
-        n_identity=kinds.count("identity"),
+        counts={kind: kinds.count(kind) for kind in MISTAKES},
         expected_place=None if spec.cue_marks_place else sum(chance or 0.0 for chance in chances),
         n_incomplete=sum(
             one is None and len(episode.touched) < len(episode.right)
@@ -98,10 +89,10 @@ def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | Non
 def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
     """Return how many items are kept, corrected for guessing.
 
-    Of the first touches, as many as items were shown, some are right. Who keeps k of L items and touches
-    others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The number
-    kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of the
-    bootstrap over episodes.
+    Of the first touches, as many as items were shown, some are right. A policy that keeps k of L items and
+    touches others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The
+    number kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of
+    the bootstrap over episodes.
 
     Returns:
         None if touches are not known, one item is right, or all of them are.
@@ -167,10 +158,7 @@ def _first_mistake(episode: _Touches, spec: TaskSpec) -> _Mistake | None:
         if spec.cue_marks_place:
             return _Mistake("place", None)
         wrong = [i for i in range(episode.n_candidates) if i not in episode.right]
-        beside = [i for i in wrong if _is_beside(i, due, episode.places)]
+        places = episode.places
+        beside = [i for i in wrong if any(abs(places[i] - places[other]) == 1 for other in due)]
         return _Mistake("place" if touched in beside else "identity", len(beside) / len(wrong))
     return None
-
-
-def _is_beside(candidate: int, due: Sequence[int], places: tuple[int, ...]) -> bool:
-    return any(abs(places[candidate] - places[other]) == 1 for other in due)

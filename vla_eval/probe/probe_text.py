@@ -4,11 +4,11 @@ import json
 
 from vla_eval.probe.mistakes import MISTAKES, Mistakes
 from vla_eval.probe.quantities import Share
-from vla_eval.probe.retention import HalfLife, Range
+from vla_eval.probe.retention import Range
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
-from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate
+from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
 from vla_eval.results.estimates import Interval
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
@@ -16,6 +16,7 @@ from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cell
 from vla_eval.results.relative_statistics import SMALLEST_SHOWN_P
 
 PROBE_VERSION = 1
+HALF_LIFE_STATES = {False: "measured", True: "beyond_longest_delay"}
 
 
 def render_probe(table: ProbeTable, fmt: Format) -> str:
@@ -66,13 +67,10 @@ def json_row(row: ProbeRow) -> JsonRow:
         **_json_share("reliability", swap.reliability if swap else None),
         **_json_share("follows", row.followed),
         "n_without_choice": row.n_without_choice,
-        "n_success_once": row.success.n if row.success else None,
-        "success_once": row.success.rate if row.success else None,
-        "ci_low": row.success.interval.low if row.success else None,
-        "ci_high": row.success.interval.high if row.success else None,
+        **success_json(row.success),
         "chance": row.chance,
-        "left": row.left,
-        **_ends("left", row.left_interval),
+        "left": row.left[0] if row.left else None,
+        **_ends("left", row.left[1] if row.left else None),
         "items_kept": row.kept.n_items if row.kept else None,
         **_ends("items_kept", row.kept.interval if row.kept else None),
         **_json_mistakes(row.mistakes),
@@ -87,7 +85,7 @@ def json_row(row: ProbeRow) -> JsonRow:
 def _json_mistakes(found: Mistakes | None) -> JsonRow:
     return {
         "n_with_touches": found.n_episodes if found else None,
-        **{f"n_{kind}_mistakes": found.count(kind) if found else None for kind in MISTAKES},
+        **{f"n_{kind}_mistakes": found.counts[kind] if found else None for kind in MISTAKES},
         "expected_place_mistakes": found.expected_place if found else None,
         "n_incomplete": found.n_incomplete if found else None,
     }
@@ -119,15 +117,9 @@ def _json_retention(curve: Retention) -> JsonRow:
         ],
         "half_life_steps": half.steps if half else None,
         **_ends("half_life_steps", half.interval if half else None),
-        "half_life_state": _state(half),
+        "half_life_state": "undefined" if half is None else HALF_LIFE_STATES[half.steps is None],
         "longest_delay_steps": curve.points[-1].delay_steps,
     }
-
-
-def _state(half: HalfLife | None) -> str:
-    if half is None:
-        return "undefined"
-    return "beyond_longest_delay" if half.steps is None else "measured"
 
 
 def _shown(share: Share | None) -> str:
@@ -138,12 +130,6 @@ def _shown_p(p_value: float | None) -> str:
     if p_value is None:
         return UNDEFINED
     return f"<{SMALLEST_SHOWN_P}" if p_value < SMALLEST_SHOWN_P else f"{p_value:.3f}"
-
-
-def _shown_left(row: ProbeRow) -> str:
-    if row.left is None or row.left_interval is None:
-        return UNDEFINED
-    return shown_rate(row.left, row.left_interval)
 
 
 _COLUMNS: tuple[Column[ProbeRow], ...] = (
@@ -162,7 +148,7 @@ _COLUMNS: tuple[Column[ProbeRow], ...] = (
     Column("follows", lambda row: _shown(row.followed)),
     Column("success once", lambda row: _shown(row.success)),
     Column("chance", lambda row: rate(row.chance), folds=True),
-    Column("left", _shown_left),
+    Column("left", lambda row: shown_rate(*row.left) if row.left else UNDEFINED),
     Column("kept", lambda row: shown_rate(*row.kept) if row.kept else UNDEFINED),
     Column("over delay", lambda row: shown_rate(*row.over_delay[1:]) if row.over_delay else UNDEFINED),
     Column("p", lambda row: _shown_p(row.p_value)),

@@ -1,4 +1,4 @@
-"""What two worlds of the same episodes say of a policy's memory. Pure functions of records.
+"""A policy's memory, from two worlds of the same episodes. Pure functions of records.
 
 An undefined value is None, never 0. `docs/probe.md` defines each quantity; their names are those of the
 Counterfactual Memory Audit (arXiv:2609.27247), the definitions are ours. Knows nothing of files.
@@ -31,6 +31,13 @@ class Share(NamedTuple):
     n: int
     of: int
 
+    @classmethod
+    def of_records(
+        cls, records: Sequence[EpisodeRecord], holds: Callable[[EpisodeRecord], bool]
+    ) -> "Share | None":
+        """Return the share of episodes for which something holds; None without an episode."""
+        return cls(sum(map(holds, records)), len(records)) if records else None
+
     @property
     def rate(self) -> float:
         """The share."""
@@ -53,7 +60,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwapQuantities:
-    """What swapped cues say; `n_follow` and `n_against` are the counts of the sign test.
+    """Quantities of pairs with swapped cues.
 
     Attributes:
         sensitivity: pairs whose choice changes, or what else `change_of` says; None where none is known.
@@ -64,7 +71,6 @@ class SwapQuantities:
         p_value: exact two-sided sign test; None where there is no single right candidate.
     """
 
-    n_pairs: int
     change_of: ChangeOf | None
     sensitivity: Share | None
     actions_changed: Share | None
@@ -97,14 +103,14 @@ def follows(record: EpisodeRecord) -> bool:
 
 
 def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | None:
-    """Return what the pairs of a swapped cue say; None without a pair."""
+    """Return the quantities of the pairs of a swapped cue; None without a pair."""
     if not pairs:
         return None
     n_pairs = len(pairs)
-    moved = None if spec.entry_point in CUE_IN_STATE else _share(pairs, _acts_differently)
+    moved = _share(pairs, lambda pair: pair.drawn.trajectory_sha256 != pair.other.trajectory_sha256)
     change_of = _change_of(pairs, spec)
     by_change: dict[ChangeOf | None, Share | None] = {
-        "choice": _share(pairs, _chooses_differently),
+        "choice": _share(pairs, lambda pair: pair.drawn.first_choice != pair.other.first_choice),
         "set": _share(pairs, _touches_other_items),
         "angle": _share(pairs, _turns_differently) if change_of == "angle" else None,
         "actions": moved,
@@ -112,10 +118,9 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
     }
     n_successes = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs)
     return SwapQuantities(
-        n_pairs=n_pairs,
         change_of=change_of,
         sensitivity=by_change[change_of],
-        actions_changed=moved,
+        actions_changed=None if spec.entry_point in CUE_IN_STATE else moved,
         warranted_choice=_share(pairs, lambda pair: follows(pair.drawn) and follows(pair.other)),
         matched_value=n_successes / (2 * n_pairs),
         matched_interval=wilson_of_rate(n_successes / (2 * n_pairs), n_pairs),
@@ -145,10 +150,6 @@ def _share(pairs: Sequence[Pair], holds: Callable[[Pair], bool]) -> Share:
     return Share(sum(holds(pair) for pair in pairs), len(pairs))
 
 
-def _chooses_differently(pair: Pair) -> bool:
-    return pair.drawn.first_choice != pair.other.first_choice
-
-
 def _touches_other_items(pair: Pair) -> bool:
     one, other = (
         set((record.touched_candidates or ())[: len(record.right_candidates or ())]) for record in pair
@@ -161,10 +162,6 @@ def _turns_differently(pair: Pair) -> bool:
     assert one is not None and other is not None  # `_change_of` has looked
     apart = abs(one - other) % math.tau
     return min(apart, math.tau - apart) > ANGLE_TOLERANCE_RAD
-
-
-def _acts_differently(pair: Pair) -> bool:
-    return pair.drawn.trajectory_sha256 != pair.other.trajectory_sha256
 
 
 def _sign_test(pairs: Sequence[Pair]) -> float | None:
@@ -186,12 +183,7 @@ def _sign_test(pairs: Sequence[Pair]) -> float | None:
 
 def paired_p(pairs: Sequence[Pair]) -> float | None:
     """Return p of the exact McNemar test on whether episodes follow the cue; None without a pair."""
-    counts = {(one, two): 0 for one in (True, False) for two in (True, False)}
-    for pair in pairs:
-        counts[follows(pair.drawn), follows(pair.other)] += 1
-    test = mcnemar_exact(
-        PairCounts(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
-    )
+    test = mcnemar_exact(PairCounts.of((follows(pair.drawn), follows(pair.other)) for pair in pairs))
     return None if test is None else test.p_value
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.find_worlds import find_probes
-from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
 from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.probe_text import render_probe
 from vla_eval.results.cells import markdown_text
@@ -17,12 +16,12 @@ def probe_texts(runs: Sequence[StoredRun]) -> list[str]:
     texts = []
     for probe in find_probes(runs):
         if probe.worlds:
-            matrices = map(_pairs_text, found_pairs(probe.worlds))
-            table = render_probe(found_table(probe.worlds), "markdown")
+            matrices = map(_pairs_text, probe.pairs())
+            table = render_probe(probe.table(), "markdown")
             doubles = [f"- {markdown_text(note)}" for note in probe.doubles]
             texts.append("\n\n".join([f"**Probe {probe.folder}**", table, *doubles, *matrices]))
         if probe.grid:
-            grid = render_grid(found_grid(probe.grid), "markdown")
+            grid = render_grid(probe.grid_table(), "markdown")
             texts.append(f"**Grid {probe.folder}**\n\n{grid}")
     return texts
 
@@ -33,6 +32,7 @@ def _pairs_text(pairs: ChoicePairs) -> str:
         f"(rows), {pairs.world.label} (columns)"
     )
     indices = range(len(pairs.names))
-    rows = [[pairs.names[row], *(str(pairs.count(row, column)) for column in indices)] for row in indices]
+    counts = [[str(pairs.counts.get((row, column), 0)) for column in indices] for row in indices]
+    rows = [[name, *own] for name, own in zip(pairs.names, counts, strict=True)]
     table = markdown_table(("drawn ↓ other →", *pairs.names), rows, [False, *(True for _ in indices)])
     return f"{title}\n\n{table}"

@@ -4,7 +4,7 @@ Pure functions of episodes. The bootstrap draws whole seeds, so that the same ep
 stay together, from a generator with a constant seed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from vla_eval.results.estimates import CONFIDENCE, Interval, p_above, wilson_interval
+from vla_eval.results.estimates import CONFIDENCE, LEVEL, Interval, p_above, wilson_interval
 
 N_DRAWS = 1000
 BOOTSTRAP_SEED = 20260927
-LEVEL = 0.05
 BEYOND = float("inf")
 
 Followed = NDArray[np.bool_]
@@ -66,12 +65,9 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
     n_episodes = episodes.shape[1]
     if n_episodes == 0 or p_above(int(episodes[0].sum()), n_episodes, chance) >= LEVEL:
         return None
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    drawn = [
-        _halved_at(delays, episodes[:, rng.integers(n_episodes, size=n_episodes)].mean(axis=1), chance)
-        for _ in range(N_DRAWS)
-    ]
-    low, high = quantiles(drawn)
+    low, high = _bootstrap(
+        n_episodes, lambda chosen: _halved_at(delays, episodes[:, chosen].mean(axis=1), chance)
+    )
     steps = _halved_at(delays, episodes.mean(axis=1), chance)
     if (
         low == high and steps != BEYOND
@@ -109,14 +105,12 @@ def share_left(before: Followed, after: Followed) -> tuple[float, Range] | None:
     """
     if not before.any():
         return None
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    n_episodes = len(before)
-    drawn = []
-    for _ in range(N_DRAWS):
-        chosen = rng.integers(n_episodes, size=n_episodes)
+
+    def left(chosen: NDArray[np.int64]) -> float:
         n_before = int(before[chosen].sum())
-        drawn.append(int(after[chosen].sum()) / n_before if n_before else BEYOND)
-    low, high = quantiles(drawn)
+        return int(after[chosen].sum()) / n_before if n_before else BEYOND
+
+    low, high = _bootstrap(len(before), left)
     if low == high:
         least_before, most_before = _wilson(before)
         least_after, most_after = _wilson(after)
@@ -144,14 +138,17 @@ def contrast(delay_steps: int, after: Followed, other: Followed) -> Contrast:
         other: the same in another world, in the same order.
     """
     per_episode = other.astype(float) - after
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    n_episodes = len(per_episode)
-    drawn = [float(per_episode[rng.integers(n_episodes, size=n_episodes)].mean()) for _ in range(N_DRAWS)]
-    low, high = quantiles(drawn)
+    low, high = _bootstrap(len(per_episode), lambda chosen: float(per_episode[chosen].mean()))
     if low == high:
         (least_after, most_after), (least_other, most_other) = _wilson(after), _wilson(other)
         low, high = least_other - most_after, most_other - least_after
     return Contrast(delay_steps, float(per_episode.mean()), Interval(low, high))
+
+
+def _bootstrap(n_episodes: int, value: Callable[[NDArray[np.int64]], float]) -> tuple[float, float]:
+    """Return the interval of a value over draws of as many episodes, given by their indices."""
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    return quantiles([value(rng.integers(n_episodes, size=n_episodes)) for _ in range(N_DRAWS)])
 
 
 def _wilson(followed: Followed) -> Interval:

@@ -6,10 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vla_eval.probe.interventions import delay_of
 from vla_eval.probe.quantities import Share, follows, pair_up
 from vla_eval.probe.retention import HalfLife, half_life
-from vla_eval.probe.world_records import Records, Worlds, chance_of, records_in, results_of
+from vla_eval.probe.world_records import Worlds, chance_of, compared_with, results_of
+from vla_eval.probe.worlds import AS_DRAWN, delay_of
 
 RetentionOf = Literal["follows", "warranted_choice"]
 LEAST_POINTS = 2
@@ -66,7 +66,7 @@ def _followed(worlds: Worlds, key: tuple[str, int]) -> dict[int, _Level]:
     for world, found in worlds:
         delay = delay_of(world.config)
         results = results_of(found.get(key, ()))
-        if world.intervention in ("none", "delay") and delay is not None and results:
+        if world.intervention in (AS_DRAWN, "delay") and delay is not None and results:
             outcomes = {(r.run, r.seed): follows(r) for r in results}
             levels[delay] = _Level(outcomes, chance_of(results, found, key[1]))
     return levels
@@ -80,25 +80,17 @@ def _warranted(worlds: Worlds, key: tuple[str, int]) -> dict[int, _Level]:
     swaps = {world.config.env.get("swap_cue") for world, _ in swapped}
     swapped += [(one, found) for one, found in worlds if one.intervention == "swap" and one.level in swaps]
     for world, other in swapped:
-        delay = delay_of(world.config)
-        is_usual = world.intervention == "swap"
-        drawn = records_in(worlds, "none", None) if is_usual else records_in(worlds, "delay", world.level)
-        level = None if drawn is None or delay is None else _pairs(drawn, other, key)
-        if level is not None and delay is not None:
-            levels[delay] = level
+        delay, drawn = delay_of(world.config), compared_with(world, worlds)
+        pairs = pair_up(drawn.get(key, ()), other.get(key, ()))
+        if delay is None or not pairs:
+            continue
+        chance = chance_of([pair.drawn for pair in pairs], drawn, key[1])
+        outcomes = {
+            (pair.drawn.run, pair.drawn.seed): follows(pair.drawn) and follows(pair.other) for pair in pairs
+        }
+        # What choices that do not depend on each other reach without the cue; a constant choice reaches 0.
+        levels[delay] = _Level(outcomes, None if chance is None else chance**2)
     return levels
-
-
-def _pairs(drawn: Records, other: Records, key: tuple[str, int]) -> _Level | None:
-    pairs = pair_up(drawn.get(key, ()), other.get(key, ()))
-    if not pairs:
-        return None
-    chance = chance_of([pair.drawn for pair in pairs], drawn, key[1])
-    outcomes = {
-        (pair.drawn.run, pair.drawn.seed): follows(pair.drawn) and follows(pair.other) for pair in pairs
-    }
-    # What choices that do not depend on each other reach without the cue; a constant choice reaches 0.
-    return _Level(outcomes, None if chance is None else chance**2)
 
 
 def _curve(task: str, key: tuple[str, int], of: RetentionOf, levels: Mapping[int, _Level]) -> Retention:
@@ -111,10 +103,9 @@ def _curve(task: str, key: tuple[str, int], of: RetentionOf, levels: Mapping[int
         policy=key[0],
         n_action_steps=key[1],
         of=of,
-        points=tuple(_point(delay, levels[delay]) for delay in delays),
+        points=tuple(
+            RetentionPoint(delay, Share(sum(one.outcomes.values()), len(one.outcomes)), one.chance)
+            for delay, one in sorted(levels.items(), key=lambda item: item[0])
+        ),
         half_life=None if chance is None else half_life(held, chance),
     )
-
-
-def _point(delay: int, level: _Level) -> RetentionPoint:
-    return RetentionPoint(delay, Share(sum(level.outcomes.values()), len(level.outcomes)), level.chance)

@@ -1,15 +1,17 @@
 """A probe in words: per policy one sentence, and notes on the controls."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from vla_eval.probe.interventions import CONTROLS, CONTROLS_OF_ONE, SWAPS
+from vla_eval.probe.grid import ORACLE
+from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import MISTAKES
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
+from vla_eval.probe.text_table import error_notes
+from vla_eval.probe.worlds import AS_DRAWN, CONTROLS, CONTROLS_OF_ONE, SWAPS
 
-ORACLE = "oracle"
 LEAST_MISTAKES = 5  # with fewer, their kinds say nothing
 
 
@@ -27,8 +29,7 @@ def _sentence(table: ProbeTable, task: str, policy: str, k: int) -> str:
         for curve in table.retention
         if (curve.task, curve.policy, curve.n_action_steps) == (task, policy, k)
     ]
-    forgotten = _forgotten_first(rows)
-    said += [] if forgotten is None else [forgotten]
+    said += filter(None, [_forgotten_first(rows)])
     return f"{policy} on {task}, K = {k}: {'; '.join(said) or 'no episode has a result'}."
 
 
@@ -39,21 +40,12 @@ def _clause(row: ProbeRow) -> str | None:
         return f"follows {what}{after} in {_of(row.swap.warranted_choice)} pairs{_of_pairs(row)}"
     if row.followed is None or row.intervention in SWAPS:
         return None
-    where = {
-        "none": "follows the cue in",
-        "blank": "with a blank cue in",
-        "freeze": "with the first frame of the cue throughout in",
-        "mask": f"{_hidden(row)} in",
-        "shuffle": "with the items shown in another order than is right in",
-        "late": f"with a cue that begins at step {row.level} in",
-        "appearance": f"with another {row.level} in",
-        "cue": f"with a cue of {row.level} steps in",
-        "distractor": f"with a distractor for {row.level} steps in",
-        "interference": "after a motion of the arm in the delay in",
-        "instruction": f"with the instructions '{row.level}' in",
-        "delay": f"after a delay of {row.level} steps in",
-        "reset": f"after a reset of its memory at step {row.level} in",
-    }[row.intervention]
+    if row.intervention == AS_DRAWN:
+        where = "follows the cue in"
+    elif row.intervention == "mask":
+        where = f"{_hidden(row)} in"
+    else:
+        where = INTERVENTIONS[row.intervention].clause.format(level=row.level)
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
     idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
     return f"{where} {_of(row.followed)}{chance}{idle}{_over_delay(row)}"
@@ -76,9 +68,9 @@ def _forgotten_first(rows: Sequence[ProbeRow]) -> str | None:
     ]
     for delay_steps, found in sorted(known, key=lambda one: one[0]):
         if found.n_mistakes >= LEAST_MISTAKES:
-            kinds = sorted(MISTAKES, key=found.count, reverse=True)
-            counts = [f"{kind} in {found.count(kind)}" for kind in kinds if found.count(kind)]
-            by_chance = found.n_place and found.expected_place is not None
+            kinds = sorted(MISTAKES, key=lambda kind: found.counts[kind], reverse=True)
+            counts = [f"{kind} in {found.counts[kind]}" for kind in kinds if found.counts[kind]]
+            by_chance = found.counts["place"] and found.expected_place is not None
             beside = f" (place in {found.expected_place:.1f} by chance)" if by_chance else ""
             return (
                 f"what is forgotten first, of {found.n_mistakes} mistakes after a delay of {delay_steps} "
@@ -100,7 +92,7 @@ def _of_pairs(row: ProbeRow) -> str:
     """Return what independent choices without the cue would give; a constant choice gives 0."""
     if row.swap is None or row.chance is None:
         return ""
-    return f" (chance at most {row.chance**2 * row.swap.n_pairs:.0f})"
+    return f" (chance at most {row.chance**2 * row.n_pairs:.0f})"
 
 
 def _half_life(curve: Retention) -> str:
@@ -123,47 +115,41 @@ def _steps(steps: float | None, half: HalfLife) -> str:
 
 
 def notes(table: ProbeTable) -> list[str]:
-    """Return what a reader of the table has to know, errors and failed controls included."""
+    """Return the notes that a reader of the table needs, errors and failed controls included."""
     found = [*_columns(table.rows), *_failed_controls(table.rows), *_chunk_and_phase(table.rows)]
-    if table.n_errors:
-        found.append(
-            f"{table.n_errors} episodes ended in an error and are not counted; the same command retries them."
-        )
-    return found
+    return [*found, *error_notes(table.n_errors)]
 
 
-def _columns(rows: Sequence[ProbeRow]) -> list[str]:
-    """Return what the columns mean, as far as any row has a value there."""
-    found = []
+def _columns(rows: Sequence[ProbeRow]) -> Iterator[str]:
+    """Explain the columns in which any row has a value."""
     if any(row.swap for row in rows):
-        found.append(
+        yield (
             "sensitivity: share of pairs whose choice differs between the two worlds (for sets: the items "
             "touched; Rotate: the final angle; other tasks without candidates: the trajectory); "
             "warranted: the cue is followed in both worlds; value: mean success of both worlds; reliable: "
             "success in both."
         )
     if any(row.kept for row in rows):
-        found.append("kept: items that are remembered, corrected for guessing.")
+        yield "kept: items that are remembered, corrected for guessing."
     if any(row.over_delay for row in rows):
-        found.append(
+        yield (
             "over delay: by how much more the cue is followed in another appearance than after the longest "
             "delay."
         )
-    found.append(
+    yield (
         "Intervals at 95 %: Wilson; of shares left, half-lives, items kept and differences, bootstrap over "
         "seeds."
     )
     if any(row.p_value is not None for row in rows):
-        found.append(
+        yield (
             "p: for swaps, exact sign test of following both cues against choosing each world's candidate in "
             "the other; else exact McNemar test against the world as drawn. Holm's correction over the table."
         )
     if any(row.policy in (*CONTROLS, *CONTROLS_OF_ONE) for row in rows):
-        found.append(
+        yield (
             "Scripted controls read the true state and no image: a blank cue and a reset take nothing from "
             "them."
         )
-    return found
 
 
 def _failed_controls(rows: Sequence[ProbeRow]) -> list[str]:
@@ -177,26 +163,20 @@ def _failed_controls(rows: Sequence[ProbeRow]) -> list[str]:
     ]
 
 
-def _chunk_and_phase(rows: Sequence[ProbeRow]) -> list[str]:
+def _chunk_and_phase(rows: Sequence[ProbeRow]) -> Iterator[str]:
     """Name the worlds in which the oracle succeeds less at a larger K: there, chunks explain a drop."""
-    found = []
-    oracles = [row for row in rows if row.policy == ORACLE and row.success is not None]
-    for row in oracles:
+    oracles = [(row, row.success) for row in rows if row.policy == ORACLE and row.success is not None]
+    for row, success in oracles:
         same = [
-            one for one in oracles if _world(one) == _world(row) and one.n_action_steps < row.n_action_steps
+            (one.n_action_steps, found)
+            for one, found in oracles
+            if (one.task, one.label) == (row.task, row.label) and one.n_action_steps < row.n_action_steps
         ]
-        best = max(same, key=lambda one: one.success.rate if one.success else 0.0, default=None)
-        if best is None or best.success is None or row.success is None:
-            continue
-        if row.success.interval.high < best.success.interval.low:
+        k, best = max(same, key=lambda one: one[1].rate, default=(0, success))
+        if success.interval.high < best.interval.low:
             late = f" ({row.inferences.n_late} steps late)" if row.inferences else ""
-            found.append(
+            yield (
                 f"{row.task}, {row.label}: at K = {row.n_action_steps}{late} the oracle, which forgets "
-                f"nothing, succeeds in {_of(row.success)} instead of {_of(best.success)} at K = "
-                f"{best.n_action_steps}: chunk and phase explain a drop of this size, not memory."
+                f"nothing, succeeds in {_of(success)} instead of {_of(best)} at K = {k}: chunk and phase "
+                "explain a drop of this size, not memory."
             )
-    return found
-
-
-def _world(row: ProbeRow) -> tuple[object, ...]:
-    return row.task, row.intervention, row.level

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_eval.probe.interventions import SWAPS, Intervention, Level, World, delay_of, label_of
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import (
@@ -21,6 +20,7 @@ from vla_eval.probe.quantities import (
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
 from vla_eval.probe.world_records import Records, Worlds, by_policy, chance_of, compared_with, results_of
+from vla_eval.probe.worlds import AS_DRAWN, SWAPS, Intervention, Level, World, delay_of, label_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names
@@ -46,7 +46,7 @@ class ProbeRow:
         mistakes: the first mistakes of its episodes; None where touches are not known.
         kept: how many items are kept; None where touches are not known, or one item is right.
         over_delay: of another appearance: by how much more is followed than after the longest delay.
-        left, left_interval: share of following that this world leaves; None for swaps and `none`.
+        left: share of following that this world leaves, and its interval; None for swaps and `none`.
         p_value: exact paired test against that world; corrected_p: after Holm, over the table.
         n_errors: episodes of this world without a result.
     """
@@ -67,8 +67,7 @@ class ProbeRow:
     mistakes: Mistakes | None
     kept: Capacity | None
     over_delay: Contrast | None
-    left: float | None
-    left_interval: Range | None
+    left: tuple[float, Range] | None
     p_value: float | None
     corrected_p: float | None
     n_errors: int
@@ -116,11 +115,13 @@ def probe_table(
         order: the policies' names in the order of the rows; others come last, by name.
     """
     by_world = [(world, by_policy(found)) for world, found in zip(worlds, records, strict=True)]
-    drawn = {world.task: found for world, found in by_world if world.intervention == "none"}
+    drawn = {world.task: found for world, found in by_world if world.intervention == AS_DRAWN}
+    ranks = {name: rank for rank, name in enumerate(order)}
     rows, retention = [], []
     for task in dict.fromkeys(world.task for world in worlds):
         of_task = [(world, found) for world, found in by_world if world.task == task]
-        for policy, k in _policies(drawn[task], order):
+        # The policies in their order, each by growing n_action_steps.
+        for policy, k in sorted(drawn[task], key=lambda key: (ranks.get(key[0], len(ranks)), *key)):
             own = [_row(world, found, compared_with(world, of_task), policy, k) for world, found in of_task]
             rows += with_contrasts(own, of_task)
             retention += retention_curves(of_task, policy, k)
@@ -130,20 +131,14 @@ def probe_table(
     return ProbeTable(rows=tuple(rows), retention=tuple(retention))
 
 
-def _policies(records: Records, order: Sequence[str]) -> list[tuple[str, int]]:
-    """Return the policies in their order, each by growing n_action_steps."""
-    ranks = {name: rank for rank, name in enumerate(order)}
-    return sorted(records, key=lambda key: (ranks.get(key[0], len(ranks)), *key))
-
-
 def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> ProbeRow:
     own = found.get((policy, k), ())
     results = results_of(own)
     pairs = pair_up(drawn.get((policy, k), ()), own)
+    choosing = [record for record in results if record.n_candidates]
     is_swap = world.intervention in SWAPS
     swap = swap_quantities(pairs, task_spec(world.task)) if is_swap else None
-    compared = not is_swap and world.intervention != "none"
-    left = share_left(*_followed(pairs)) if compared and pairs else None
+    compared = not is_swap and world.intervention != AS_DRAWN
     phases = phases_of(task_spec(world.task), world.config.env)
     p_value = swap.p_value if swap is not None else paired_p(pairs) if compared else None
     return ProbeRow(
@@ -156,15 +151,14 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         inferences=inferences(phases, k) if isinstance(phases, Phases) else None,
         n_pairs=len(pairs),
         swap=swap,
-        followed=Share(sum(map(follows, results)), len(results)) if results else None,
-        n_without_choice=_n_without_choice(results),
-        success=Share(sum(bool(r.success_once) for r in results), len(results)) if results else None,
+        followed=Share.of_records(results, follows),
+        n_without_choice=sum(record.first_choice is None for record in choosing) if choosing else None,
+        success=Share.of_records(results, lambda record: bool(record.success_once)),
         chance=chance_of(results, found, k),
         mistakes=mistakes(results, task_spec(world.task)),
         kept=capacity(results),
         over_delay=None,
-        left=left[0] if left else None,
-        left_interval=left[1] if left else None,
+        left=share_left(*_followed(pairs)) if compared and pairs else None,
         p_value=p_value,
         corrected_p=None,
         n_errors=len(own) - len(results),
@@ -194,11 +188,6 @@ def with_contrasts(rows: Sequence[ProbeRow], worlds: Worlds) -> list[ProbeRow]:
             row = replace(row, over_delay=contrast(longest, *_followed(pairs)))
         compared.append(row)
     return compared
-
-
-def _n_without_choice(results: Sequence[EpisodeRecord]) -> int | None:
-    choosing = [record for record in results if record.n_candidates]
-    return sum(record.first_choice is None for record in choosing) if choosing else None
 
 
 def _followed(pairs: Sequence[Pair]) -> tuple[Followed, Followed]:

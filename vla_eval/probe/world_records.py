@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from vla_eval.probe.interventions import Intervention, Level, World
 from vla_eval.probe.quantities import follows
+from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.comparison import CHANCE_POLICY
 
@@ -22,21 +22,15 @@ def by_policy(records: Iterable[EpisodeRecord]) -> Records:
     return found
 
 
-def records_in(worlds: Worlds, intervention: Intervention, level: Level) -> Records | None:
-    """Return the records of a world; None if it was not run."""
-    own = (found for world, found in worlds if (world.intervention, world.level) == (intervention, level))
-    return next(own, None)
-
-
 def compared_with(world: World, worlds: Worlds) -> Records:
     """Return the records of the world that this one is compared with; none if it was not run."""
-    if world.intervention == "delay_swap":
-        return records_in(worlds, "delay", world.level) or {}
-    return records_in(worlds, "none", None) or {}
+    wanted = ("delay", world.level) if world.intervention == "delay_swap" else (AS_DRAWN, None)
+    own = (found for world, found in worlds if (world.intervention, world.level) == wanted)
+    return next(own, {})
 
 
 def results_of(records: Iterable[EpisodeRecord]) -> list[EpisodeRecord]:
-    """Return the records that are no errors."""
+    """Return the records with a result."""
     return [record for record in records if record.outcome != "error"]
 
 

@@ -2,31 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 
-from vla_eval.results.shipped_audit import AuditProtocol, TaskAudit, protocol_of, shipped_audits
+from vla_eval.results.shipped_audit import (
+    OTHER_VERDICTS,
+    PROTOCOLS,
+    ROADS,
+    AuditProtocol,
+    TaskAudit,
+    protocol_of,
+    shipped_audits,
+)
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
-
-ROADS: Mapping[str, str] = {
-    "can be toured": "by touching one candidate after another",
-    "body can store the cue": "by storing the cue in the gripper",
-    "won by staying at the cue": "by staying where the cue was shown",
-    "won from single frames": "from single frames",
-    "won without acting": "without acting",
-    "won by chance motions": "by chance motions",
-    "won without the cue": "without the cue",
-}
-"""A shortcut in the words of the audit -> how the task is won by it."""
-OTHER_VERDICTS: Mapping[str, str] = {
-    "needs memory": "no shortcut found",
-    "not decided": "not decided by so few episodes",
-    "not audited: no scripted control": "not audited, for lack of a scripted control",
-}
-RULES: Mapping[AuditProtocol, str] = {
-    "paper": "the paper's rule",
-    "strict": "the strict rule",
-    "official": "the official rule",
-}
-PAGES: Mapping[AuditProtocol, str] = {"official": "docs/audit_official.md"}
 
 
 def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
@@ -46,7 +32,7 @@ def audit_notes(runs: Sequence[StoredRun]) -> list[str]:
             audit = None if protocol is None else shipped_audits().get((task, protocol))
             if spec is not None and audit is not None and audit.version == spec.version:
                 found.setdefault(audit.protocol, {})[task] = audit
-    return [_note(protocol, found[protocol]) for protocol in RULES if protocol in found]
+    return [_note(protocol, found[protocol]) for protocol in PROTOCOLS if protocol in found]
 
 
 def _note(protocol: AuditProtocol, audits: Mapping[str, TaskAudit]) -> str:
@@ -63,6 +49,6 @@ def _note(protocol: AuditProtocol, audits: Mapping[str, TaskAudit]) -> str:
         tasks = [task for task, audit in audits.items() if words in audit.verdict]
         said += [f"{meaning}: {', '.join(tasks)}"] if tasks else []
     n_episodes = min((audit.n_episodes for audit in audits.values() if audit.n_episodes), default=0)
-    page = PAGES.get(protocol, "docs/audit.md")
-    under = f"audit under {RULES[protocol]}, {n_episodes} episodes per control: {page}"
+    rules = PROTOCOLS[protocol]
+    under = f"audit under {rules.words}, {n_episodes} episodes per control: {rules.page}"
     return f"{'; '.join(said)} ({under})."

@@ -6,25 +6,17 @@ Reads records and returns counts; changes nothing. `docs/report_page.md` explain
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import p_above
+from vla_eval.results.estimates import LEVEL, p_above
 from vla_eval.results.grouping import RowEpisodes
 
 Cause = Literal["right", "not_finished", "forgot", "position_habit", "never_chose", "could_not_move"]
-CAUSES: tuple[Cause, ...] = (
-    "right",
-    "not_finished",
-    "forgot",
-    "position_habit",
-    "never_chose",
-    "could_not_move",
-)
+CAUSES: tuple[Cause, ...] = get_args(Cause)
 Kind = Literal["item", "place"]
 
 MOVED_M = 0.05  # half the distance between two neighbouring places: below it, the arm went to none of them
-HABIT_LEVEL = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +40,7 @@ class Habit:
     @property
     def is_found(self) -> bool:
         """Whether it is significant at 5 %."""
-        return self.p_value < HABIT_LEVEL
+        return self.p_value < LEVEL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,16 +115,9 @@ def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) 
         n_possible = sum(n for (target, _), n in wrong.items() if target != index)
         n_chosen = sum(n for (_, chosen), n in wrong.items() if chosen == index)
         if n_possible:
-            p = p_above(n_chosen, n_possible, by_luck)
-            found.append(
-                Habit(
-                    index=index,
-                    n_chosen=n_chosen,
-                    n_possible=n_possible,
-                    by_luck=by_luck,
-                    p_value=min(1.0, p * n_candidates),
-                )
-            )
+            p = min(1.0, p_above(n_chosen, n_possible, by_luck) * n_candidates)
+            habit = Habit(index=index, n_chosen=n_chosen, n_possible=n_possible, by_luck=by_luck, p_value=p)
+            found.append(habit)
     return min(found, key=lambda habit: habit.p_value)
 
 

@@ -214,8 +214,8 @@ def _baseline_of(key: RowKey, groups: Mapping[RowKey, RowEpisodes], baseline: st
 
 def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
     """Count the outcomes of two rows on the same run and seed."""
-    counts = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
     others = {run.key: run.results for run in other.runs}
+    outcomes = []
     seen: set[tuple[int, str, str]] = set()
     for run in group.runs:
         partner = others.get(run.key, {})
@@ -228,5 +228,5 @@ def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
                 if (seed, first, second) in seen:
                     continue
                 seen.add((seed, first, second))
-            counts[record.outcome == "success", partner[seed].outcome == "success"] += 1
-    return PairCounts(*counts.values())
+            outcomes.append((record.outcome == "success", partner[seed].outcome == "success"))
+    return PairCounts.of(outcomes)

@@ -44,15 +44,10 @@ def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None: 
     gap_steps = arguments.get("gap_steps", 0)
     lengths = [steps] if isinstance(steps, int) else steps
     fewest, most = (total_cue_steps(f(lengths), n_in_turn, gap_steps) for f in (min, max))
-    if _reads_every_frame(group):
+    if any((r.n_frames or 0) > (r.n_inferences or 0) for r in group.results):  # it reads every frame
         return CueFrames(fewest, most)
     k = group.key.n_action_steps
     after = arguments.get("cue_after_steps", 0)
     # Inferences before a step: rounded up, as there is one at step 0.
     earlier, by_fewest, by_most = (-(-step // k) for step in (after, after + fewest, after + most))
     return CueFrames(by_fewest - earlier, by_most - earlier)
-
-
-def _reads_every_frame(group: RowEpisodes) -> bool:
-    """Whether the policy got more observations than there were inferences."""
-    return any((r.n_frames or 0) > (r.n_inferences or 0) for r in group.results)

@@ -5,13 +5,15 @@ is None, never 0. Knows nothing of episodes, tasks or files.
 """
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from scipy import stats
 
 CONFIDENCE = 0.95
+LEVEL = 0.05  # of tests
 
 
 class Interval(NamedTuple):
@@ -35,6 +37,12 @@ class PairCounts(NamedTuple):
     only_first: int
     only_second: int
     neither: int
+
+    @classmethod
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> "PairCounts":
+        """Count pairs by whether the first and the second succeeded."""
+        counts = Counter(outcomes)
+        return cls(*(counts[one, two] for one in (True, False) for two in (True, False)))
 
     @property
     def n_pairs(self) -> int:
@@ -64,13 +72,11 @@ class PairedTest:
     Attributes:
         difference: difference of the success rates over the pairs.
         interval: its 95 % interval.
-        n_pairs: number of pairs.
         p_value: two-sided exact McNemar test.
     """
 
     difference: float
     interval: Interval
-    n_pairs: int
     p_value: float
 
 
@@ -152,7 +158,6 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     return PairedTest(
         difference=difference,
         interval=paired_interval(counts),
-        n_pairs=counts.n_pairs,
         p_value=min(1.0, p_value),
     )
 

@@ -24,7 +24,7 @@ CONTROLS = {
     "cue_touch": "stays where the cue was",
     "one_frame": "single frames",
 }
-"""Scripted policy -> what a caption says of it. They are below the rule and never the best."""
+"""Scripted policy -> its words in a caption. They are below the rule and never the best."""
 LINE_WIDTH_PT = 345  # \linewidth of LaTeX's article with 10 pt
 SMALL_PT, SCRIPT_PT = 5.0, 3.9  # width of a letter in \small and \scriptsize, which are 9 and 7 pt high
 COLUMN_SPACE_PT = 6  # twice \tabcolsep
@@ -39,18 +39,21 @@ def paper_preset(table: Table) -> str:
     """
     tasks = list(dict.fromkeys(row.task for row in table.rows))
     labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
-    variants = {text: chr(ord("a") + i) for i, text in enumerate(_variants(table))}
-    names = {label: _name(label, list(labels), variants) for label in labels}
+    names = {label: _name(label, list(labels), table.variants) for label in labels}
     cells = {(row.key.of_all_tasks, row.task): row for row in table.rows}
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
+    slug = (
+        re.sub("[^a-z0-9]+", "-", "-".join(dict.fromkeys(table.runs.values())).lower()).strip("-")
+        or "results"
+    )
     lines = [
         "% needs \\usepackage{booktabs}",
         "\\begin{table}[t]",
         "\\centering",
-        f"\\caption{{{_caption(table, variants)}}}",
-        f"\\label{{tab:{_slug(table)}}}",
+        f"\\caption{{{_caption(table)}}}",
+        f"\\label{{tab:{slug}}}",
         "\\smallskip",
         "\\small",
         f"\\setlength{{\\tabcolsep}}{{{COLUMN_SPACE_PT / 2:g}pt}}",
@@ -131,10 +134,6 @@ def _name(label: RowKey, labels: Sequence[RowKey], variants: Mapping[str, str]) 
     return f"{name} ({variants[label.variant]})" if label.variant else name
 
 
-def _variants(table: Table) -> list[str]:
-    return list(dict.fromkeys(row.variant for row in table.rows if row.variant))
-
-
 def _title(task: str) -> list[str]:
     """Return the lines of a column's title: `RememberColor3-v0` gives `Remember`, `Color3`."""
     lines: list[str] = []
@@ -152,7 +151,7 @@ def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
     return max(max(rate, title) * SMALL_PT, len("[0.00, 0.00]") * SCRIPT_PT) + COLUMN_SPACE_PT
 
 
-def _caption(table: Table, variants: Mapping[str, str]) -> str:
+def _caption(table: Table) -> str:
     rows = [row for row in table.rows if row[SUCCESS].success_once is not None]
     parts = ["Success once with its 95\\,\\% interval"]
     counts = sorted({row[EPISODES].n_episodes for row in rows})
@@ -172,15 +171,10 @@ def _caption(table: Table, variants: Mapping[str, str]) -> str:
     if controls:
         said = "; ".join(f"{latex_text(name)}: {CONTROLS[name]}" for name in controls)
         sentences.append(f"Controls: {said}.")
-    if variants:
-        said = "; ".join(f"({letter}) {latex_text(text)}" for text, letter in variants.items())
+    if table.variants:
+        said = "; ".join(f"({letter}) {latex_text(text)}" for text, letter in table.variants.items())
         sentences.append(f"Settings: {said}.")
     n_errors = sum(row[EPISODES].n_errors for row in table.rows)
     if n_errors:
         sentences.append(f"Episodes that ended in an error are in no rate: {n_errors}.")
     return " ".join(sentences)
-
-
-def _slug(table: Table) -> str:
-    names = "-".join(dict.fromkeys(table.runs.values()))
-    return re.sub("[^a-z0-9]+", "-", names.lower()).strip("-") or "results"

@@ -1,19 +1,20 @@
 """The footnotes of a table on its run folders: what is missing, counted once, or not the same in all."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
 from vla_eval.errors import MAX_NAMED, some_of
 from vla_eval.results.grouping import PROMPTS, Grouping, config_names
 from vla_eval.results.own_statistics import count
-from vla_eval.storage.run_file import DEVICE, leaves
+from vla_eval.storage.run_file import DEVICE, JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import find_task
 
 DEVICE_FACTS = f"{DEVICE}."
+UNCOMMITTED = "made with uncommitted changes to the package, which the commit does not contain."
 
 
 class PlannedRow(NamedTuple):
@@ -34,94 +35,87 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
     notes = [(str(run.path), note) for run in runs for note in (*_no_evidence(run), *_unknown_weights(run))]
     doubles = "with the same trajectory as in another run folder; each is counted once."
     notes += [(path, f"{count(n, 'episode')} {doubles}") for path, n in grouping.n_doubles.items()]
-    notes += [
-        (
-            path,
-            "repeats episodes of another run folder (same run and seed) with other trajectories or weights; "
-            "they count as further runs.",
-        )
-        for path in grouping.further
-    ]
-    own = [
-        note
-        for run in runs
-        for note in (*_incomplete(run), *_continued_elsewhere(run), *_seen_in_training(run))
-    ]
-    shards = _absent_shards(runs)
-    own += _unique(line for run in runs for session in run.sessions for line in session.sentences)
-    return _told_together(notes) + own + shards + _environment_differences(runs) + _recipe_differences(runs)
+    further = (
+        "repeats episodes of another run folder (same run and seed) with other trajectories or weights; they "
+        "count as further runs."
+    )
+    notes += [(path, further) for path in grouping.further]
+    own: list[str] = []
+    for run in runs:
+        seen = seen_in_training((record.key for record in run.records), run.description.training_seeds)
+        own += [*_incomplete(run), *_continued_elsewhere(run), *seen]
+    sentences = dict.fromkeys(line for run in runs for session in run.sessions for line in session.sentences)
+    differences = (*_environment_differences(runs), *_recipe_differences(runs))
+    return [*_told_together(notes), *own, *sentences, *_absent_shards(runs), *differences]
 
 
-def _told_together(notes: Sequence[tuple[str, str]]) -> list[str]:
-    """Return one note for many folders; a few are named individually."""
+def _told_together(notes: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Yield one note for many folders; a few are named individually."""
     paths_of: dict[str, list[str]] = {}
     for path, note in notes:
         paths_of.setdefault(note, []).append(path)
-    told = []
     for note, paths in paths_of.items():
         if len(paths) > MAX_NAMED:
-            told.append(f"{paths[0]} and {len(paths) - 1} more run folders: {note}")
+            yield f"{paths[0]} and {len(paths) - 1} more run folders: {note}"
         else:
-            told += [f"{path}: {note}" for path in paths]
-    return told
+            yield from (f"{path}: {note}" for path in paths)
 
 
-def _unknown_weights(run: StoredRun) -> list[str]:
+def _unknown_weights(run: StoredRun) -> Iterator[str]:
     """Name the policies behind sockets whose servers do not say which weights they have."""
     unknown = [
         name
         for name, server in run.description.servers.items()
         if not (isinstance(server, Mapping) and "weights_sha256" in server)
     ]
-    if not unknown:
-        return []
-    return [
-        f"weights unknown: the server of {some_of(unknown)} does not say which weights the policy has, so "
-        "that no change of them would be noticed."
-    ]
+    if unknown:
+        yield (
+            f"weights unknown: the server of {some_of(unknown)} does not say which weights the policy has, "
+            "so that no change of them would be noticed."
+        )
 
 
-def _no_evidence(run: StoredRun) -> list[str]:
-    """Return the notes on what makes the results of a run meaningless or impossible to reproduce."""
-    notes = []
+def _no_evidence(run: StoredRun) -> Iterator[str]:
+    """Say what makes the results of a run meaningless or impossible to reproduce."""
     if run.description.config.get("simulator") == "fake":
-        notes.append("made with the fake simulator, which has no physics; its rates mean nothing.")
-    source = run.description.environment.get("vla_eval")
-    if isinstance(source, Mapping) and source.get("changes") is not None:
-        notes.append("made with uncommitted changes to the package, which the commit does not contain.")
-    return notes
+        yield "made with the fake simulator, which has no physics; its rates mean nothing."
+    if has_uncommitted_changes(run.description.environment):
+        yield UNCOMMITTED
 
 
-def _incomplete(run: StoredRun) -> list[str]:
+def has_uncommitted_changes(environment: Mapping[str, JsonValue]) -> bool:
+    """Return whether a run was made with another code than that of its commit."""
+    source = environment.get("vla_eval")
+    return isinstance(source, Mapping) and source.get("changes") is not None
+
+
+def _incomplete(run: StoredRun) -> Iterator[str]:
     config = run.description.config
     n_episodes, n_runs = config.get("episodes"), config.get("runs", 1)
     if not isinstance(n_episodes, int) or not isinstance(n_runs, int):
-        return []
+        return
     there: Counter[PlannedRow] = Counter(PlannedRow(r.task, r.policy, r.n_action_steps) for r in run.records)
     shard = run.description.shard
     expected = (n_episodes if shard is None else len(shard.indices(n_episodes))) * n_runs
     missing = {group: there[group] for group in _planned(run, there) if there[group] < expected}
-    if not missing:
-        return []
     parts = (f"{group}: {n} of {expected}" for group, n in missing.items())
-    return [
-        f"{run.path} is incomplete (episodes done, of how many): {some_of(parts)}. Run the same command "
-        "again to resume."
-    ]
+    if missing:
+        yield (
+            f"{run.path} is incomplete (episodes done, of how many): {some_of(parts)}. Run the same command "
+            "again to resume."
+        )
 
 
-def _absent_shards(runs: Sequence[StoredRun]) -> list[str]:
+def _absent_shards(runs: Sequence[StoredRun]) -> Iterator[str]:
     """Name the shards of a run that are not among the run folders."""
     found: dict[tuple[str, int], set[int]] = defaultdict(set)
     for run in runs:
         if run.description.shard is not None:
             found[run.description.name, run.description.shard.count].add(run.description.shard.number)
-    absent = {key: sorted(set(range(1, key[1] + 1)) - numbers) for key, numbers in found.items()}
-    return [
-        f"{name} is not complete; not in this table: shard {some_of(f'{n}/{count}' for n in numbers)}."
-        for (name, count), numbers in absent.items()
-        if numbers
-    ]
+    for (name, n_shards), numbers in found.items():
+        absent = [f"{n}/{n_shards}" for n in range(1, n_shards + 1) if n not in numbers]
+        if absent:
+            yield f"{name} is not complete; not in this table: shard {some_of(absent)}."
 
 
 def _planned(run: StoredRun, there: Mapping[PlannedRow, int]) -> list[PlannedRow]:
@@ -131,7 +125,8 @@ def _planned(run: StoredRun, there: Mapping[PlannedRow, int]) -> list[PlannedRow
     begun_policies = {group.policy for group in there}
     named: list[PlannedRow] = []
     for task, policy in product(config_names(run, "tasks"), config_names(run, "policies")):
-        if (task, policy) not in begun_pairs and policy in begun_policies and _has_no_candidates(task):
+        has_none = (spec := find_task(task)) is not None and not spec.has_candidates
+        if (task, policy) not in begun_pairs and policy in begun_policies and has_none:
             continue  # a policy that needs candidates is skipped there; nothing is missing
         if isinstance(steps, Sequence) and not isinstance(steps, str):
             named += [PlannedRow(task, policy, k) for k in steps if isinstance(k, int)]
@@ -140,54 +135,38 @@ def _planned(run: StoredRun, there: Mapping[PlannedRow, int]) -> list[PlannedRow
     return list(dict.fromkeys((*named, *there)))
 
 
-def _has_no_candidates(task: str) -> bool:
-    spec = find_task(task)
-    return spec is not None and not spec.has_candidates
+def _continued_elsewhere(run: StoredRun) -> Iterator[str]:
+    changed = dict.fromkeys(one.path for session in run.sessions for one in session.environment_changes)
+    if changed:
+        yield (
+            f"{run.path} was resumed in another environment (--allow-environment-change); what changed: "
+            f"{some_of(changed)}."
+        )
 
 
-def _continued_elsewhere(run: StoredRun) -> list[str]:
-    changed = _unique(change.path for session in run.sessions for change in session.environment_changes)
-    if not changed:
-        return []
-    return [
-        f"{run.path} was resumed in another environment (--allow-environment-change); what changed: "
-        f"{some_of(changed)}."
-    ]
-
-
-def _seen_in_training(run: StoredRun) -> list[str]:
-    return seen_in_training((record.key for record in run.records), run.description.training_seeds)
-
-
-def _environment_differences(runs: Sequence[StoredRun]) -> list[str]:
+def _environment_differences(runs: Sequence[StoredRun]) -> Iterator[str]:
     texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
-    names = _unique(name for text in texts for name in text)
     # A run without images has no renderer, and one of which no worker has started has no device at all: what
     # is not known does not differ.
     found = {
-        name: [text.get(name) for text in texts if name in text or not name.startswith(DEVICE_FACTS)]
-        for name in names
+        name: {text.get(name) for text in texts if name in text or not name.startswith(DEVICE_FACTS)}
+        for text in texts
+        for name in text
     }
-    differing = [name for name, values in found.items() if len(set(values)) > 1]
-    if not differing:
-        return []
-    return [f"the run folders were made in different environments; what differs: {some_of(differing)}."]
+    differing = [name for name, values in found.items() if len(values) > 1]
+    if differing:
+        yield f"the run folders were made in different environments; what differs: {some_of(differing)}."
 
 
-def _recipe_differences(runs: Sequence[StoredRun]) -> list[str]:
+def _recipe_differences(runs: Sequence[StoredRun]) -> Iterator[str]:
     digests: dict[str, set[str]] = defaultdict(set)
     for run in runs:
         for recipe, digest in run.description.recipes.items():
             digests[recipe].add(digest)
     # Other prompts are another variant, for which the table has a column.
     differing = [name for name, found in digests.items() if len(found) > 1 and not name.startswith(PROMPTS)]
-    if not differing:
-        return []
-    return [
-        f"the run folders were made with different contents of {some_of(differing)}; rows of the same name "
-        "are combined anyway."
-    ]
-
-
-def _unique(items: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(items))
+    if differing:
+        yield (
+            f"the run folders were made with different contents of {some_of(differing)}; rows of the same "
+            "name are combined anyway."
+        )

@@ -81,12 +81,15 @@ def _mean(records: Iterable[EpisodeRecord], value: Callable[[EpisodeRecord], flo
     return math.fsum(known) / len(known) if values and len(known) == len(values) else None
 
 
+def mean_text(mean: float | None, sem: float | None, low: float | None, high: float | None) -> str:
+    """Return `0.50 ± 0.10 [0.07, 0.93]`, without the standard error of a single run; or a dash."""
+    spread = "" if sem is None else f" ± {sem:.2f}"
+    return UNDEFINED if mean is None else f"{mean:.2f}{spread} [{rate(low)}, {rate(high)}]"
+
+
 def _shown_success(row: Row) -> str:
     success = row[SUCCESS]
-    if success.success_once is None:
-        return UNDEFINED
-    sem = "" if success.sem is None else f" ± {success.sem:.2f}"
-    return f"{success.success_once:.2f}{sem} [{rate(success.ci_low)}, {rate(success.ci_high)}]"
+    return mean_text(success.success_once, success.sem, success.ci_low, success.ci_high)
 
 
 def _shown_right(row: Row) -> str:

@@ -26,6 +26,7 @@ class Column[R]:
         name: what `--columns` calls it.
         is_extra: shown only if it is named.
         is_last: at the right end.
+        is_code: names and messages, which a page sets as code.
     """
 
     title: str
@@ -37,6 +38,7 @@ class Column[R]:
     name: str = ""
     is_extra: bool = False
     is_last: bool = False
+    is_code: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,14 +32,12 @@ def _paired_cells(comparisons: Sequence[Comparison | None]) -> dict[str, Cell]:
     for number in range(max(LEAST_COMPARISONS, len(comparisons))):
         names = FIRST_NAMES if not number else [f"{_ordinal(number)}_{name}" for name in NEXT_NAMES]
         one = comparisons[number] if number < len(comparisons) else None
-        cells |= dict.fromkeys(names) if one is None else dict(zip(names, _values(one), strict=True))
+        cells |= dict.fromkeys(names)
+        if one is not None:
+            test, other = one.test, (one.baseline.policy, one.baseline.n_action_steps)
+            tested = (test.difference, *test.interval, one.pairs.n_pairs, one.corrected_p, test.p_value)
+            cells |= zip(names, (*other, *tested), strict=True)
     return cells
-
-
-def _values(one: Comparison) -> tuple[Cell, ...]:
-    baseline, test = one.baseline, one.test
-    counted = (test.difference, *test.interval, test.n_pairs, one.corrected_p, test.p_value)
-    return (baseline.policy, baseline.n_action_steps, *counted)
 
 
 def _paired_column(number: int, baseline: str) -> Column[Row]:

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from vla_eval.errors import ReportError
 from vla_eval.strict.json_text import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
@@ -21,8 +21,44 @@ STRICT: Mapping[str, bool] = {
     "strict_choice": True,
     "phase_gate_success": True,
 }
-PROTOCOLS: Mapping[AuditProtocol, Mapping[str, bool]] = {"paper": {}, "strict": STRICT, "official": {}}
-"""Name of a set of rules -> arguments of the tasks. The official package's tasks have one set, their own."""
+
+
+class Rules(NamedTuple):
+    """A set of rules: the arguments of the tasks, its words in a note, and the page with its audit."""
+
+    arguments: Mapping[str, bool]
+    words: str
+    page: str
+
+
+PROTOCOLS: Mapping[AuditProtocol, Rules] = {
+    "paper": Rules({}, "the paper's rule", "docs/audit.md"),
+    "strict": Rules(STRICT, "the strict rule", "docs/audit.md"),
+    "official": Rules({}, "the official rule", "docs/audit_official.md"),
+}
+"""The official package's tasks have one set, their own."""
+
+SHORTCUTS: Mapping[str, tuple[str, str]] = {
+    "hold": ("won without acting", "without acting"),
+    "random": ("won by chance motions", "by chance motions"),
+    "tour": ("can be toured", "by touching one candidate after another"),
+    "body_memory": ("body can store the cue", "by storing the cue in the gripper"),
+    "cue_touch": ("won by staying at the cue", "by staying where the cue was shown"),
+    "cue_blind": ("won without the cue", "without the cue"),
+    "one_frame": ("won from single frames", "from single frames"),
+}
+"""Control that needs no memory -> the verdict if it finds a shortcut, and how the task is won by it."""
+ROADS: Mapping[str, str] = dict(SHORTCUTS.values())
+
+NEEDS_MEMORY = "needs memory"
+UNDECIDED = "not decided"
+NOT_AUDITED = "not audited: no scripted control"
+OTHER_VERDICTS: Mapping[str, str] = {
+    NEEDS_MEMORY: "no shortcut found",
+    UNDECIDED: "not decided by so few episodes",
+    NOT_AUDITED: "not audited, for lack of a scripted control",
+}
+"""A verdict without a shortcut -> its words in a note."""
 
 FILE = Path(__file__).with_suffix(".json")
 OFFICIAL_FILE = FILE.with_name("official_audit.json")

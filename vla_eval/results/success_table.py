@@ -14,10 +14,10 @@ SummaryInterval = Literal["wilson_over_tasks", "t_over_runs"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Statistic[V]:
-    """One statistic of a row, with all that the formats, `--columns` and the notes say of it.
+    """One statistic of a row: its estimate, and its columns and words in every format.
 
     Attributes:
-        estimate: its value, from what is known of a row; None where it is undefined.
+        estimate: its value, from the evidence of a row; None where it is undefined.
         cells: its columns in CSV and JSON, a public format: name -> value.
         columns: its columns in tables for reading.
         column_of: the column of a baseline, by its number from 0 and its name, where each has one.
@@ -141,6 +141,12 @@ class Table:
     n_comparisons: int
     runs: Mapping[str, str]
     protocols: tuple[ProtocolRow, ...] = ()
+
+    @property
+    def variants(self) -> dict[str, str]:
+        """The settings in which run folders differ, each with its letter."""
+        told = dict.fromkeys(row.variant for row in self.rows if row.variant)
+        return {variant: chr(ord("a") + i) for i, variant in enumerate(told)}
 
     def with_runs(self) -> tuple[Row, ...]:
         """Return the rows, each followed by its runs."""

@@ -3,19 +3,23 @@
 Reads and returns; changes nothing. `docs/chunk_sizes.md` explains each column.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from scipy import stats
+
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.cue import CueFrames, cue_frames
+from vla_eval.results.estimates import LEVEL
 from vla_eval.results.formats import By
 from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
-from vla_eval.results.power import LEVEL, discordance_of_independent, episodes_to_settle
 from vla_eval.storage.run_folder import StoredRun
 
 DEFAULT_DIFFERENCE = 0.1
+POWER = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +47,7 @@ class SweepRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """Rows, grouped so that each reference is beside the rows that are compared with it."""
+    """Rows, grouped so that each reference stands with the rows that are compared with it."""
 
     by: By
     rows: tuple[SweepRow, ...]
@@ -147,3 +151,33 @@ def _env_arguments(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], Ma
         for task, label in labels.items():
             found[task, label] = env if isinstance(env, Mapping) else {}
     return found
+
+
+def episodes_to_settle(difference: float, discordance: float, *, level: float = LEVEL) -> int:
+    """Return how many paired episodes a two-sided McNemar test needs to detect a difference with `POWER`.
+
+    Args:
+        difference: of the two success rates, in (0, 1].
+        discordance: share of episodes in which the two policies differ; raised to `difference` if it is
+            smaller, which is impossible.
+        level: of the test, after any correction for several comparisons, in (0, 1).
+
+    Source: Connor 1987, "Sample size for testing differences in proportions for the paired-sample
+    design", Biometrics 43(1):207-211, equation 3: n = (z_{1-level/2} √ψ + z_{power} √(ψ - δ²))² / δ².
+    It is for the asymptotic test; the exact one needs slightly more.
+    """
+    psi = max(discordance, difference)
+    z_level = float(stats.norm.ppf(1 - level / 2))
+    z_power = float(stats.norm.ppf(POWER))
+    root = z_level * math.sqrt(psi) + z_power * math.sqrt(psi - difference**2)
+    return math.ceil((root / difference) ** 2)
+
+
+def discordance_of_independent(first: float, second: float) -> float:
+    """Return how often two policies differ if their outcomes are independent.
+
+    Args:
+        first: success rate of one.
+        second: success rate of the other.
+    """
+    return first * (1 - second) + second * (1 - first)

@@ -96,7 +96,7 @@ def _values(row: SweepRow, sweep: Sweep) -> dict[str, object]:
         "cue_frames": list(row.cue) if row.cue else None,
         "reference": getattr(one.baseline, sweep.by) if one else None,
         "paired_difference": one.test.difference if one else None,
-        "n_pairs": one.test.n_pairs if one else None,
+        "n_pairs": one.pairs.n_pairs if one else None,
         "paired_p_raw": one.test.p_value if one else None,
         "paired_p": one.corrected_p if one else None,
         "episodes_to_settle": row.n_to_settle,

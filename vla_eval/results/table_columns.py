@@ -35,7 +35,11 @@ def lay_out(
     check_names("column", names, by_name, where="--columns")
     if names:
         return _printed(table, [by_name[name] for name in names], table.rows)
-    shown = [one for one in by_name.values() if not one.is_extra and not _is_empty(one, table)]
+
+    def is_empty(column: Column[Row]) -> bool:
+        return column.name != "success" and {column.cell(row) for row in table.rows} == {UNDEFINED}
+
+    shown = [one for one in by_name.values() if not one.is_extra and not is_empty(one)]
     if wide:
         return _printed(table, shown, table.with_runs())
     same = [one for one in shown if one.folds and len(set(map(one.cell, table.rows))) == 1]
@@ -65,7 +69,3 @@ def _fit(
             kept.add(column.name)
             left -= own
     return [one for one in columns if one.name in kept], [one for one in columns if one.name not in kept]
-
-
-def _is_empty(column: Column[Row], table: Table) -> bool:
-    return column.name != "success" and {column.cell(row) for row in table.rows} == {UNDEFINED}

@@ -6,14 +6,11 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 from vla_eval.results.comparison import CHANCE_POLICY, Comparison
+from vla_eval.results.estimates import LEVEL
 from vla_eval.results.latex_preset import CONTROLS
 from vla_eval.results.own_statistics import CHOICES, EPISODES, SUCCESS
-from vla_eval.results.relative_statistics import CHANCE, PAIRED
+from vla_eval.results.relative_statistics import CHANCE, PAIRED, SMALLEST_SHOWN_P
 from vla_eval.results.success_table import Row, Table
-
-LEVEL = 0.05
-SMALLEST_SAID_P = 0.001
-
 
 Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
 
@@ -87,7 +84,7 @@ def _finding(row: Row) -> Finding:
 
 
 def _sentence(group: Sequence[Row], rows: Sequence[Row]) -> str:
-    """Say what was found of a policy at one or several K; the group has the largest difference first."""
+    """Return the finding on a policy at one or several K; the group has the largest difference first."""
     name, finding, row = _name(group, rows), _finding(group[0]), group[0]
     if finding == "no result":
         return f"{name} has no result yet."
@@ -121,7 +118,9 @@ def _said(row: Row) -> str:
     assert compared is not None  # as in every row whose chance was measured
     test = compared.test
     difference = f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]"
-    return f"{difference}, {_p(compared.corrected_p)}{_choice(row)}"
+    p = compared.corrected_p
+    said = f"p < {SMALLEST_SHOWN_P}" if p < SMALLEST_SHOWN_P else f"p = {p:.3f}"
+    return f"{difference}, {said}{_choice(row)}"
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -144,7 +143,3 @@ def _name(group: Sequence[Row], rows: Sequence[Row]) -> str:
 def _choice(row: Row) -> str:
     n_right = row[CHOICES].n_chose_right
     return "" if n_right is None else f"; first choice right in {n_right} of {row[EPISODES].n_episodes}"
-
-
-def _p(value: float) -> str:
-    return f"p < {SMALLEST_SAID_P}" if value < SMALLEST_SAID_P else f"p = {value:.3f}"

@@ -13,9 +13,6 @@ from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.viz.tape import Tapes
 
-VIDEO_WRITER = "vla_eval.viz.video:write_video"
-RRD_WRITER = "vla_eval.viz.rerun_log:write_rrd"
-
 
 class Capturable(Protocol):
     """The facts of an episode that decide whether it is captured."""
@@ -49,9 +46,9 @@ class EpisodeCapture:
 
     def load(self) -> None:
         """Import the writers while the worker is being set up: it takes seconds."""
-        for which, writer in ((self.config.video, VIDEO_WRITER), (self.config.rrd, RRD_WRITER)):
+        for which, writer in ((self.config.video, "video"), (self.config.rrd, "rerun_log")):
             if which != "none":
-                _import(writer)
+                importlib.import_module(f"vla_eval.viz.{writer}")
 
     def tapes(self, jobs: Sequence[Capturable]) -> Tapes | None:
         """Return the observer of a batch; None if no episode of it can be captured."""
@@ -78,7 +75,7 @@ class EpisodeCapture:
 
         Args:
             jobs: the batch.
-            tapes: what was taped of it.
+            tapes: the tapes of its episodes.
             records: its results, in the order of the jobs.
             env: what the environment offers.
             heartbeat: called before each file: the watchdog gives each the time of a step.
@@ -91,8 +88,11 @@ class EpisodeCapture:
             if tape is None:
                 continue
             if self._wants(self.config.video, job, record):
+                # Here and not above: a worker that writes no video need not wait for the encoder.
+                from vla_eval.viz.video import write_video
+
                 heartbeat("step")
-                _import(VIDEO_WRITER)(
+                write_video(
                     tape,
                     record,
                     video_file(self.folder, record),
@@ -101,15 +101,11 @@ class EpisodeCapture:
                     frame_rate_hz=env.control_hz / self.config.frame_stride,
                 )
             if self._wants(self.config.rrd, job, record):
+                from vla_eval.viz.rerun_log import write_rrd
+
                 heartbeat("step")
-                _import(RRD_WRITER)(tape, record, rrd_file(self.folder, record), env=env)
+                write_rrd(tape, record, rrd_file(self.folder, record), env=env)
 
     def _wants(self, which: Any, job: Capturable, record: EpisodeRecord) -> bool:
         index = job.seed - self.seed_start
         return is_wanted(which, run=job.run, index=index, is_success=record.outcome == "success")
-
-
-def _import(writer: str) -> Any:  # Any: the two take different arguments
-    # When it is needed: a worker that writes no rrd need not wait for rerun's import.
-    module, _, function = writer.partition(":")
-    return getattr(importlib.import_module(module), function)

@@ -17,6 +17,7 @@ from vla_eval.tasks.objects.item_names import item_names, item_rgb
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 VIEW_PX = 512  # the large view; the others are half of it, one below the other
+WIDTH_PX = VIEW_PX + VIEW_PX // 2
 PANEL_PX = 128
 LINE_PX = 24
 MARGIN_PX = 10
@@ -44,17 +45,6 @@ class Part:
     swatch: Rgb | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Caption:
-    """What is written above the images of one step."""
-
-    instruction: str
-    episode: str
-    step: tuple[Part, ...]
-    outcome: str
-    outcome_color: Rgb
-
-
 def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_held: int = 1) -> ImageArray:
     """Return one frame of an episode, (H, W, 3) uint8 with even sides.
 
@@ -66,8 +56,7 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_hel
     """
     images = taped.result.observation.images
     small = [name for name in images if name != HUMAN_CAMERA]
-    width = VIEW_PX + VIEW_PX // 2
-    canvas = Image.new("RGB", (width, VIEW_PX + PANEL_PX), PAPER)
+    canvas = Image.new("RGB", (WIDTH_PX, VIEW_PX + PANEL_PX), PAPER)
     large = HUMAN_CAMERA if HUMAN_CAMERA in images else small[0]
     canvas.paste(_scaled(images[large], VIEW_PX), (0, PANEL_PX))
     draw = ImageDraw.Draw(canvas)
@@ -77,8 +66,8 @@ def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_hel
         top = PANEL_PX + row * VIEW_PX // 2
         canvas.paste(_scaled(images[name], VIEW_PX // 2), (VIEW_PX, top))
         _label(draw, (VIEW_PX + 6, top + 4), name)
-    _write(draw, _caption(tape, taped, record, n_held), width)
-    _draw_strip(draw, tape, taped, record, width)
+    _write(draw, tape, taped, record, n_held)
+    _draw_strip(draw, tape, taped, record)
     return np.asarray(canvas, dtype=np.uint8)
 
 
@@ -94,11 +83,11 @@ def _scaled(image: ImageArray, size_px: int) -> Image.Image:
     return scaled.resize((size_px, size_px), how)
 
 
-def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held: int) -> Caption:
-    status, start = taped.result.status, tape.start
+def _step_parts(tape: EpisodeTape, taped: TapedStep, task: str, n_held: int) -> list[Part]:
+    status = taped.result.status
     n_inferences = sum(chunk.step <= taped.step for chunk in tape.chunks)
     is_new = any(chunk.step == taped.step for chunk in tape.chunks)
-    texts = [f"step {taped.step}/{start.horizon_steps}"]
+    texts = [f"step {taped.step}/{tape.start.horizon_steps}"]
     texts += [status.phase] if status.phase else []
     texts += [f"inference {n_inferences}"]
     texts += ["new chunk"] if is_new else []
@@ -106,22 +95,10 @@ def _caption(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held:
     parts = [Part(text=text) for text in texts]
     if status.n_candidates:
         parts += [
-            _item_part("target", "several", status.target, record.task, status.n_candidates),
-            _item_part("chosen", "none yet", status.first_choice, record.task, status.n_candidates),
+            _item_part("target", "several", status.target, task, status.n_candidates),
+            _item_part("chosen", "none yet", status.first_choice, task, status.n_candidates),
         ]
-    outcome, color = "", INK
-    if record.success_step is not None and taped.step >= record.success_step:
-        outcome, color = f"SUCCESS at step {record.success_step}", SUCCESS_COLOR
-    elif taped.step == tape.steps[-1].step and record.outcome == "failure":
-        outcome, color = "FAILURE", FAILURE_COLOR
-    return Caption(
-        instruction=start.instruction,
-        episode=f"{record.task}  {record.policy}  K={record.n_action_steps}  "
-        f"run {record.run}  seed {record.seed}",
-        step=tuple(parts),
-        outcome=outcome,
-        outcome_color=color,
-    )
+    return parts
 
 
 def _item_part(kind: str, missing: str, index: int | None, task: str, n_items: int) -> Part:
@@ -130,25 +107,34 @@ def _item_part(kind: str, missing: str, index: int | None, task: str, n_items: i
     return Part(text=f"{kind} {item_names(task, n_items)[index]}", swatch=item_rgb(task, n_items, index))
 
 
-def _write(draw: ImageDraw.ImageDraw, caption: Caption, width: int) -> None:
+def _write(
+    draw: ImageDraw.ImageDraw, tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, n_held: int
+) -> None:
     top = STRIP_PX + 10
     font, bold = _font(17), _font(18)
-    for index, (text, fitting, color) in enumerate(
-        ((caption.instruction, bold, INK), (caption.episode, font, FAINT))
-    ):
-        fitted = _fitted(draw, text, fitting, width - 2 * MARGIN_PX)
+    episode = (
+        f"{record.task}  {record.policy}  K={record.n_action_steps}  run {record.run}  seed {record.seed}"
+    )
+    lines = ((tape.start.instruction, bold, INK), (episode, font, FAINT))
+    for index, (text, fitting, color) in enumerate(lines):
+        fitted = _fitted(draw, text, fitting, WIDTH_PX - 2 * MARGIN_PX)
         draw.text((MARGIN_PX, top + index * LINE_PX), fitted, font=fitting, fill=color)
-    _write_parts(draw, caption.step, top + 2 * LINE_PX, width)
+    _write_parts(draw, _step_parts(tape, taped, record.task, n_held), top + 2 * LINE_PX)
     draw.text((MARGIN_PX, top + 3 * LINE_PX + 4), UNSEEN, font=_font(13), fill=FAINT)
-    size = draw.textlength(caption.outcome, font=bold)
-    place = (width - MARGIN_PX - size, top + LINE_PX)
-    draw.text(place, caption.outcome, font=bold, fill=caption.outcome_color)
+    if record.success_step is not None and taped.step >= record.success_step:
+        outcome, color = f"SUCCESS at step {record.success_step}", SUCCESS_COLOR
+    elif taped.step == tape.steps[-1].step and record.outcome == "failure":
+        outcome, color = "FAILURE", FAILURE_COLOR
+    else:
+        return
+    place = (WIDTH_PX - MARGIN_PX - draw.textlength(outcome, font=bold), top + LINE_PX)
+    draw.text(place, outcome, font=bold, fill=color)
 
 
-def _write_parts(draw: ImageDraw.ImageDraw, parts: Sequence[Part], top: int, width: int) -> None:
+def _write_parts(draw: ImageDraw.ImageDraw, parts: Sequence[Part], top: int) -> None:
     """Write the pieces of a line, each followed by its swatch, as large as they fit."""
     whole = "  |  ".join(part.text for part in parts)
-    left, room = float(MARGIN_PX), width - 2 * (MARGIN_PX + SWATCH_PX + 5)
+    left, room = float(MARGIN_PX), WIDTH_PX - 2 * (MARGIN_PX + SWATCH_PX + 5)
     font = next((one for one in map(_font, (17, 15)) if draw.textlength(whole, font=one) <= room), _font(13))
     for number, part in enumerate(parts):
         text = f"  |  {part.text}" if number else part.text
@@ -172,14 +158,14 @@ def _fitted(
 
 
 def _draw_strip(
-    draw: ImageDraw.ImageDraw, tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, width: int
+    draw: ImageDraw.ImageDraw, tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord
 ) -> None:
     """Draw the episode as a strip: phases, chunk boundaries as ticks, success, and the current step."""
     n_steps = max(tape.start.horizon_steps, 1)
     top, bottom = 2, 2 + STRIP_PX
 
     def x_of(step: int) -> float:
-        return step / n_steps * (width - 1)
+        return step / n_steps * (WIDTH_PX - 1)
 
     for one in tape.steps[:-1]:
         color = PHASE_COLORS[one.result.status.phase]

@@ -1,4 +1,4 @@
-"""The moments of an episode that tell whether it remembered: cue, reveal, touch."""
+"""The moments of an episode that show whether it remembered: cue, reveal, touch."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +35,11 @@ def find_moments(tape: EpisodeTape) -> Moments:
     has_phases = captured[0].result.status.phase in ("cue", "delay")
     reveal = response[0] if has_phases and response else captured[len(captured) // 2]
     # Where several candidates are right, the first touch is not the answer yet.
-    touched = [one for one in captured if _has_one_target(one) and one.result.status.first_choice is not None]
+    touched = [
+        one
+        for one in captured
+        if one.result.status.target is not None and one.result.status.first_choice is not None
+    ]
     return Moments(cue=captured[0], reveal=reveal, touch=touched[0] if touched else captured[-1])
 
 
@@ -64,10 +68,6 @@ def read_stills(path: Path) -> tuple[ImageArray, ...]:
         shown = image.convert("RGB").resize((n_moments * STILL_PX, STILL_PX), Image.Resampling.LANCZOS)
     pixels = np.asarray(shown, dtype=np.uint8)
     return tuple(np.split(pixels, n_moments, axis=1))
-
-
-def _has_one_target(taped: TapedStep) -> bool:
-    return taped.result.status.target is not None
 
 
 def _view(taped: TapedStep) -> ImageArray:

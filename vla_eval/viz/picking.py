@@ -1,7 +1,7 @@
 """Find the rerun files of a run for the viewer, or explain why there are none."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vla_eval.errors import ViewingError, unknown_name
@@ -34,21 +34,15 @@ def pick(run: StoredRun, wish: Wish) -> list[Path]:
         known = {str(getattr(record, name)) for record in run.records}
         if wanted is not None and str(wanted) not in known:
             raise unknown_name(name, str(wanted), known, where=str(run.path))
-    wished = [record for record in run.records if _fits(record, wish)]
+    wished = [
+        record
+        for record in run.records
+        if all(wanted in (None, getattr(record, name)) for name, wanted in asdict(wish).items())
+    ]
     found = [rrd_file(run.path, record) for record in wished if rrd_file(run.path, record).is_file()]
     if not found:
         raise ViewingError(_why_none(run, wished, wish))
     return found
-
-
-def _fits(record: EpisodeRecord, wish: Wish) -> bool:
-    pairs = (
-        (wish.task, record.task),
-        (wish.policy, record.policy),
-        (wish.n_action_steps, record.n_action_steps),
-        (wish.seed, record.seed),
-    )
-    return all(wanted is None or wanted == found for wanted, found in pairs)
 
 
 def _why_none(run: StoredRun, wished: Sequence[EpisodeRecord], wish: Wish) -> str:

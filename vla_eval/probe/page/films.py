@@ -8,7 +8,8 @@ from PIL import Image
 
 from vla_eval.page.probe_section import FilmFrame, FilmPair, Filmstrip
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.find_worlds import FoundWorld
+from vla_eval.probe.find_worlds import Found
+from vla_eval.probe.worlds import World
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import video_file
 from vla_eval.storage.run_folder import StoredRun
@@ -21,7 +22,7 @@ WIDTH_PX = 340  # twice of what the page shows, for screens with fine pixels
 JPEG_QUALITY = 75
 
 
-def film_pairs(worlds: Sequence[FoundWorld], pairs: Sequence[ChoicePairs]) -> tuple[FilmPair, ...]:
+def film_pairs(worlds: Sequence[Found[World]], pairs: Sequence[ChoicePairs]) -> tuple[FilmPair, ...]:
     """Return the first captured pair of each policy with a swapped cue, of `MOST_PAIRS` policies.
 
     Raises:

@@ -24,7 +24,7 @@ def heat_maps(table: GridTable) -> dict[Group, list[HeatMap]]:
 def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
     """Write a PNG file per task and phase, `OUT_TASK_delay.png`, and return their paths.
 
-    They are beside the folder and not in it, so that all it holds are run folders.
+    They go next to the folder, which holds run folders alone.
 
     Args:
         table: the grid.
@@ -33,10 +33,8 @@ def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
     Raises:
         ReportError: a file cannot be written.
     """
-    return [
-        write_beside(folder, f"{task}_{axis}", heat_png(maps))
-        for (task, axis), maps in heat_maps(table).items()
-    ]
+    found = heat_maps(table)
+    return write_beside(folder, {f"{task}_{axis}": heat_png(maps) for (task, axis), maps in found.items()})
 
 
 def _heat_map(policy: str, cells: list[GridCell]) -> HeatMap:

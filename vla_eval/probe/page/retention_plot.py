@@ -2,59 +2,49 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.page.charts import Point, Series, curves_png
+from vla_eval.page.charts import Curves, Point, Series, curves_png
 from vla_eval.probe.page.png_files import write_beside
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeTable
 
-X_TITLE = "delay, steps (logarithmic)"
 CURVES: dict[str, str] = {
     "follows": "follows the cue",
     "warranted_choice": "follows the cue in both worlds",
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetentionLines:
-    """Curves of the same kind and task, on a logarithmic axis that has a place for a delay of 0."""
-
-    series: tuple[Series, ...]
-    x_ticks: tuple[float, ...]
-    x_labels: tuple[str, ...]
-
-
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     """Write a PNG file per task and kind of curve, such as `OUT_TASK_follows.png`, and return their paths.
 
-    They are beside the folder and not in it, so that all it holds are run folders.
+    They go next to the folder, which holds run folders alone.
 
     Raises:
         ReportError: a file cannot be written.
     """
-    written = []
-    for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
-        own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
-        written.append(write_beside(folder, f"{task}_{of}", retention_png(own)))
-    return written
+    curves = by_kind(table.retention)
+    return write_beside(folder, {f"{own[0].task}_{own[0].of}": retention_png(own) for own in curves})
+
+
+def by_kind(curves: Sequence[Retention]) -> list[list[Retention]]:
+    """Return the curves of each task and kind, which are drawn together."""
+    kinds = dict.fromkeys((curve.task, curve.of) for curve in curves)
+    return [[curve for curve in curves if (curve.task, curve.of) == kind] for kind in kinds]
+
+
+def line_colors(curves: Sequence[Retention]) -> dict[str, int]:
+    """Return the color of each curve by the name of its line."""
+    return {name: number for number, name in enumerate(dict.fromkeys(map(line_name, curves)))}
 
 
 def retention_png(curves: Sequence[Retention]) -> bytes:
     """Return curves of one task and kind; the same curves give the same bytes."""
-    lines = retention_lines(curves, {name: n for n, name in enumerate(dict.fromkeys(map(line_name, curves)))})
-    return curves_png(
-        lines.series,
-        title=f"{curves[0].task}: {CURVES[curves[0].of]}",
-        x_title=X_TITLE,
-        x_ticks=lines.x_ticks,
-        x_labels=lines.x_labels,
-    )
+    return curves_png(retention_lines(curves, line_colors(curves)))
 
 
-def retention_lines(curves: Sequence[Retention], colors: Mapping[str, int]) -> RetentionLines:
-    """Return what is drawn of curves of one task and kind, with the chance level where it is known."""
+def retention_lines(curves: Sequence[Retention], colors: Mapping[str, int]) -> Curves:
+    """Return curves of one task and kind on a logarithmic axis, with the chance level where it is known."""
     delays = sorted({point.delay_steps for curve in curves for point in curve.points})
     series = [
         Series(
@@ -67,19 +57,22 @@ def retention_lines(curves: Sequence[Retention], colors: Mapping[str, int]) -> R
         )
         for curve in curves
     ]
-    chances = {
-        point.delay_steps: point.chance
-        for curve in curves
-        for point in curve.points
-        if point.chance is not None
-    }
+    points = [point for curve in curves for point in curve.points]
+    chances = {point.delay_steps: point.chance for point in points if point.chance is not None}
     if chances:
-        points = tuple(Point(_x(delay), chances[delay]) for delay in sorted(chances))
-        series.append(Series(name="chance", color=0, points=points, kind="chance"))
-    return RetentionLines(
-        series=tuple(series),
-        x_ticks=tuple(_x(delay) for delay in delays),
-        x_labels=tuple(str(delay) for delay in delays),
+        level = tuple(Point(_x(delay), chances[delay]) for delay in sorted(chances))
+        series.append(Series(name="chance", color=0, points=level, kind="chance"))
+    said = {
+        line_name(curve): [f"{p.share.n} of {p.share.of} after {p.delay_steps}" for p in curve.points]
+        for curve in curves
+    }
+    return Curves(
+        series=series,
+        title=f"{curves[0].task}: {CURVES[curves[0].of]}",
+        description="; ".join(f"{name}: {', '.join(words)}" for name, words in said.items()),
+        x_title="delay, steps (logarithmic)",
+        x_ticks=[_x(delay) for delay in delays],
+        x_labels=[str(delay) for delay in delays],
     )
 
 

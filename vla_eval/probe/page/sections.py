@@ -2,24 +2,22 @@
 
 from collections.abc import Sequence
 
-from vla_eval.page.charts import Chart, curves, reference_sign, sign
+from vla_eval.page.charts import curves, reference_sign, sign
 from vla_eval.page.heat import heat_chart
-from vla_eval.page.probe_section import PairMatrix, ProbeSection
-from vla_eval.page.rates import Plots, Sign, printed_on_page
-from vla_eval.page.tables import DARKEST, UNKNOWN, MatrixCell, PageTable, page_table
+from vla_eval.page.probe_section import ProbeSection
+from vla_eval.page.rates import Plots, Sign
+from vla_eval.page.tables import Matrix, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.find_worlds import FoundGridWorld, FoundProbe, find_probes
-from vla_eval.probe.found_tables import found_grid, found_pairs, found_table
+from vla_eval.probe.find_worlds import FoundProbe, find_probes
 from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_text import printed_grid
 from vla_eval.probe.page.films import film_pairs
 from vla_eval.probe.page.heat_maps import heat_maps
-from vla_eval.probe.page.retention_plot import CURVES, X_TITLE, line_name, retention_lines
+from vla_eval.probe.page.retention_plot import CURVES, by_kind, line_colors, line_name, retention_lines
 from vla_eval.probe.probe_text import printed_probe
-from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import half_life_text, notes, sentences
 from vla_eval.probe.table import ProbeTable
-from vla_eval.results.printed_table import PrintedTable
+from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.storage.run_folder import StoredRun
 
 
@@ -30,15 +28,15 @@ def probe_sections(runs: Sequence[StoredRun]) -> list[ProbeSection]:
         if probe.worlds:
             sections.append(_probe_section(probe))
         if probe.grid:
-            sections.append(_grid_section(f"{probe.folder}: grid", probe.grid))
+            sections.append(_grid_section(probe))
     return sections
 
 
 def _probe_section(probe: FoundProbe) -> ProbeSection:
-    table, pairs = found_table(probe.worlds), found_pairs(probe.worlds)
+    table, pairs = probe.table(), probe.pairs()
     return ProbeSection(
         title=str(probe.folder),
-        table=_page_table(printed_probe(table)),
+        table=printed_probe(table),
         sentences=tuple(sentences(table)),
         notes=(*notes(table), *probe.doubles),
         plots=_retention_plots(table) if table.retention else None,
@@ -48,11 +46,11 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
     )
 
 
-def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
-    table = found_grid(worlds)
+def _grid_section(probe: FoundProbe) -> ProbeSection:
+    table = probe.grid_table()
     return ProbeSection(
-        title=title,
-        table=_page_table(printed_grid(table)),
+        title=f"{probe.folder}: grid",
+        table=printed_grid(table),
         sentences=tuple(grid_sentences(table)),
         notes=tuple(grid_notes(table)),
         heat=tuple(
@@ -62,31 +60,24 @@ def _grid_section(title: str, worlds: Sequence[FoundGridWorld]) -> ProbeSection:
     )
 
 
-def _page_table(table: PrintedTable) -> PageTable:
-    return printed_on_page(table, table.sentence or "Every row")
-
-
 def _retention_plots(table: ProbeTable) -> Plots:
     """Draw the retention curves, one chart per task and kind of curve; delays on a logarithmic axis."""
-    names = {name: number for number, name in enumerate(dict.fromkeys(map(line_name, table.retention)))}
-    charts: list[Chart] = []
-    for task, of in dict.fromkeys((curve.task, curve.of) for curve in table.retention):
-        own = [curve for curve in table.retention if (curve.task, curve.of) == (task, of)]
-        charts.append(_chart(task, of, own, names))
+    colors = line_colors(table.retention)
     legend = (
-        *(Sign(name, sign(number, is_line=False)) for name, number in names.items()),
+        *(Sign(name, sign(number, is_line=False)) for name, number in colors.items()),
         Sign("chance", reference_sign("chance")),
     )
+    charts = (curves(retention_lines(own, colors)) for own in by_kind(table.retention))
     return Plots(legend=legend, charts=tuple(charts))
 
 
-def _half_lives(table: ProbeTable) -> PageTable:
+def _half_lives(table: ProbeTable) -> PrintedTable:
     rows = [
         [
             f"{curve.task} · {line_name(curve)}",
             CURVES[curve.of],
-            UNKNOWN if curve.half_life is None else half_life_text(curve.half_life),
-            UNKNOWN if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
+            UNDEFINED if curve.half_life is None else half_life_text(curve.half_life),
+            UNDEFINED if curve.points[0].chance is None else f"{curve.points[0].chance:.2f}",
         ]
         for curve in table.retention
     ]
@@ -94,40 +85,18 @@ def _half_lives(table: ProbeTable) -> PageTable:
         rows,
         text=("policy", "curve", "half-life"),
         numbers=("chance",),
-        caption="Half-lives; —: at the shortest delay no better than chance",
     )
 
 
-def _chart(task: str, of: str, own: Sequence[Retention], names: dict[str, int]) -> Chart:
-    lines = retention_lines(own, names)
-    said = "; ".join(f"{line_name(curve)}: {_points_in_words(curve)}" for curve in own)
-    return curves(
-        lines.series,
-        title=f"{task}: {CURVES[of]}",
-        description=said,
-        x_title=X_TITLE,
-        x_ticks=lines.x_ticks,
-        x_labels=lines.x_labels,
-    )
-
-
-def _points_in_words(curve: Retention) -> str:
-    return ", ".join(f"{p.share.n} of {p.share.of} after {p.delay_steps}" for p in curve.points)
-
-
-def _matrix(pairs: ChoicePairs) -> PairMatrix:
-    most = max(pairs.counts.values())
+def _matrix(pairs: ChoicePairs) -> Matrix:
     indices = range(len(pairs.names))
-    return PairMatrix(
+    return Matrix(
         title=f"{pairs.world.task}, {pairs.policy} · K={pairs.n_action_steps}: as drawn (rows), "
         f"{pairs.world.label} (columns)",
         names=pairs.names,
-        rows=tuple(
-            tuple(
-                MatrixCell(n, DARKEST * n / most, pairs.is_right(row, column))
-                for column in indices
-                for n in (pairs.count(row, column),)
-            )
-            for row in indices
+        columns=pairs.names,
+        rows=shaded(
+            [[pairs.counts.get((row, column), 0) for column in indices] for row in indices],
+            lambda row, column: (row, column) in pairs.following,
         ),
     )

@@ -1,6 +1,6 @@
 """Published results as data, from `published.yaml`, which ships with the package. Knows no format.
 
-A value that a source does not state is None. They are printed beside measured rows, never among them.
+A value that a source does not state is None. They are printed below measured rows, never among them.
 """
 
 import functools

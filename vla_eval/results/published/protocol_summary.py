@@ -124,7 +124,7 @@ def _with_figure(row: ProtocolRow, groups: Sequence[RowEpisodes]) -> ProtocolRow
 def _departures(
     protocol: Protocol, label: RowKey, found: Mapping[str, RowEpisodes], tasks: Sequence[str]
 ) -> Iterator[str]:
-    """Yield what is missing or too much of tasks, K, runs and seeds."""
+    """Yield missing and additional tasks, K, runs and seeds."""
     absent = [task for task in tasks if task not in found]
     if absent:
         yield f"{len(found)} of {len(tasks)} tasks, without {some_of(absent)}"
@@ -147,13 +147,9 @@ def _run_departures(protocol: Protocol, found: Mapping[str, RowEpisodes]) -> Ite
         yield f"{some_of(counts)} of {protocol.runs} runs"
     elif len({frozenset(runs) for runs in runs_of.values()}) > 1:
         yield "other runs in one task than in another"
-    if protocol.runs is not None and any(_shares_weights(group) for group in found.values()):
+    weights = [[run.weights for run in group.runs if run.weights] for group in found.values()]
+    if protocol.runs is not None and any(len(set(of_task)) < len(of_task) for of_task in weights):
         yield f"the same weights in several runs instead of {protocol.runs} training runs"
-
-
-def _shares_weights(group: RowEpisodes) -> bool:
-    weights = [run.weights for run in group.runs if run.weights]
-    return len(set(weights)) < len(weights)
 
 
 def _seed_departures(protocol: Protocol, group: RowEpisodes) -> Iterator[str]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from vla_eval.results.own_statistics import rate
+from vla_eval.results.own_statistics import mean_text, rate
 from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
 from vla_eval.results.success_table import ProtocolRow, Table
 
@@ -39,10 +39,7 @@ def protocol_side_table(table: Table) -> SideTable:
 
 
 def _mean(row: ProtocolRow) -> str:
-    if row.mean is None:
-        return NOT_THE_PROTOCOL
-    sem = "" if row.sem is None else f" ± {row.sem:.2f}"
-    return f"{row.mean:.2f}{sem} [{rate(row.ci_low)}, {rate(row.ci_high)}]"
+    return NOT_THE_PROTOCOL if row.mean is None else mean_text(row.mean, row.sem, row.ci_low, row.ci_high)
 
 
 def _spread(row: ProtocolRow) -> str:

@@ -76,10 +76,11 @@ _PAPER_COLUMNS: tuple[Column[PaperFigure], ...] = (
 
 
 def _how_measured(published: Published, results: Sequence[PublishedResult]) -> SideTable:
+    titles = {name: source.title for name, source in published.sources.items()}
     columns: list[Column[PublishedResult]] = [
         Column("method", lambda one: one.label, is_number=False),
         Column("kind", lambda one: one.family, is_number=False),
-        Column("source", partial(_source, published), is_number=False),
+        Column("source", lambda one: ", ".join(filter(None, (titles[one.source], one.where))), False),
         Column("control mode", lambda one: one.control_mode or UNDEFINED, is_number=False),
         Column("image", lambda one: f"{one.image_px} px" if one.image_px else UNDEFINED, is_number=False),
         Column("models", lambda one: one.training or UNDEFINED, is_number=False),
@@ -92,10 +93,6 @@ def _how_measured(published: Published, results: Sequence[PublishedResult]) -> S
         columns=columns,
         rows=cells_of(columns, results),
     )
-
-
-def _source(published: Published, result: PublishedResult) -> str:
-    return ", ".join(filter(None, (published.sources[result.source].title, result.where)))
 
 
 def _rate(task: str, result: PublishedResult) -> str:
@@ -125,13 +122,9 @@ def _notes(published: Published, results: Sequence[PublishedResult]) -> Iterator
         for task, text in one.contested.items():
             yield f"{CONTESTED} contested: {one.method} on {task}, {text}."
     for one in results:
+        k = "" if one.n_action_steps is None else f" at K = {one.n_action_steps}"
         if one.differs:
-            yield f"{_named(one)}: {'; '.join(one.differs)}."
-
-
-def _named(result: PublishedResult) -> str:
-    k = "" if result.n_action_steps is None else f" at K = {result.n_action_steps}"
-    return f"{result.label}{k}"
+            yield f"{one.label}{k}: {'; '.join(one.differs)}."
 
 
 def _csv_rows(published: Published, result: PublishedResult) -> Iterator[dict[str, object]]:

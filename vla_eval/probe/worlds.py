@@ -1,0 +1,202 @@
+"""The worlds of a probe: a task with one thing changed, on the same seeds.
+
+What is changed is the cue, the length of the delay, the policy's memory … Knows nothing of records or
+statistics.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from vla_eval.config.appearance import AppearanceSettings
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.cue_view import CueViewKind
+from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
+from vla_eval.tasks.spec import TaskSpec
+
+Intervention = str
+"""`AS_DRAWN`, or a key of `interventions.INTERVENTIONS`."""
+AS_DRAWN: Intervention = "none"
+SWAPS: tuple[Intervention, ...] = ("swap", "order", "delay_swap")
+"""Interventions whose worlds have another right answer than the world that they are compared with."""
+
+Level = int | str | None
+"""By how much a world is changed: a number, or a name; None where there is nothing to count."""
+
+CONTROLS = ("oracle", "cue_blind")
+CONTROLS_OF_ONE = ("body_memory",)
+"""Controls that need a single right candidate."""
+
+ITEMS = ("items", "cubes")
+"""Kinds of candidates that can be shown, and so can distract."""
+
+
+MASKS: Mapping[str, CueViewKind] = {
+    "cue": "hidden",
+    "elsewhere": "hidden_elsewhere",
+    "later": "hidden_later",
+}
+"""What of the image is hidden: the cue, as much of the same frames, the same place in the delay."""
+
+APPEARANCES: Mapping[str, AppearanceSettings] = {
+    "light": AppearanceSettings(light=0.6),
+    "camera": AppearanceSettings(camera_shift_m=0.03, camera_turn_deg=3.0),
+    "table": AppearanceSettings(table_rgb=(0.5, 0.5, 0.5)),
+    "hue": AppearanceSettings(hue_deg=10.0),
+}
+"""Changes that leave each colour nearer to itself than to any other of the nine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeSettings:
+    """What a probe changes.
+
+    Attributes:
+        probes: keys of `interventions.INTERVENTIONS`.
+        swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
+        delays: values of `env.delay_steps`.
+        cues: values of `env.cue_steps`.
+        masks: keys of `MASKS`.
+        lates: values of `env.cue_after_steps`.
+        appearances: keys of `APPEARANCES`.
+        distractors: values of `env.distract_steps`.
+        instructions: prompt sets.
+        reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
+            of the response if that is later.
+        controls: whether the controls are run with the policies.
+    """
+
+    probes: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
+    swaps: tuple[int, ...] = (1,)
+    delays: tuple[int, ...] = (0, 5, 10, 20, 40, 80, 160, 320)
+    cues: tuple[int, ...] = (1, 2, 3)
+    masks: tuple[str, ...] = tuple(MASKS)
+    lates: tuple[int, ...] = (5, 20)
+    appearances: tuple[str, ...] = tuple(APPEARANCES)
+    distractors: tuple[int, ...] = (3,)
+    instructions: tuple[str, ...] = ("paraphrased", "other_task", "no_content")
+    reset_steps: tuple[int, ...] = ()
+    controls: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class World:
+    """One evaluation of a probe.
+
+    Attributes:
+        task: task id.
+        intervention: what is changed; `none` for the world that the others are compared with. `delay_swap`
+            is compared with the `delay` of the same level.
+        level: by how much: the swap's number, a number of steps, the step of a reset, or a prompt set.
+        config: the evaluation of this task; its name is the run folder's.
+    """
+
+    task: str
+    intervention: Intervention
+    level: Level
+    config: EvalConfig
+
+    @property
+    def label(self) -> str:
+        """What is changed and by how much: `swap 1`."""
+        return label_of(self.intervention, self.level)
+
+
+def label_of(intervention: Intervention, level: Level) -> str:
+    """Return what is changed in a world, and by how much."""
+    return intervention if level is None else f"{intervention} {level}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskWorlds:
+    """The worlds of one task."""
+
+    spec: TaskSpec
+    config: EvalConfig
+    settings: ProbeSettings
+
+    @property
+    def has_phases(self) -> bool:
+        """Whether the task has phases, in which something can be changed."""
+        return self.spec.candidates is not None
+
+    @property
+    def phases(self) -> Phases:
+        """The phases of the world as drawn; only asked of tasks with phases."""
+        return fixed_phases(self.spec, self.config.env)
+
+    def of_lengths(self, phase: Literal["cue", "delay"], lengths: tuple[int, ...]) -> list[World]:
+        """Return the worlds in which a phase has another length, with as many steps for the response."""
+        phases = self.phases
+        usual = phases.cue_steps if phase == "cue" else phases.delay_steps
+        return [
+            self.world(phase, length, phases.with_length(phase, length))
+            for length in sorted(set(lengths) - {usual})
+        ]
+
+    def swapped_after_delays(self) -> list[World]:
+        """Return the worlds of each delay, as drawn and with the first of the other cues."""
+        delays, swap = self.of_lengths("delay", self.settings.delays), self.settings.swaps[0]
+        swapped = [
+            self.world("delay_swap", world.level, {**world.config.env, "swap_cue": swap}) for world in delays
+        ]
+        return [self.world("swap", swap, {"swap_cue": swap}), *delays, *swapped]
+
+    def masked(self) -> list[World]:
+        """Return the worlds in which a part of the image is hidden, in the delay only if there is one."""
+        has_delay = self.phases.delay_steps > 0
+        masks = [mask for mask in self.settings.masks if mask != "later" or has_delay]
+        return [self.world("mask", mask, cue_view=MASKS[mask]) for mask in masks]
+
+    def late(self) -> list[World]:
+        """Return the worlds in which nothing is shown before the cue, with as many steps after it."""
+        horizon_steps = self.phases.horizon_steps
+        return [
+            self.world("late", steps, {"cue_after_steps": steps, "horizon_steps": horizon_steps + steps})
+            for steps in self.settings.lates
+        ]
+
+    def distracted(self) -> list[World]:
+        """Return the worlds with another item in the delay, if the delay is long enough."""
+        longest = self.phases.delay_steps if self.spec.candidates in ITEMS else 0
+        lengths = [length for length in self.settings.distractors if length <= longest]
+        return [self.world("distractor", length, {"distract_steps": length}) for length in lengths]
+
+    def reset_steps(self) -> tuple[int, ...]:
+        """Return the steps at which the policy is reset: those asked for, or the ends of phases."""
+        if self.settings.reset_steps or not self.has_phases:
+            return self.settings.reset_steps
+        return tuple(dict.fromkeys((self.phases.cue_end_step, self.phases.response_step)))
+
+    def world(
+        self,
+        intervention: Intervention,
+        level: Level,
+        env: Mapping[str, object] | None = None,
+        **fields: Any,  # Any: other fields of `EvalConfig`
+    ) -> World:
+        """Return the world with these arguments of the task, and fields of the evaluation, changed."""
+        policies = [*self.config.policies]
+        if self.settings.controls:
+            policies += [control for control in self._controls() if control not in policies]
+        # Written out, so that this world is one level of the delay whatever the simulator's default is.
+        delay = {"delay_steps": default_delay_steps(self.spec)} if self.has_phases else {}
+        config = replace(
+            self.config,
+            name="_".join([self.spec.id, intervention, *([] if level is None else [str(level)])]),
+            tasks=(self.spec.id,),
+            policies=tuple(policies),
+            env={**delay, **self.config.env, **(env or {})},
+            **fields,
+        )
+        return World(task=self.spec.id, intervention=intervention, level=level, config=config)
+
+    def _controls(self) -> tuple[str, ...]:
+        shows_several = "n_shown" in (*self.spec.kwargs, *self.spec.open_arguments)
+        return (*CONTROLS, *CONTROLS_OF_ONE) if self.has_phases and not shows_several else CONTROLS
+
+
+def delay_of(config: EvalConfig) -> int | None:
+    """Return the delay of a world; None for a task without one, or if it is drawn per episode."""
+    delay = config.env.get("delay_steps")
+    return delay if isinstance(delay, int) else None
