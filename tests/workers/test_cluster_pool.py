@@ -13,8 +13,7 @@ from vla_eval.workers.cluster import pool as pool_module
 from vla_eval.workers.cluster.actor import Place
 from vla_eval.workers.cluster.machines import Machine
 from vla_eval.workers.cluster.pool import MAX_JOBS_PER_CALL, MAX_LOSSES, ClusterPool
-from vla_eval.workers.job_list import JobList
-from vla_eval.workers.jobs import Answered
+from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.messages import Failed
 from vla_eval.workers.process import WorkerSpec
 

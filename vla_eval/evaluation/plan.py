@@ -7,7 +7,7 @@ first episode. Knows nothing of processes or files of results.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
-from typing import Any, NamedTuple
+from typing import Any
 
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.notes import (
@@ -121,12 +121,14 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = resolved.shared
-    found = _groups_of_all(config, tasks, policies, prompts=prompts, servers=servers, shared=shared)
-    if not found.groups:
-        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(found.left_out)}).")
-    _refuse_too_many(config, found.groups)
+    groups, left_out = _groups_of_all(
+        config, tasks, policies, prompts=prompts, servers=servers, shared=shared
+    )
+    if not groups:
+        raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
+    _refuse_too_many(config, groups)
     plan = Plan(
-        jobs=tuple(job for group in found.groups for job in _jobs(config, group)),
+        jobs=tuple(job for group in groups for job in _jobs(config, group)),
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
         normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
@@ -138,9 +140,9 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
         task_versions={task.id: task.version for task in tasks},
         policy_names=tuple(policy.name for policy in policies),
         shared=shared,
-        left_out=tuple(found.left_out),
+        left_out=tuple(left_out),
         max_workers=_max_workers(policies, shared),
-        ignored=_ignored(found.groups),
+        ignored=_ignored(groups),
     )
     return plan if resolved.shard is None else _shard_of(plan, config, resolved.shard)
 
@@ -154,13 +156,6 @@ def _shard_of(plan: Plan, config: EvalConfig, shard: Shard) -> Plan:
     return replace(plan, jobs=jobs, shard=own)
 
 
-class _Found(NamedTuple):
-    """The groups of a plan, and which pairs are left out."""
-
-    groups: list[EpisodeGroup]
-    left_out: list[str]
-
-
 def _groups_of_all(
     config: EvalConfig,
     tasks: Sequence[TaskSpec],
@@ -169,23 +164,22 @@ def _groups_of_all(
     prompts: Recipe[PromptRecipe],
     servers: Mapping[str, ServerMetadata],
     shared: Mapping[str, str],
-) -> _Found:
-    """Return the groups of every task and policy that make sense together."""
-    found = _Found([], [])
+) -> tuple[list[EpisodeGroup], list[str]]:
+    """Return the groups of every task and policy that make sense together, and which pairs are left out."""
+    groups: list[EpisodeGroup] = []
+    left_out: list[str] = []
     for task in tasks:
         check_arguments(task, config.env, TASKS.values())
         instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and not task.has_candidates:
-                found.left_out.append(
-                    f"{policy.name} on {task.id}: it needs candidates, and this task has none"
-                )
+                left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
             server = servers.get(policy.name)
-            found.groups.extend(_groups(config, task, policy, instruction, server, n_rows=n_rows))
-    return found
+            groups.extend(_groups(config, task, policy, instruction, server, n_rows=n_rows))
+    return groups, left_out
 
 
 def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:

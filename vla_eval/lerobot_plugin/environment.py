@@ -5,9 +5,9 @@ no seeds in its results. For figures use `mikasa-vla eval`.
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any  # lerobot and gymnasium's vector environments are untyped here
+from typing import Any, Literal  # lerobot and gymnasium's vector environments are untyped here
 
 import gymnasium as gym
 import numpy as np
@@ -249,14 +249,11 @@ def _state_kind(name: str) -> StateKind:
 
 
 def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
-    known: Mapping[str, RenderSettings] = {
-        "shipped": RenderSettings(wrist_mesh="shipped", backend=backend),
-        "whole": RenderSettings(wrist_mesh="whole", backend=backend),
-        "simplified": RenderSettings(wrist_mesh="simplified", backend=backend),
-    }
-    if wrist_mesh not in known:
-        raise unknown_name("mesh", wrist_mesh, known, where="env.wrist_mesh")
-    return known[wrist_mesh]
+    meshes: tuple[Literal["shipped", "whole", "simplified"], ...] = ("shipped", "whole", "simplified")
+    for known in meshes:
+        if known == wrist_mesh:
+            return RenderSettings(wrist_mesh=known, backend=backend)
+    raise unknown_name("mesh", wrist_mesh, meshes, where="env.wrist_mesh")
 
 
 def _vector(make: Callable[[], MikasaGym], n_envs: int, *, in_processes: bool) -> Any:

@@ -34,8 +34,6 @@ class Inference(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Begin:
-    """Begin an episode."""
-
     start: EpisodeStart
     done: Future[None] = field(default_factory=Future)
 
@@ -46,8 +44,6 @@ class _Begin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Infer:
-    """Infer a chunk."""
-
     start: EpisodeStart
     window: ObservationWindow
     asked_at: float
@@ -60,8 +56,6 @@ class _Infer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Forget:
-    """Forget a slot."""
-
     slot: int
     done: Future[None] = field(default_factory=Future)
 

@@ -4,7 +4,7 @@ The environment that the policy is made for is the description of ours; an evalu
 its own simulator.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # Any: arguments of an adapter
 
@@ -105,11 +105,7 @@ def host_policy(options: HostOptions) -> HostedPolicy:
     reader = observation_reader(policy.spec, env, end_effector=end_effector)
     return HostedPolicy(
         policy=policy,
-        metadata=replace(
-            _describe(policy, recipe, reader, env, hashes),
-            n_action_steps=options.n_action_steps or recipe.value.default_n_action_steps,
-            batch_max=options.max_batch if isinstance(policy, BatchPolicy) else 1,
-        ),
+        metadata=_describe(policy, recipe, reader, env, hashes, options),
         reader=reader,
         task=env.task,
         ignored=ignored_fields(recipe.value.adapter, recipe.value.args),
@@ -165,6 +161,7 @@ def _describe(
     reader: ObservationReader,
     env: EnvSpec,
     hashes: dict[str, str],
+    options: HostOptions,
 ) -> ServerMetadata:
     layouts = reader.state_layouts
     weights = {name: digest for name, digest in hashes.items() if name.startswith("checkpoints/")}
@@ -177,6 +174,7 @@ def _describe(
         weights_sha256=_digest(weights),
         recipe_sha256=recipe.sha256,
         chunk_size=policy.spec.chunk_size,
+        n_action_steps=options.n_action_steps or recipe.value.default_n_action_steps,
         control_mode=env.action.control_mode,
         action_dims=env.action.dims,
         control_hz=env.control_hz,
@@ -187,6 +185,7 @@ def _describe(
         prompt_key=PROMPT_WIRE_KEY,
         needs_every_frame=policy.spec.reads == "every",
         needs_session_id=True,
+        batch_max=options.max_batch if isinstance(policy, BatchPolicy) else 1,
         supports=SUPPORTS,
         versions={name: version for name, version in versions.items() if version is not None},
         training_seeds=training_seeds(recipe.value.adapter, recipe.value.args) or None,

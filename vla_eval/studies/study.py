@@ -89,16 +89,9 @@ def finetune_study(
     missing = unfinished(study)
     say(describe_effort(study.table, n_finished=len(everything) - len(missing)))
     _check(study.table, missing)
-    todo = [
-        one._replace(
-            config=replace(
-                one.config,
-                device=device,
-                allow_unreplayed=allow_unreplayed or one.config.allow_unreplayed,
-            )
-        )
-        for one in missing
-    ]
+    todo = [one._replace(config=replace(one.config, device=device)) for one in missing]
+    if allow_unreplayed:
+        todo = [one._replace(config=replace(one.config, allow_unreplayed=True)) for one in todo]
     if backend is LOCAL:
         return _finetune_here(study, todo, say=say, is_stopping=is_stopping)
     from vla_eval.studies.table_on_cluster import finetune_on

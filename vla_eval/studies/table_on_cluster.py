@@ -10,8 +10,7 @@ from vla_eval.evaluation.model_table import Finetuning
 from vla_eval.strict.bounds import MAX_SECONDS
 from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob, finetune_main
 from vla_eval.workers.backend import Backend, Pool
-from vla_eval.workers.job_list import JobList
-from vla_eval.workers.jobs import Answered
+from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.messages import Failed
 from vla_eval.workers.process import WorkerSpec
 

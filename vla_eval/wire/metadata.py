@@ -205,43 +205,27 @@ def _names(value: Any) -> tuple[str, ...] | None:
     return tuple(value) if is_list else None
 
 
-def _layouts(value: Any) -> dict[str, tuple[str, ...]] | None:
-    if not isinstance(value, Mapping):
-        return None
-    read = {name: _names(dims) for name, dims in value.items()}
-    return (
-        {name: dims for name, dims in read.items() if dims is not None} if None not in read.values() else None
-    )
+def _map_of(read_item: Callable[[Any], Any]) -> Callable[[Any], dict[str, Any] | None]:
+    def read(value: Any) -> dict[str, Any] | None:
+        items = (
+            {name: read_item(item) for name, item in value.items()} if isinstance(value, Mapping) else None
+        )
+        return None if items is None or any(item is None for item in items.values()) else items
 
-
-def _seeds(value: Any) -> dict[str, tuple[SeedRange, ...]] | None:
-    if not isinstance(value, Mapping):
-        return None
-    read: dict[str, tuple[SeedRange, ...]] = {}
-    for task, pairs in value.items():
-        if not isinstance(pairs, list | tuple) or not all(isinstance(pair, list | tuple) for pair in pairs):
-            return None
-        numbers = [[_count(0, MAX_SEED)(number) for number in pair] for pair in pairs]
-        if any(len(pair) != 2 or None in pair for pair in numbers):
-            return None
-        read[str(task)] = tuple(SeedRange(first=first or 0, last=last or 0) for first, last in numbers)
     return read
 
 
-def _texts(value: Any) -> dict[str, str] | None:
-    is_map = isinstance(value, Mapping) and all(isinstance(item, str) for item in value.values())
-    return dict(value) if is_map else None
-
-
-def _cameras(value: Any) -> dict[str, CameraImage] | None:
-    if not isinstance(value, Mapping):
+def _seeds(pairs: Any) -> tuple[SeedRange, ...] | None:
+    if not isinstance(pairs, list | tuple) or not all(isinstance(pair, list | tuple) for pair in pairs):
         return None
-    read = {name: _camera(image) for name, image in value.items()}
-    return (
-        {name: image for name, image in read.items() if image is not None}
-        if None not in read.values()
-        else None
-    )
+    numbers = [[_count(0, MAX_SEED)(number) for number in pair] for pair in pairs]
+    if any(len(pair) != 2 or None in pair for pair in numbers):
+        return None
+    return tuple(SeedRange(first=first or 0, last=last or 0) for first, last in numbers)
+
+
+def _any_text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 def _camera(value: Any) -> CameraImage | None:
@@ -264,19 +248,19 @@ _READERS = {
     "control_mode": _Reader("text", _text),
     "action_dims": _Reader("a list of names", _names),
     "control_hz": _Reader("a number > 0", _rate),
-    "cameras": _Reader("a map of cameras, each with 'key', 'height_px' and 'width_px'", _cameras),
+    "cameras": _Reader("a map of cameras, each with 'key', 'height_px' and 'width_px'", _map_of(_camera)),
     "state_key": _Reader("text", _text),
     "state_dims": _Reader("a list of names", _names),
-    "state_layouts": _Reader("a map of lists of names", _layouts),
+    "state_layouts": _Reader("a map of lists of names", _map_of(_names)),
     "prompt_key": _Reader("text", _text),
     "needs_every_frame": _Reader("true or false", _flag),
     "needs_session_id": _Reader("true or false", _flag),
     "batch_max": _Reader(f"a number from 1 to {MAX_SERVER_ROWS}", _count(1, MAX_SERVER_ROWS)),
     "supports": _Reader("a list of names", _names),
-    "versions": _Reader("a map of texts", _texts),
+    "versions": _Reader("a map of texts", _map_of(_any_text)),
     "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),
-    "training_seeds": _Reader("a map of lists of first and last seeds", _seeds),
-    "sentences": _Reader("a map of lists of texts", _layouts),
+    "training_seeds": _Reader("a map of lists of first and last seeds", _map_of(_seeds)),
+    "sentences": _Reader("a map of lists of texts", _map_of(_names)),
 }
 
 

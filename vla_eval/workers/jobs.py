@@ -1,6 +1,7 @@
 """Jobs, where they come from and how they end. Knows neither processes nor machines."""
 
-from collections.abc import Collection, Hashable, Mapping
+from collections import deque
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,6 +29,25 @@ class JobSource[J: Job](Protocol):
 
     def take(self, loaded: Hashable | None, *, taken: Collection[Hashable]) -> J | None:
         """Return the next job for a worker that has loaded `loaded`, while others have `taken`."""
+
+
+class JobList[J: Job]:
+    """A `JobSource` of jobs that are all known from the start; it hands them out in their order."""
+
+    def __init__(self, jobs: Iterable[J]) -> None:
+        self._jobs = deque(jobs)
+
+    def has_next(self) -> bool:
+        """Whether there is a job that has not been handed out."""
+        return bool(self._jobs)
+
+    def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> J | None:
+        """Return the next job; see `JobSource`."""
+        return self._jobs.popleft() if self._jobs else None
+
+    def give_back(self, job: J) -> None:
+        """Hand out a job again, next."""
+        self._jobs.appendleft(job)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

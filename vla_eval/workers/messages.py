@@ -57,9 +57,6 @@ def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
 
 def as_exception(error: EpisodeError) -> VlaEvalError:
     """Return the worker's exception again; a class of another package becomes its nearest one of ours."""
-    cls = getattr(errors, error.kind, VlaEvalError)
-    return (
-        cls(error.message)
-        if isinstance(cls, type) and issubclass(cls, VlaEvalError)
-        else VlaEvalError(error.message)
-    )
+    found = getattr(errors, error.kind, VlaEvalError)
+    is_ours = isinstance(found, type) and issubclass(found, VlaEvalError)
+    return found(error.message) if is_ours else VlaEvalError(error.message)

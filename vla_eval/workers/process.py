@@ -197,9 +197,8 @@ class WorkerProcess:
                 self._start()
             self.connection.send(job)
         except (BrokenPipeError, ConnectionResetError) as exc:
-            logger.debug(
-                "worker %d: %s", self.index, exc
-            )  # it has ended: the parent reads that from the pipe
+            # It has ended: the parent reads that from the pipe.
+            logger.debug("worker %d: %s", self.index, exc)
         except BaseException as exc:  # the parent reports it
             self.start_error = exc
 
@@ -226,17 +225,9 @@ class WorkerProcess:
         with worker_environment() as environment:
             if self._is_abandoned:
                 return
+            own = (self._their_lifeline, self._main, self._their_connection, self._shared, self.log)
             process = self._context.Process(
-                target=begin,
-                args=(
-                    environment,
-                    self._their_lifeline,
-                    self._main,
-                    self._their_connection,
-                    self._shared,
-                    self.log,
-                ),
-                name=f"mikasa-vla worker {self.index}",
+                target=begin, args=(environment, *own), name=f"mikasa-vla worker {self.index}"
             )
             self.is_starting = True
             try:

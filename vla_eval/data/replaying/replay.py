@@ -36,8 +36,7 @@ from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.framing import send_message
 from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
-from vla_eval.workers.job_list import JobList
-from vla_eval.workers.jobs import Answered
+from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerSpec

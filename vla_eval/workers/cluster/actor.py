@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_eval.workers.job_list import JobList
-from vla_eval.workers.jobs import Answered, Job
+from vla_eval.workers.jobs import Answered, Job, JobList
 from vla_eval.workers.local import LocalService
 from vla_eval.workers.messages import Failed, Notice
 from vla_eval.workers.pool import WorkerPool
@@ -72,7 +71,7 @@ class WorkerActor[J: Job, A]:
         self._pool.__exit__(None, None, None)
 
 
-class ServiceActor:
+class ServiceActor(LocalService):
     """A policy server's process; see `Service`."""
 
     def __init__(
@@ -80,32 +79,20 @@ class ServiceActor:
     ) -> None:
         """Take over the driver's place; the process starts with its job."""
         log = place.enter(address) / f"server-{index}.log"
-        self._service = LocalService(main, worker_context(preload=preload), index=index, log=log)
-
-    def give(self, job: object) -> None:
-        """Start the process."""
-        self._service.give(job)
+        super().__init__(main, worker_context(preload=preload), index=index, log=log)
 
     def read(self) -> list[object]:
         """Return what it has sent; see `Service.read`."""
-        if self._service.start_error is not None:
-            raise self._service.start_error
-        return self._service.read()
+        if self.start_error is not None:
+            raise self.start_error
+        return super().read()
 
     def busy_seconds(self) -> float:
         """Return how long it has been in forward passes."""
-        return self._service.count
-
-    def wait(self, seconds: float) -> int | None:
-        """Wait for its end; return its exit code if there is one."""
-        return self._service.wait(seconds)
+        return self.count
 
     def close(self) -> None:
         """Have it end by itself, then kill it."""
-        self._service.ask_to_close()
-        self._service.wait(CLOSE_SECONDS)
-        self._service.end()
-
-    def tail(self) -> str | None:
-        """Return the end of what it has written."""
-        return self._service.tail()
+        self.ask_to_close()
+        self.wait(CLOSE_SECONDS)
+        self.end()

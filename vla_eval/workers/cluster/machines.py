@@ -141,7 +141,8 @@ class Machines:
             nodes = {str(node["NodeID"]): node for node in self._ray.nodes()}
             for name, node in nodes.items():
                 if node["Alive"] and name not in self._known:
-                    self._begin_check(_machine(node))
+                    machine = self._known[name] = _machine(node)
+                    self._ask(machine, node_facts, self._needs)
             for machine in self:
                 is_alive = machine.node in nodes and bool(nodes[machine.node]["Alive"])
                 if machine.is_alive and not is_alive:
@@ -188,10 +189,6 @@ class Machines:
             for row in rows
         )
 
-    def _begin_check(self, machine: Machine) -> None:
-        self._known[machine.node] = machine
-        self._ask(machine, node_facts, self._needs)
-
     def _ask(self, machine: Machine, task: Callable[..., NodeFacts], *args: Any) -> None:
         """Have a machine say what it has."""
         options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": on_machine(machine.node)}
@@ -223,8 +220,7 @@ class Machines:
                 self._send(machine, machine.facts.absent)
                 machine.facts = None
                 continue
-            found = objections(machine.facts, self.here, allow_other_kind=self._allow_other_kind)
-            machine.refused = found
+            machine.refused = objections(machine.facts, self.here, allow_other_kind=self._allow_other_kind)
             if machine.facts.kind != self.here.kind:
                 machine.kind = MachineKind(name=machine.facts.kind_name, facts=machine.facts.kind)
         for ref, (machine, since) in list(self._checks.items()):
@@ -235,11 +231,10 @@ class Machines:
 
 def _machine(node: dict[str, Any]) -> Machine:
     resources = node["Resources"]
-    address = str(node["NodeManagerAddress"])
     return Machine(
         node=str(node["NodeID"]),
         name=f"{node['NodeManagerHostname']}/{str(node['NodeID'])[:6]}",
-        address=address,
+        address=str(node["NodeManagerAddress"]),
         n_cores=int(resources.get("CPU", 0)),
         n_gpus=int(resources.get("GPU", 0)),
     )

@@ -234,14 +234,12 @@ class ClusterPool[J: Job, A]:
                 yield event
                 continue
             job = given.popleft().job
-            self._note(worker.machine, job, event)
+            if not isinstance(event, Failed):
+                self._machines.note_answer(worker.machine, n_items=job.n_items)
+            elif not event.refused:
+                what = f"{event.error.kind}: {event.error.message[:200]}"
+                self._machines.note_error(worker.machine, what)
             yield Answered(job=job, answer=event, kind=worker.machine.kind)
-
-    def _note(self, machine: Machine, job: J, answer: A | Failed) -> None:
-        if not isinstance(answer, Failed):
-            self._machines.note_answer(machine, n_items=job.n_items)
-        elif not answer.refused:
-            self._machines.note_error(machine, f"{answer.error.kind}: {answer.error.message[:200]}")
 
     def _lose(self, worker: _Worker[J], exc: BaseException) -> Iterator[Event[J, A]]:
         """Put what a dead worker was doing back to the queue; give up what has been lost several times."""
