@@ -28,11 +28,10 @@ from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.interface import env_spec
-from vla_eval.viz.arm_figure import arm_points_m
 from vla_eval.viz.contact_sheet import LABEL_PX, LEFT_PX
 from vla_eval.viz.frames import FAILURE_COLOR, PANEL_PX, PHASE_COLORS, SUCCESS_COLOR, VIEW_PX, compose
 from vla_eval.viz.moments import STILL_PX, find_moments, read_stills, write_stills
-from vla_eval.viz.rerun_log import events, n_overlapping, write_rrd
+from vla_eval.viz.rerun_log import arm_points_m, events, n_overlapping, write_rrd
 from vla_eval.viz.tape import Tapes
 from vla_eval.viz.video import write_video
 

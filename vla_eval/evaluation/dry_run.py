@@ -85,7 +85,9 @@ def evaluation_effort(
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
     steps = [horizon_steps(job) for job in ahead]
-    inferences = [_inferences(job) for job in ahead]
+    inferences = [
+        math.ceil(n_steps / job.group.key.n_action_steps) for job, n_steps in zip(ahead, steps, strict=True)
+    ]
     checkpoints = _checkpoints(plan)
     reads = images_read(resolved.policies)
     rendered = [
@@ -146,12 +148,7 @@ def horizon_steps(job: EpisodeJob) -> int:
     return int(own) if own is not None else task_spec(job.group.key.task).horizon_steps
 
 
-def _inferences(job: EpisodeJob) -> int:
-    return math.ceil(horizon_steps(job) / job.group.key.n_action_steps)
-
-
 def _checkpoints(plan: Plan) -> dict[str, Path]:
-    """Return the folder of the weights of each learned policy."""
     named = {job.group.key.policy: job.group.args.get(LEARNED) for job in plan.jobs}
     return {policy: find_checkpoint(Path(str(path))) for policy, path in named.items() if path is not None}
 

@@ -30,7 +30,7 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.backend import Pool
-from vla_eval.workers.jobs import Answered, MachineKind
+from vla_eval.workers.jobs import Answered
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerMain, WorkerSpec
@@ -190,7 +190,6 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
 
 
 def _worker_main(bookkeeper: "_Bookkeeper") -> WorkerMain:
-    """Return what workers run."""
     config = bookkeeper.resolved.config
     if not config.capture.is_on:
         return worker_main
@@ -267,10 +266,13 @@ class _Bookkeeper:
             return
         self.proven.add(batch.setup_key)
         self.n_consecutive_errors = 0
-        self._note_kind(answered.kind)
+        kind = answered.kind
+        if kind is not None and kind.name not in self.kinds:
+            self.folder.note_machine(kind.name, kind.facts)
+            self.kinds.add(kind.name)
         for record, timing in zip(answer.records, answer.timings, strict=True):
-            if answered.kind is not None:
-                timing = replace(timing, kind=answered.kind.name)
+            if kind is not None:
+                timing = replace(timing, kind=kind.name)
             self.unstored.append(StoredEpisode(record, timing))
 
     def store(self) -> None:
@@ -291,11 +293,6 @@ class _Bookkeeper:
         for line in watch.lines(found.reading, found.task):
             self.folder.note_sentence(line)
             self.observer.on_warning(line)
-
-    def _note_kind(self, kind: MachineKind | None) -> None:
-        if kind is not None and kind.name not in self.kinds:
-            self.folder.note_machine(kind.name, kind.facts)
-            self.kinds.add(kind.name)
 
     def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:
         record = EpisodeRecord(**job.key._asdict(), outcome="error", error=error)

@@ -40,7 +40,6 @@ class JobQueue:
     """
 
     def __init__(self, jobs: Iterable[EpisodeJob], *, finished: Collection[EpisodeKey]) -> None:
-        """Queue the jobs that are not finished."""
         jobs = tuple(jobs)
         begun = {job.group.setup_key for job in jobs if job.key in finished}
         self._heads: deque[EpisodeBatch] = deque()
@@ -69,9 +68,7 @@ class JobQueue:
     def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> EpisodeBatch | None:
         """Return the next batch for a worker, or None if there is no more.
 
-        Args:
-            loaded: the group whose environment and policy the worker has loaded.
-            taken: groups that other workers have loaded; avoided while there are others.
+        Groups that other workers have loaded (`taken`) are avoided while there are others.
         """
         if self._heads:  # of several of one group, as `put_back_alone` leaves them, the worker keeps on
             index = next((i for i, batch in enumerate(self._heads) if batch.setup_key == loaded), 0)

@@ -18,11 +18,7 @@ CHECKPOINT_ARGS = ("checkpoint", "base_checkpoint")
 
 
 def needed_files(policies: Sequence[PolicyEntry]) -> tuple[Needed, ...]:
-    """Return the checkpoints that the policies of an evaluation load.
-
-    Raises:
-        CheckpointError: a checkpoint is not here.
-    """
+    """Return the checkpoints that the policies of an evaluation load; `CheckpointError`: one is not here."""
     return tuple(dict.fromkeys(_checkpoints(policies)))
 
 

@@ -208,7 +208,6 @@ def _noted[T](
 
 
 def _ignored(groups: Sequence[EpisodeGroup]) -> tuple[str, ...]:
-    """Return what of the checkpoints' configurations is ignored, each once."""
     said = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
     return tuple(dict.fromkeys(chain.from_iterable(said)))
 
@@ -231,7 +230,6 @@ def _sentences(
 
 
 def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:
-    """Return the least of the limits of policies that each worker loads."""
     limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
     return min((limit for limit in limits if limit is not None), default=None)
 

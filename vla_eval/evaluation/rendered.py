@@ -23,9 +23,6 @@ def images_read(policies: Sequence[PolicyEntry]) -> dict[str, Reads]:
     """Return the images that each policy of a configuration has to be given, by its name.
 
     Of an adapter of another package nothing is known: it is taken to read every step's.
-
-    Raises:
-        CheckpointError: the weights that a recipe names are not there, or not whole.
     """
     return {policy.name: _read_by(policy) for policy in policies}
 

@@ -30,7 +30,6 @@ class ResolvedEvaluation:
     Attributes:
         config: what was asked for; `inference` is never `auto`.
         policies: those of the configuration, each read once; a policy server asked once.
-        backend: where the workers run.
         shard: the part of the episodes that is run; None: all.
         named_out: the run folder that was asked for; None: the default one.
     """

@@ -200,7 +200,6 @@ class EpisodeRunner:
         return EnvFacts(env.spec, task_spec(settings.task).n_candidates(settings.kwargs))
 
     def _close_other(self, settings: EnvSettings) -> None:
-        """Close the environment if it is not made with these settings."""
         if self._env is not None and self._env_settings != settings:
             self._env.close()
             self._env = self._env_settings = None
@@ -217,11 +216,7 @@ class EpisodeRunner:
 
 
 def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
-    """Make the policy of a group.
-
-    Raises:
-        RecipeError: the adapter does not take the recipe's arguments.
-    """
+    """Make the policy of a group; errors are those of `make_from_adapter`."""
     context = PolicyContext(
         name=group.key.policy,
         env=facts.spec,

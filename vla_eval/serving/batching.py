@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -83,9 +83,8 @@ class Batcher:
         n_rows: int,
         action_dims: Sequence[str],
         metrics: ServerMetrics,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._policy, self._n_rows, self._metrics, self._clock = policy, n_rows, metrics, clock
+        self._policy, self._n_rows, self._metrics = policy, n_rows, metrics
         self._action_dims = action_dims
         self._queue: deque[_Request] = deque()
         self._changed = threading.Condition()
@@ -100,7 +99,7 @@ class Batcher:
 
     def infer(self, start: EpisodeStart, window: ObservationWindow) -> Future[Inference]:
         """Infer a chunk for an episode that was begun."""
-        return self._put(_Infer(start=start, window=window, asked_at=self._clock())).done
+        return self._put(_Infer(start=start, window=window, asked_at=time.monotonic())).done
 
     def forget(self, slot: int) -> None:
         """Have the policy forget a slot, after what was asked for it before."""
@@ -174,7 +173,7 @@ class Batcher:
 
     def _infer(self, due: list[_Infer]) -> None:
         """Do a pass; if it fails, one pass for each request, so that the error is that of one session."""
-        begun = self._clock()
+        begun = time.monotonic()
         try:
             chunks = self._ask(due)
         except BaseException as exc:  # as above
@@ -185,7 +184,7 @@ class Batcher:
                 return
             due[0].done.set_exception(self._failure(exc, "inference"))
             return
-        seconds = self._clock() - begun
+        seconds = time.monotonic() - begun
         waits = [begun - request.asked_at for request in due]
         self._metrics.count_pass(n_requests=len(due), infer_seconds=seconds, queue_seconds=sum(waits))
         for request, chunk, wait in zip(due, chunks, waits, strict=True):

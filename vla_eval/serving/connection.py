@@ -80,11 +80,7 @@ class ClientConnection:
             await asyncio.wait(self._replies, timeout=seconds)
 
     def _take(self, data: str | bytes) -> None:
-        """Begin to answer a request.
-
-        Raises:
-            RequestError: it cannot be answered.
-        """
+        """Begin to answer a request, or raise `RequestError`."""
         if self._has_failed:  # the connection is being closed
             return
         request, begun = _read(data), time.monotonic()
@@ -182,11 +178,7 @@ class ClientConnection:
 
 
 def _read(data: str | bytes) -> dict[str, Any]:
-    """Return a request.
-
-    Raises:
-        RequestError: it is not a map in msgpack.
-    """
+    """Return a request, or raise `RequestError` if it is not a map in msgpack."""
     if isinstance(data, str):
         raise RequestError("expected a binary message (msgpack), found a text message.")
     try:

@@ -57,11 +57,7 @@ class ObservationReader:
         return layouts
 
     def read(self, request: Mapping[str, Any], *, step: int) -> Observation:
-        """Return the observation that a request holds, after `step` control steps.
-
-        Raises:
-            RequestError: an image or the state is missing, or has another shape or type.
-        """
+        """Return a request's observation after `step` control steps; a `RequestError` if it does not fit."""
         return Observation(
             step=step,
             images={name: _read_image(request, camera) for name, camera in self.cameras.items()},
@@ -112,11 +108,7 @@ def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) 
 
 
 def read_prompt(request: Mapping[str, Any]) -> str:
-    """Return the instruction of a request.
-
-    Raises:
-        RequestError: there is none.
-    """
+    """Return the instruction of a request; a `RequestError` if there is none."""
     prompt = _required(request, PROMPT_WIRE_KEY, "the instruction, text")
     if not isinstance(prompt, str) or not prompt.strip():
         raise RequestError(f"'{PROMPT_WIRE_KEY}': expected the instruction, found {shown(prompt)}.")

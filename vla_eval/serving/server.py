@@ -15,7 +15,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -124,7 +124,17 @@ class PolicyServer:
             ServeError: the address cannot be listened on.
         """
         try:
-            server = await self._listen()
+            server = await serve(
+                self._serve_client,
+                self._options.host,
+                self._options.port,
+                process_request=self._answer_http,
+                compression=None,  # images are large and the network is near
+                max_size=MAX_MESSAGE_BYTES,
+                ping_interval=None,
+                close_timeout=CLOSE_SECONDS,
+                server_header=None,
+            )
         except (OSError, UnicodeError) as exc:
             self._batcher.close()
             raise ServeError(
@@ -140,19 +150,6 @@ class PolicyServer:
                 task.cancel()
             has_ended = await self._close(server)
         return has_ended
-
-    def _listen(self) -> Awaitable[Server]:
-        return serve(
-            self._serve_client,
-            self._options.host,
-            self._options.port,
-            process_request=self._answer_http,
-            compression=None,  # images are large and the network is near
-            max_size=MAX_MESSAGE_BYTES,
-            ping_interval=None,
-            close_timeout=CLOSE_SECONDS,
-            server_header=None,
-        )
 
     async def _close(self, server: Server) -> bool:
         self._is_stopping = True

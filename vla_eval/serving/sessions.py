@@ -35,7 +35,6 @@ class Session:
     """One client's episode.
 
     Attributes:
-        connection: number of the connection that it belongs to.
         address: of the machine that the connection comes from.
         name: its id within the connection; None: the connection itself.
         slot: where the policy keeps what it remembers of it.
@@ -62,12 +61,10 @@ class Session:
 
 
 class SessionTable:
-    """All sessions of a server.
+    """All sessions of a server. Methods that take a request raise `RequestError` for what they refuse.
 
     Args:
-        reader: reads the observations.
         reads: whether the policy is given every frame or only the last one.
-        n_rows: rows of a pass.
         task: the task of an episode whose client names none.
         forget: called with the slot of each session that is dropped.
     """
@@ -93,11 +90,7 @@ class SessionTable:
         return len(self._sessions)
 
     def session(self, connection: int, request: Mapping[str, Any], *, address: str) -> Session:
-        """Return the session of a request, for an id that is new a new one; `address` is that of its machine.
-
-        Raises:
-            RequestError: the id is not text, its session was dropped, or there are too many.
-        """
+        """Return the session of a request from a machine with this address; a new one for a new id."""
         name = _text(request, "session_id")
         key = (connection, name)
         dropped = self._dropped.get(connection, {})
@@ -110,12 +103,14 @@ class SessionTable:
         found = self._sessions.get(key)
         if found is None:
             self._make_room(connection, address)
+            slots = {session.slot for session in self._sessions.values()}
+            rows = Counter(session.row for session in self._sessions.values())
             found = Session(
                 connection=connection,
                 address=address,
                 name=name,
-                slot=self._free_slot(),
-                row=self._emptiest_row(),
+                slot=next(slot for slot in range(MAX_SESSIONS) if slot not in slots),
+                row=min(range(self._n_rows), key=lambda row: (rows[row], row)),  # the emptiest
                 used_at=self._clock(),
             )
             self._sessions[key] = found
@@ -123,11 +118,7 @@ class SessionTable:
         return found
 
     def begin(self, session: Session, request: Mapping[str, Any]) -> EpisodeStart:
-        """Begin an episode in a session; all that it had is forgotten.
-
-        Raises:
-            RequestError: no instruction, or a field of another type or out of range.
-        """
+        """Begin an episode in a session; all that it had is forgotten."""
         _number(request, "step")  # of a reset, it is only repeated in the reply
         row = _number(request, "row", most=self._n_rows - 1)
         session.row = session.row if row is None else row
@@ -145,12 +136,9 @@ class SessionTable:
         return start
 
     def begins(self, session: Session, request: Mapping[str, Any]) -> bool:
-        """Whether an `infer` begins an episode without a `reset`: openpi's client knows none.
+        """Whether an `infer` begins an episode without a `reset`: openpi's client does not have it.
 
         Its first request does, and each one with another instruction.
-
-        Raises:
-            RequestError: it belongs to an episode that this session does not have.
         """
         if session.episode is not None:
             is_same = request.get(PROMPT_WIRE_KEY) in (None, session.episode.instruction)
@@ -166,11 +154,7 @@ class SessionTable:
         return True
 
     def observe(self, session: Session, request: Mapping[str, Any]) -> None:
-        """Keep a frame for the next inference, if the policy is given every frame.
-
-        Raises:
-            RequestError: the frame does not fit, or too many are unread.
-        """
+        """Keep a frame for the next inference, if the policy is given every frame."""
         step = self._next_step(session, request)
         if self._reads == "last":
             return
@@ -179,11 +163,7 @@ class SessionTable:
         session.frames.append(self._reader.read(request, step=step))
 
     def window(self, session: Session, request: Mapping[str, Any]) -> ObservationWindow:
-        """Return what the policy is given for an inference: the unread frames, and the one of the request.
-
-        Raises:
-            RequestError: the frame does not fit.
-        """
+        """Return what the policy is given for an inference: the unread frames, and the one of the request."""
         newest = self._reader.read(request, step=self._next_step(session, request))
         frames, session.frames = (*session.frames, newest), []
         return ObservationWindow(slot=session.slot, frames=frames)
@@ -207,9 +187,6 @@ class SessionTable:
         """Drop a session of the same connection if one more would be too many; never one of another.
 
         It is the one without a message for longest, of those without a request under way.
-
-        Raises:
-            RequestError: none of the connection is idle.
         """
         own = [key for key in self._sessions if key[0] == connection]
         n_of_address = sum(session.address == address for session in self._sessions.values())
@@ -265,14 +242,6 @@ class SessionTable:
             longest,
             "its 'horizon_steps'" if longest == said else "the longest task",
         )
-
-    def _free_slot(self) -> int:
-        taken = {session.slot for session in self._sessions.values()}
-        return next(slot for slot in range(MAX_SESSIONS) if slot not in taken)
-
-    def _emptiest_row(self) -> int:
-        taken = Counter(session.row for session in self._sessions.values())
-        return min(range(self._n_rows), key=lambda row: (taken[row], row))
 
 
 def _text(request: Mapping[str, Any], key: str) -> str | None:

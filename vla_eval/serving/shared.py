@@ -105,11 +105,7 @@ class SharedServers:
         return True
 
     def __enter__(self) -> Self:
-        """Start all servers and wait for them; workers that start now know the key.
-
-        Raises:
-            VlaEvalError: one of them cannot be started.
-        """
+        """Start all servers and wait for them; workers that start now know the key."""
         os.environ[KEY_VARIABLE] = self._key
         try:
             for service in self._services:
@@ -195,7 +191,6 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
 
 
 def _wait_for_parent(connection: Connection) -> None:
-    """Return when the parent asks the server to end, or is gone."""
     try:
         connection.recv()
     except (EOFError, OSError):

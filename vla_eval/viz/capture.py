@@ -51,10 +51,8 @@ class EpisodeCapture:
     ) -> None:
         """Write the captures of a finished batch; its starts and records are in the same order.
 
-        `heartbeat` is called before each file: the watchdog gives each the time of a step.
-
-        Raises:
-            ViewingError: a file could not be written.
+        `heartbeat` is called before each file: the watchdog gives each the time of a step. A file that cannot
+        be written is a `ViewingError`.
         """
         for start, record in zip(starts, records, strict=True):
             tape = tapes.episodes.get(start.slot)

@@ -43,11 +43,7 @@ def find_moments(tape: EpisodeTape) -> Moments:
 
 
 def write_stills(tape: EpisodeTape, path: Path) -> None:
-    """Write the moments side by side as a JPEG, each `STILL_PX` wide, without anything drawn over them.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the moments side by side as a JPEG, each `STILL_PX` wide, without anything drawn over them."""
     shown = [_view(one) for one in find_moments(tape)]
     Image.fromarray(np.concatenate(shown, axis=1)).save(path, format="JPEG", quality=JPEG_QUALITY)
 
@@ -55,10 +51,7 @@ def write_stills(tape: EpisodeTape, path: Path) -> None:
 def read_stills(path: Path) -> tuple[ImageArray, ...]:
     """Return the moments that `write_stills` has written, each (STILL_PX, STILL_PX, 3) uint8.
 
-    Those of earlier versions, which were smaller, are scaled.
-
-    Raises:
-        OSError: the file cannot be read as an image.
+    Those of earlier versions, which were smaller, are scaled. An `OSError` if it is not such an image.
     """
     n_moments = len(Moments._fields)
     with Image.open(path) as image:

@@ -38,11 +38,6 @@ def check_mp4(path: Path, error: type[VlaEvalError]) -> None:
 
 
 def open_mp4(path: Path, error: type[VlaEvalError]) -> Any:  # Any: PyAV's container
-    """Return a video, opened to be read.
-
-    Raises:
-        VlaEvalError: of the class `error`: it does not begin as an MP4 does.
-        av.error.FFmpegError: it is damaged.
-    """
+    """Return a video, opened to be read; see `check_mp4`, and `av.error.FFmpegError` if it is damaged."""
     check_mp4(path, error)
     return av.open(str(path.absolute()), format="mp4", options=ONLY_THIS_FILE)

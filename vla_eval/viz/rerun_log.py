@@ -18,19 +18,21 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from vla_eval.control_modes import N_ARM_JOINTS
 from vla_eval.core import FloatArray
+from vla_eval.oracles.kinematics import FLANGE_M, TCP_M, joint_poses
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import capture_stem
 from vla_eval.task_state import PHASES
 from vla_eval.tasks.objects.item_names import item_names
-from vla_eval.viz.arm_figure import ROBOT_BASE_M, arm_points_m
-from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step
-from vla_eval.viz.rerun_layout import layout
+from vla_eval.viz.rerun_file import layout, rrd_when_whole, send_curve, set_step
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 TCP_POSE, JOINTS, N_FINGERS = "tcp_pose", "qpos", 2
 JPEG_QUALITY = 90
+ROBOT_BASE_M = (-0.615, 0.0, 0.0)  # where the tasks put the Panda
+SAME_PLACE_M = 0.01
 COLORS = {
     "right": (0, 158, 115),
     "other": (163, 169, 181),
@@ -67,7 +69,6 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvS
 
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
-    """Log the facts of the whole episode."""
     status = tape.steps[-1].result.status
     names = item_names(record.task, status.n_candidates)
     target = "several, or none" if status.target is None else names[status.target]
@@ -116,6 +117,20 @@ def log_arm(stream: rr.RecordingStream, qpos: FloatArray, tcp_position_m: FloatA
     points = arm_points_m(qpos, tcp_position_m)
     if points is not None:
         stream.log("world/arm", rr.LineStrips3D([points], colors=[COLORS["arm"]], radii=0.02))
+
+
+def arm_points_m(qpos: FloatArray, tcp_position_m: FloatArray) -> FloatArray | None:
+    """Return (10, 3): base, the seven joints, the flange and the tool centre point, in m, world frame.
+
+    None if the line would not end at the simulator's tool centre point: it is another arm, or no arm at all.
+    """
+    if len(qpos) < N_ARM_JOINTS:
+        return None
+    poses = joint_poses(qpos)
+    joints = poses[:, :3, 3]
+    tips = [joints[-1] + poses[-1, :3, 2] * along_m for along_m in (FLANGE_M, FLANGE_M + TCP_M)]
+    points = (np.stack([np.zeros(3), *joints, *tips]) + ROBOT_BASE_M).astype(np.float32)
+    return None if np.linalg.norm(points[-1] - tcp_position_m) > SAME_PLACE_M else points
 
 
 def _log_world(stream: rr.RecordingStream, taped: TapedStep) -> None:

@@ -31,16 +31,11 @@ def write_video(
     stills: Path,
     frame_rate_hz: float,
 ) -> None:
-    """Write the captured steps of an episode.
+    """Write the captured steps of an episode as an mp4, which is there whole or not at all.
 
-    Args:
-        tape: the episode.
-        record: its record.
-        path: the mp4; it is there whole or not at all.
-        thumbnail: the JPEG: the frame of the cue and next to it that of the choice.
-        stills: a small JPEG of cue, reveal and touch, for `report --filmstrip`.
-        frame_rate_hz: captured steps per second of the episode, so that the video is as fast as the episode,
-            but for the cue.
+    `thumbnail` is a JPEG of the cue and next to it the choice, `stills` a small one of cue, reveal and touch,
+    for `report --filmstrip`. `frame_rate_hz` are captured steps per second of the episode, so that the video
+    is as fast as the episode, but for the cue.
 
     Raises:
         ViewingError: no step has images, or the file cannot be written.

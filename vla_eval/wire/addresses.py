@@ -28,11 +28,7 @@ def named_server(name: str) -> NamedServer | None:
 
 
 def split_urls(text: str) -> tuple[str, ...]:
-    """Return the addresses of a list with commas.
-
-    Raises:
-        RecipeError: one is not an address of a server, or stands there twice.
-    """
+    """Return the addresses of a list with commas; a `RecipeError` for one that is wrong or there twice."""
     urls = tuple(url.strip().rstrip("/") for url in text.split(","))
     for url in urls:
         _check_url(url)

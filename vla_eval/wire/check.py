@@ -93,7 +93,8 @@ def _healthz(server: Server) -> list[str]:
     return ["GET /healthz answers 200."]
 
 
-_IS_DIGEST = re.compile("[0-9a-f]{64}").fullmatch
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
 def _is_names(value: Any) -> bool:
@@ -112,7 +113,10 @@ def _is_camera(value: Any) -> bool:
 
 _FIELDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "name": ("a text", lambda v: isinstance(v, str) and bool(v)),
-    "weights_sha256": ("64 hexadecimal digits, or null without weights", lambda v: v is None or _digest(v)),
+    "weights_sha256": (
+        "64 hexadecimal digits, or null without weights",
+        lambda v: v is None or _is_digest(v),
+    ),
     "chunk_size": ("a number ≥ 1", _is_count),
     "control_mode": ("a text", lambda v: isinstance(v, str) and bool(v)),
     "action_dims": ("a list of names", lambda v: _is_names(v) and len(v) > 0),
@@ -129,10 +133,6 @@ _FIELDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "batch_max": ("a number ≥ 1", _is_count),
     "supports": ("a list of names", _is_names),
 }
-
-
-def _digest(value: Any) -> bool:
-    return isinstance(value, str) and _IS_DIGEST(value) is not None
 
 
 def _metadata(server: Server) -> list[str]:

@@ -114,9 +114,6 @@ def _marked(value: Any, text_markers: bool) -> Any:
 def unpackb(data: Any) -> Any:
     """Return the message that bytes hold; arrays in it are new, writable and in this machine's byte order.
 
-    Args:
-        data: bytes, or another buffer.
-
     Raises:
         CodecError: it is not such a message, or one that is refused.
     """

@@ -32,10 +32,7 @@ class Connection:
     """A connection to one server; used by one thread.
 
     Args:
-        url: `ws://HOST:PORT`.
-        timeout_seconds: how long a message is waited for.
         connect_seconds: how long to try again while nobody listens there.
-        api_key: sent in the header `Authorization: Api-Key KEY`.
         text_markers: see `codec.packb`.
 
     Raises:
@@ -60,11 +57,7 @@ class Connection:
         self._socket = self._opened.enter_context(opened)
 
     def send(self, message: Any) -> None:
-        """Send a message.
-
-        Raises:
-            RemoteConnectionError: the connection is lost, or was closed after an earlier error.
-        """
+        """Send a message; a `RemoteConnectionError` if the connection is lost, or closed by an error."""
         try:
             self._socket.send(packb(message, text_markers=self._text_markers))
         except CodecError as exc:

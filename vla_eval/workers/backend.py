@@ -95,8 +95,5 @@ class Backend(Protocol):
     def services(self, main: WorkerMain, *, logs: Path, preload: Sequence[str] = ()) -> Sequence[Service]:
         """Return services that are not started yet: one per GPU; one, where there is no GPU.
 
-        Args:
-            main: what each runs.
-            logs: folder for what those of this machine write.
-            preload: modules that they need and that take long to import.
+        Those of this machine write into the folder `logs`; see `worker_context` for `preload`.
         """

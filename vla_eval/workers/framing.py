@@ -43,13 +43,7 @@ class Inbox:
         self._data = bytearray()
 
     def read(self) -> list[object]:
-        """Return the messages that have come since the last call.
-
-        Raises:
-            EOFError: the worker has closed its end, and all that it sent has been returned.
-            OSError: the connection is broken.
-            BrokenMessageError: what has come is not a message.
-        """
+        """Return the messages that have come since the last call; errors are those of `Service.read`."""
         messages: list[object] = []
         for _ in range(MAX_READS):
             if not self._connection.poll():

@@ -143,7 +143,6 @@ def _has_children() -> bool:
 
 
 def _end_as(status: int) -> None:
-    """End this process as the one with this wait status has ended."""
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the worker has dumped its core; one is enough

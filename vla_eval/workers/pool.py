@@ -42,10 +42,7 @@ class _Worker[J: Job]:
 class WorkerPool[J: Job, A]:
     """Some worker processes; a context manager that leaves none behind.
 
-    Args:
-        spec: what the workers are made of.
-        size: how many processes at most.
-        first_index: what logs and messages call the first worker.
+    Logs and messages call the first worker `first_index`.
     """
 
     def __init__(self, spec: WorkerSpec, *, size: int, first_index: int = 0) -> None:
@@ -58,7 +55,6 @@ class WorkerPool[J: Job, A]:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """End all processes: gently after success, at once after an exception."""
         idle = [worker for worker in self._workers.values() if worker.job is None and kind is None]
         for worker in idle:
             worker.process.ask_to_close()
@@ -177,7 +173,6 @@ class WorkerPool[J: Job, A]:
         )
 
     def _end(self, index: int) -> None:
-        """Kill the process and whatever it has started."""
         self._workers.pop(index).process.end()
 
 

@@ -118,11 +118,7 @@ class WorkerProcess:
         return self.connection.poll()
 
     def busy(self) -> Busy:
-        """Return what it is busy with.
-
-        Raises:
-            BrokenMessageError: its memory holds something else, as after a stray write.
-        """
+        """Return what it is busy with; a `BrokenMessageError` after a stray write into its memory."""
         # The stage first, as `write_stage` writes it last.
         stage, since = self._shared[1], self._shared[0]
         if stage not in range(len(STAGES)) or not self._given_at <= since <= time.monotonic():

@@ -33,8 +33,7 @@ from vla_eval.features import (
 )
 from vla_eval.models.shared.levels import in_bytes
 from vla_eval.task_state import PHASES
-from vla_eval.viz.rerun_file import rrd_when_whole, send_curve, set_step, time_columns
-from vla_eval.viz.rerun_layout import layout
+from vla_eval.viz.rerun_file import layout, rrd_when_whole, send_curve, set_step, time_columns
 from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, log_arm
 
 PLACE_NAMES = ("x", "y", "z")

@@ -54,7 +54,6 @@ class WorkerActor[J: Job, A]:
     """A pool of one process; lives as long as its process's jobs last."""
 
     def __init__(self, spec: WorkerSpec, place: Place, index: int, address: str) -> None:
-        """Take over the driver's place; no process starts yet."""
         spec = replace(spec, logs=place.enter(address))
         self._pool: WorkerPool[J, A] = WorkerPool(spec, size=1, first_index=index)
 
@@ -77,7 +76,6 @@ class ServiceActor(LocalService):
     def __init__(
         self, main: WorkerMain, preload: tuple[str, ...], place: Place, index: int, address: str
     ) -> None:
-        """Take over the driver's place; the process starts with its job."""
         log = place.enter(address) / f"server-{index}.log"
         super().__init__(main, worker_context(preload=preload), index=index, log=log)
 

@@ -30,11 +30,7 @@ LOCAL_VARIABLES = {
 
 
 def check_address(text: str) -> str:
-    """Return the value of `--cluster`.
-
-    Raises:
-        RecipeError: it is none of `auto`, `local`, `ray://HOST:PORT` and `HOST:PORT`.
-    """
+    """Return the value of `--cluster`, or raise `RecipeError`."""
     if text in ("auto", "local") or ADDRESS.fullmatch(text):
         return text
     raise RecipeError(

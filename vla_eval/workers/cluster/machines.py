@@ -44,9 +44,7 @@ class Machine:
         is_alive: whether the cluster has it.
         was_sent: whether folders that it did not have were sent to it.
         kind: what kind it is; None: the same as the planning machine.
-        n_used: workers that it has.
         n_errors_in_a_row: workers that died and jobs that failed since its last answer.
-        services: the policy servers on it.
         seen_at: `time.monotonic` when it came.
         name, n_running, n_done: see `MachineLoad`.
     """
@@ -190,7 +188,6 @@ class Machines:
         )
 
     def _ask(self, machine: Machine, task: Callable[..., NodeFacts], *args: Any) -> None:
-        """Have a machine say what it has."""
         options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": on_machine(machine.node)}
         ref = self._ray.remote(task).options(**options).remote(*args, folder=os.getcwd())
         self._checks[ref] = (machine, time.monotonic())
@@ -204,7 +201,6 @@ class Machines:
         self._ask(machine, receive, folders, self._needs)
 
     def _collect(self) -> None:
-        """Take the answers that have come."""
         if not self._checks:
             return
         ready, _ = self._ray.wait(list(self._checks), num_returns=len(self._checks), timeout=0)

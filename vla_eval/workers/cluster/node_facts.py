@@ -65,7 +65,7 @@ def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFact
     return NodeFacts(
         environment=collect_environment(),
         vulkan=vulkan_drivers(),
-        free_bytes=free_memory_bytes(),
+        free_bytes=_free_memory_bytes(),
         n_gpus=len(visible_gpus()),
         missing=missing,
         absent=absent,
@@ -86,8 +86,8 @@ def receive(folders: Sequence[PackedFolder], needs: tuple[Needed, ...], *, folde
     return node_facts(needs, folder=folder)
 
 
-def free_memory_bytes() -> int:
-    """Return how much memory is free, as Linux says; what it keeps of files counts as free."""
+def _free_memory_bytes() -> int:
+    # What Linux keeps of files counts as free.
     for line in MEMINFO_FILE.read_text(encoding="utf-8").splitlines():
         name, _, rest = line.partition(":")
         if name == "MemAvailable":

@@ -86,11 +86,9 @@ class ClusterPool[J: Job, A]:
         )
 
     def __enter__(self) -> Self:
-        """Start nothing yet."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """End all actors: gently after success, at once after an exception."""
         idle = [worker for worker in self._workers.values() if worker.is_ready and not worker.given]
         if kind is None and idle:
             closing = [worker.actor.close.remote() for worker in idle]
@@ -122,13 +120,12 @@ class ClusterPool[J: Job, A]:
         return bool(self._returned) or queue.has_next()
 
     def _start_workers(self) -> None:
-        """Start actors where there is room for them."""
         while len(self._workers) < self._size:
             machine = max(self._machines, key=self._n_free, default=None)
             if machine is None or self._n_free(machine) <= 0:
                 break
             index = next(number for number in range(self._size) if number not in self._workers)
-            actor = self.new_actor(machine, index)
+            actor = self._new_actor(machine, index)
             machine.n_used += 1
             call = actor.ready.remote()
             self._workers[index] = _Worker(machine=machine, actor=actor, call=call, index=index)
@@ -141,8 +138,7 @@ class ClusterPool[J: Job, A]:
     def _n_free(self, machine: Machine) -> int:
         return machine.n_free(takes_gpu=self._takes_gpu)
 
-    def new_actor(self, machine: Machine, index: int) -> Any:
-        """Start an actor on a machine; returns at once."""
+    def _new_actor(self, machine: Machine, index: int) -> Any:
         actor = self._ray.remote(WorkerActor).options(
             max_restarts=0,
             max_task_retries=0,
@@ -250,8 +246,12 @@ class ClusterPool[J: Job, A]:
         if worker.machine.is_alive:
             self._machines.say(f"a worker on {worker.machine.name} died ({cause:.200}); its jobs run again")
             self._machines.note_error(worker.machine, cause)
-            if not worker.is_ready and worker.machine.n_errors_in_a_row >= MAX_ERRORS_IN_A_ROW:
-                self._give_up(worker.machine, cause)
+            n_errors = worker.machine.n_errors_in_a_row
+            if not worker.is_ready and n_errors >= MAX_ERRORS_IN_A_ROW and worker.machine.is_usable:
+                raise ClusterError(
+                    f"{n_errors} workers in a row did not start on {worker.machine.name}, the only machine "
+                    f"that is left: {cause} Look into Ray's logs there (session_latest/logs)."
+                )
         for one in reversed(given):
             one.n_losses += 1
             if one.n_losses < MAX_LOSSES:
@@ -266,21 +266,9 @@ class ClusterPool[J: Job, A]:
             )
             yield Answered(job=one.job, answer=Failed(error=error, refused=False))
 
-    def _give_up(self, machine: Machine, cause: str) -> None:
-        """End the run if workers do not even start on the only machine that is left."""
-        if machine.is_usable:
-            raise ClusterError(
-                f"{machine.n_errors_in_a_row} workers in a row did not start on {machine.name}, the only "
-                f"machine that is left: {cause} Look into Ray's logs there (session_latest/logs)."
-            )
-
     def _end(self, index: int) -> None:
         worker = self._workers.pop(index)
         worker.machine.n_used -= 1
         worker.machine.n_running -= worker.n_items
-        self.kill(worker.actor)
-
-    def kill(self, actor: Any) -> None:
-        """Kill an actor; its guard ends what it has started."""
-        with contextlib.suppress(self._ray.exceptions.RayError):
-            self._ray.kill(actor, no_restart=True)
+        with contextlib.suppress(self._ray.exceptions.RayError):  # its guard ends what it has started
+            self._ray.kill(worker.actor, no_restart=True)
