@@ -61,11 +61,7 @@ class EvaluationEffort:
 def describe_evaluation(
     resolved: ResolvedEvaluation, *, rates: AssumedRates, allow_environment_change: bool = False
 ) -> list[str]:
-    """Return lines for a person.
-
-    Raises:
-        VlaEvalError: what `evaluate` would raise before its first episode.
-    """
+    """Return lines for a person, or raise what `evaluate` would raise before its first episode."""
     effort = evaluation_effort(resolved, allow_environment_change=allow_environment_change)
     return list(_lines(resolved, effort, rates))
 

@@ -5,13 +5,14 @@ one is run; a mistake that every episode would repeat ends the run. Stopped at a
 means, the same call resumes where it stopped.
 """
 
+import contextlib
 import functools
 import logging
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import options_of
@@ -203,7 +204,8 @@ def _run(
 ) -> Literal["finished", "stopped", "server lost"]:
     """Run the queue's episodes until they are finished, the observer stops it, or a server has died."""
     next_load = time.monotonic()
-    with bookkeeper, pool as running:
+    with contextlib.ExitStack() as ending, pool as running:
+        ending.callback(bookkeeper.store)  # what has come, whatever ends the run
         for event in running.run(bookkeeper.queue):
             if isinstance(event, Answered):
                 failed = event.answer if isinstance(event.answer, Failed) else None
@@ -244,13 +246,6 @@ class _Bookkeeper:
     kinds: set[str] = field(default_factory=set)  # of machines that are unlike this one
     unstored: list[StoredEpisode] = field(default_factory=list)
     sentences: dict[str, SentenceWatch] = field(default_factory=dict)  # by `EpisodeGroup.part`
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Store what has come, whatever ended the run."""
-        self.store()
 
     def take(self, answered: Answered[EpisodeBatch, Finished]) -> None:
         """Store the results, or the error in their place."""

@@ -3,7 +3,7 @@
 Recipes, prompts and settings travel with the episodes; small checkpoints are sent where they are missing.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
@@ -19,22 +19,18 @@ CHECKPOINT_ARGS = ("checkpoint", "base_checkpoint")
 
 def needed_files(policies: Sequence[PolicyEntry]) -> tuple[Needed, ...]:
     """Return the checkpoints that the policies of an evaluation load; `CheckpointError`: one is not here."""
-    return tuple(dict.fromkeys(_checkpoints(policies)))
-
-
-def _checkpoints(policies: Sequence[PolicyEntry]) -> Iterator[Needed]:
-    for policy in policies:
-        recipes = [recipe.value for recipe in policy.recipes]
-        own = [recipe for recipe in recipes if recipe.adapter in LEROBOT_CHECKPOINTS]
-        for recipe, arg in product(own, CHECKPOINT_ARGS):
-            path = recipe.args.get(arg)
-            if isinstance(path, str):
-                yield Needed(
-                    path=path,
-                    sha256=checkpoint_sha256(Path(path)),
-                    digest=checkpoint_sha256,
-                    folders=_to_send(Path(path)),
-                )
+    recipes = [recipe.value for policy in policies for recipe in policy.recipes]
+    own = [recipe for recipe in recipes if recipe.adapter in LEROBOT_CHECKPOINTS]
+    named = [recipe.args.get(arg) for recipe, arg in product(own, CHECKPOINT_ARGS)]
+    return tuple(
+        Needed(
+            path=path,
+            sha256=checkpoint_sha256(Path(path)),
+            digest=checkpoint_sha256,
+            folders=_to_send(Path(path)),
+        )
+        for path in dict.fromkeys(path for path in named if isinstance(path, str))
+    )
 
 
 def _to_send(checkpoint: Path) -> tuple[str, ...]:

@@ -53,7 +53,6 @@ class Plan:
             trained with, see `Sentences`; None where that is not known.
         training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
             demonstrations it was trained on, where known.
-        task_versions: task id -> version of the task's rules.
         policy_names: what records call the policies, in the order of the configuration.
         shared: `EpisodeGroup.part` whose inference all workers share -> what the configuration calls it.
         left_out: (task, policy) pairs that make no sense together, and why, for a message.

@@ -1,9 +1,9 @@
 """How many images an evaluation renders at most, as far as that is known before any policy is made."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal  # Any: what a recipe holds
+from typing import Literal
 
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
@@ -13,7 +13,6 @@ from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import SCRIPTED
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
-from vla_eval.wire.metadata import ServerMetadata
 
 Reads = Literal["none", "last", "every"]
 """No image; those of the control step of an inference; those of each control step."""
@@ -46,19 +45,15 @@ def _read_by(policy: PolicyEntry) -> Reads:
     adapter, args = policy.value.adapter, policy.value.args
     if adapter in SCRIPTED:
         return "none"
-    if adapter == REMOTE_ADAPTER and policy.server is not None:
-        return _read_at(policy.server, args)
+    server = policy.server
+    if adapter == REMOTE_ADAPTER and server is not None:
+        if server.needs_every_frame or args.get("reads") == "every":
+            return "every"
+        return "none" if args.get("cameras") is None and server.is_ours and not server.cameras else "last"
     checkpoint = args.get("checkpoint")
     if adapter in LEROBOT_CHECKPOINTS and isinstance(checkpoint, str):
         return "every" if _is_shown_every_frame(find_checkpoint(Path(checkpoint))) else "last"
     return "every"
-
-
-def _read_at(server: ServerMetadata, args: Mapping[str, Any]) -> Reads:
-    """Return what a policy behind a socket reads, by its server and by the recipe."""
-    if server.needs_every_frame or args.get("reads") == "every":
-        return "every"
-    return "none" if args.get("cameras") is None and server.is_ours and not server.cameras else "last"
 
 
 def _is_shown_every_frame(folder: Path) -> bool:

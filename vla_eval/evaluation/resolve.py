@@ -111,10 +111,8 @@ def resolve(
 ) -> ResolvedEvaluation:
     """Read the policies of a configuration, ask policy servers, and decide what it leaves open.
 
-    The arguments are the fields of `ResolvedEvaluation`; `out` is by default a folder in `runs/`.
-
-    Raises:
-        VlaEvalError: a policy cannot be read; see `load_policy_entry`.
+    The arguments are the fields of `ResolvedEvaluation`; `out` is by default a folder in `runs/`. Errors are
+    those of `load_policy_entry`.
     """
     policies = load_policy_entries(config.policies)
     return ResolvedEvaluation.of(config, policies, backend=backend, out=out, shard=shard)

@@ -162,7 +162,9 @@ class EpisodeRunner:
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
         if self._env is None or self._policy is None:
-            facts = self._describe_env(group.env)
+            # Privileged, as scripted controls need it: theirs is then already made.
+            spec = self._make_env(dataclasses.replace(group.env, privileged=True)).spec
+            facts = EnvFacts(spec, task_spec(group.env.task).n_candidates(group.env.kwargs))
             self._heartbeat("setup")
             if self._capture is not None:
                 self._capture.load()
@@ -192,12 +194,6 @@ class EpisodeRunner:
             privileged=True,
             human_camera_stride=self._capture.config.frame_stride,
         )
-
-    def _describe_env(self, settings: EnvSettings) -> EnvFacts:
-        """Return what the policy has to know of an environment whose cameras it then decides on."""
-        # Privileged, as scripted controls need it: theirs is then already made.
-        env = self._make_env(dataclasses.replace(settings, privileged=True))
-        return EnvFacts(env.spec, task_spec(settings.task).n_candidates(settings.kwargs))
 
     def _close_other(self, settings: EnvSettings) -> None:
         if self._env is not None and self._env_settings != settings:

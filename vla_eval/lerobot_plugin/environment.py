@@ -51,7 +51,6 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
     the task's horizon. The simulator is built at the first reset: in the process that needs it.
 
     Args:
-        settings: the environment; cameras are added.
         state: which proprioception `agent_pos` is.
         prompt_set: where the instruction comes from.
         seed_offset: added to the seeds that LeRobot gives.

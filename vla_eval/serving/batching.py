@@ -68,12 +68,9 @@ _Request = _Begin | _Infer | _Forget
 
 
 class Batcher:
-    """Asks a policy on behalf of many; the futures that it returns are completed by its thread.
+    """Asks a policy, which nobody else may call any more, on behalf of many, with `n_rows` in a pass.
 
-    Args:
-        policy: nobody else may call it any more.
-        n_rows: rows of a pass.
-        action_dims: names of an action's numbers.
+    The futures that it returns are completed by its thread.
     """
 
     def __init__(

@@ -89,8 +89,7 @@ class ObservationReader:
 def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) -> ObservationReader:
     """Return what reads the observations of a policy; `end_effector`: it also reads the kind `eef`.
 
-    Raises:
-        SpecMismatchError: the policy has a camera for which the wire has no key.
+    A `SpecMismatchError` if the policy has a camera for which the wire has no key.
     """
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     for camera in policy.cameras:

@@ -40,7 +40,7 @@ PASS_SECONDS = 4.0  # for the pass under way; then the policy is left alone
 REPLY_SECONDS = 1.5  # for clients to take their replies
 CLOSE_SECONDS = 1.5  # for clients to answer the closing of their connections; then they are cut
 END_SECONDS = 9.0  # for all of it and the end of the process, which is then ended as it is
-LOG_SECONDS = 60.0
+LOG_SECONDS = 60.0  # between two lines of statistics
 IDLE_CHECKS = 4  # per idle time
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STDERR_FD = 2
@@ -66,7 +66,6 @@ class ServerOptions:
         api_key: what clients must send; None: nothing.
         idle_seconds: sessions without a message for so long are dropped.
         debug: send errors with their traceback.
-        log_seconds: time between two lines of statistics.
     """
 
     host: str = "127.0.0.1"
@@ -74,7 +73,6 @@ class ServerOptions:
     api_key: str | None = None
     idle_seconds: float = 600.0
     debug: bool = False
-    log_seconds: float = LOG_SECONDS
 
     def __post_init__(self) -> None:
         check_bounds(self, {"port": (0, MAX_PORT), "idle_seconds": (0.001, MAX_SECONDS)})
@@ -196,7 +194,7 @@ class PolicyServer:
 
     async def _log(self) -> None:
         while True:
-            await asyncio.sleep(self._options.log_seconds)
+            await asyncio.sleep(LOG_SECONDS)
             logger.info("%s", self._metrics.line(n_sessions=len(self._sessions)))
 
     async def _drop_idle(self) -> None:
@@ -217,10 +215,7 @@ def run_server(
 
     Within `END_SECONDS` of the first one the process has ended, whatever the policy does. `ready` is called
     once, with the port, when clients can connect; `ends` in a thread of its own: when it returns, the server
-    stops as well.
-
-    Raises:
-        ServeError: the address cannot be listened on.
+    stops as well. Errors are those of `PolicyServer.run`.
     """
 
     async def serve_until_stopped() -> bool:

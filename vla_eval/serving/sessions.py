@@ -136,7 +136,7 @@ class SessionTable:
         return start
 
     def begins(self, session: Session, request: Mapping[str, Any]) -> bool:
-        """Whether an `infer` begins an episode without a `reset`: openpi's client does not have it.
+        """Whether an `infer` begins an episode without a `reset`, which openpi's client never sends.
 
         Its first request does, and each one with another instruction.
         """

@@ -155,10 +155,8 @@ class SharedServers:
             if service.start_error is not None:
                 raise self._not_started(service, f"could not be started: {service.start_error!r}")
             if time.monotonic() > deadline:
-                raise self._not_started(
-                    service,
-                    f"was not ready after {self._start_seconds:g} s (timeouts.setup_seconds)",
-                )
+                what = f"was not ready after {self._start_seconds:g} s (timeouts.setup_seconds)"
+                raise self._not_started(service, what)
             time.sleep(POLL_SECONDS)
         return None
 

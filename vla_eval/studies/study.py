@@ -50,10 +50,8 @@ def open_study(
 ) -> Study:
     """Read a table by its file, or its name in `configs/`; of some tasks and rows, or all if none is named.
 
-    `out` is by default a folder in `runs/`; `is_tiny` puts tiny random models in place of the rows'.
-
-    Raises:
-        VlaEvalError: there is no such table, row or task.
+    `out` is by default a folder in `runs/`; `is_tiny` puts tiny random models in place of the rows'. A
+    `VlaEvalError` if there is no such table, row or task.
     """
     table = narrow(load_model_table(name), tasks=tasks, rows=rows)
     folder = out or RUNS_FOLDER / (table.name + ("_tiny" if is_tiny else ""))

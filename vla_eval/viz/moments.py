@@ -44,7 +44,10 @@ def find_moments(tape: EpisodeTape) -> Moments:
 
 def write_stills(tape: EpisodeTape, path: Path) -> None:
     """Write the moments side by side as a JPEG, each `STILL_PX` wide, without anything drawn over them."""
-    shown = [_view(one) for one in find_moments(tape)]
+    images = [one.result.observation.images for one in find_moments(tape)]
+    views = [each[HUMAN_CAMERA] if HUMAN_CAMERA in each else next(iter(each.values())) for each in images]
+    size = (STILL_PX, STILL_PX)
+    shown = [np.asarray(Image.fromarray(view).resize(size, Image.Resampling.LANCZOS)) for view in views]
     Image.fromarray(np.concatenate(shown, axis=1)).save(path, format="JPEG", quality=JPEG_QUALITY)
 
 
@@ -60,10 +63,3 @@ def read_stills(path: Path) -> tuple[ImageArray, ...]:
         shown = image.convert("RGB").resize((n_moments * STILL_PX, STILL_PX), Image.Resampling.LANCZOS)
     pixels = np.asarray(shown, dtype=np.uint8)
     return tuple(np.split(pixels, n_moments, axis=1))
-
-
-def _view(taped: TapedStep) -> ImageArray:
-    images = taped.result.observation.images
-    name = HUMAN_CAMERA if HUMAN_CAMERA in images else next(iter(images))
-    scaled = Image.fromarray(images[name]).resize((STILL_PX, STILL_PX), Image.Resampling.LANCZOS)
-    return np.asarray(scaled, dtype=np.uint8)

@@ -20,8 +20,7 @@ def rrd_when_whole(
 ) -> Iterator[rr.RecordingStream]:
     """Give a stream to log to. The file gets its name once everything is in it.
 
-    Raises:
-        ViewingError: the file cannot be written; `failed` is the message before the cause, `advice` after it.
+    If it cannot be written, a `ViewingError` has `failed` before the cause and `advice` after it.
     """
     unfinished = path.with_suffix(".part")
     try:

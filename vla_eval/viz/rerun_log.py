@@ -43,12 +43,9 @@ COLORS = {
 
 
 def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvSpec) -> None:
-    """Write one episode; the file is there whole or not at all.
+    """Write one episode; the file is there whole or not at all, with a `ViewingError` in its place.
 
     `env` names the numbers of an action, and the control steps per second for the timeline `time`.
-
-    Raises:
-        ViewingError: the file cannot be written.
     """
     n_series = n_overlapping(tape)
     cameras = sorted({name for one in tape.steps for name in one.result.observation.images})

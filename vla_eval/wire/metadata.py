@@ -138,8 +138,7 @@ class ServerMetadata:
     def from_wire(cls, message: object, *, where: str) -> "ServerMetadata":
         """Read the first message of a server; `where` is its address, for messages.
 
-        Raises:
-            RemoteReplyError: it is not a map, or a known field has another type.
+        A `RemoteReplyError` if it is not a map, or a known field has another type.
         """
         if not isinstance(message, Mapping):
             raise RemoteReplyError(

@@ -119,11 +119,7 @@ class Machines:
         return [machine for machine in self if machine.is_usable]
 
     def survey(self) -> None:
-        """Wait until every machine has said what it has, or has not answered in time.
-
-        Raises:
-            ClusterError: none can be used.
-        """
+        """Wait until every machine has said what it has or is late; a `ClusterError` if none can be used."""
         self.look(at_once=True)
         while self._checks:
             self._ray.wait(list(self._checks), num_returns=len(self._checks), timeout=0.5)

@@ -58,10 +58,7 @@ class _Worker[J: Job]:
 class ClusterPool[J: Job, A]:
     """Some actors with a worker process each; a context manager that leaves none behind.
 
-    Args:
-        place: what a worker takes over from the driver.
-        size: how many at most.
-        takes_gpu: whether a GPU is reserved for each.
+    With `takes_gpu` a GPU is reserved for each.
     """
 
     def __init__(

@@ -25,7 +25,6 @@ class ClusterService:
     """An actor with a guarded process; see `Service`.
 
     Args:
-        place: what it takes over from the driver.
         index: which of the services it is.
         has_gpu: whether a GPU is reserved for it; Ray then sets `CUDA_VISIBLE_DEVICES`.
         address: IP address to bind.
