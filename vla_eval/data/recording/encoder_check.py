@@ -20,7 +20,7 @@ N_COLOURS = 3
 
 
 def check_encoder(settings: EncoderSettings) -> None:
-    """Encode one frame, unless the encoder is a device's; `RecipeError` if it takes no such settings."""
+    """Encode two frames, unless the encoder is a device's; `RecipeError` if it takes no such settings."""
     name = ALIASES.get(settings.vcodec, settings.vcodec)
     known = (*SOFTWARE, *OF_A_DEVICE)
     if name not in known:
@@ -43,7 +43,7 @@ def check_encoder(settings: EncoderSettings) -> None:
             "of these, or another encoder.vcodec. yuv444p keeps the colour of every pixel."
         )
     try:
-        _encode_one_frame(name, settings)
+        _encode_two_frames(name, settings)
     except av.FFmpegError as exc:
         raise RecipeError(
             f"encoder: '{name}' does not take pix_fmt {settings.pix_fmt} with crf {settings.crf} and g "
@@ -51,10 +51,11 @@ def check_encoder(settings: EncoderSettings) -> None:
         ) from exc
 
 
-def _encode_one_frame(name: str, settings: EncoderSettings) -> None:
+def _encode_two_frames(name: str, settings: EncoderSettings) -> None:
     options = {"g": str(settings.g), "crf": str(settings.crf)}
     with av.open(io.BytesIO(), "w", format="mp4") as container:
         stream: Any = container.add_stream(name, FPS, options=options)  # Any: a VideoStream
         stream.pix_fmt, stream.width, stream.height = settings.pix_fmt, SIDE_PX, SIDE_PX
-        container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
+        for _ in range(2):  # x265 sometimes fails to end a video of one frame
+            container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
         container.mux(stream.encode())
