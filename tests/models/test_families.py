@@ -32,7 +32,7 @@ SHORT = {"steps": 3, "batch_size": 2, "save_every_steps": 3, "log_every_steps": 
 def toy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Register the row; workers find the folder by its name, too."""
     monkeypatch.syspath_prepend(Path(__file__).parent)
-    module = importlib.import_module("toy_family")
+    module = importlib.import_module("toy_family.row")
     monkeypatch.setitem(FAMILIES, module.ROW.type, module.ROW)
     return module
 
