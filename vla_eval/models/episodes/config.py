@@ -4,19 +4,20 @@ A training sample is an episode. Knows no network.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar  # lerobot is untyped
 
 from vla_eval.features import STATE_NAMES
 from vla_eval.models.shared.ported_config import PortedConfig
-from vla_eval.strict.bounds import Bounds, check_bounds, require
+from vla_eval.strict.bounds import check_bounds, require
 
 STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
 POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
 SPACE = 3  # numbers of a position, and of the translation with which an action begins
 SENTENCES = ("none", "words")
 """`words`: which words are in it, see `sentence.SentenceEncoder`."""
-BOUNDS: dict[str, Bounds] = {
+BOUNDS: Mapping[str, tuple[float, float]] = {
     "window_steps": (1, math.inf),
     **dict.fromkeys(("late_steps", "erase_warmup_episodes", "shift_px"), (0, math.inf)),
     **dict.fromkeys(("decision_share", "exchange_share", "erase_share"), (0, 1)),

@@ -1,6 +1,7 @@
 """lerobot's configuration of policies that learn from rewards; `docs/offline_rl.md` explains them."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_args  # lerobot is untyped
 
@@ -12,11 +13,11 @@ from vla_eval.features import RewardKind
 from vla_eval.models.sequence.sizes import encoder_stages
 from vla_eval.models.shared.ported_config import PortedConfig
 from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
-from vla_eval.strict.bounds import Bounds, check_bounds, require
+from vla_eval.strict.bounds import check_bounds, require
 
 TYPE = "mikasa_offline_rl"
 REWARDS: tuple[str, ...] = get_args(RewardKind)
-BOUNDS: dict[str, Bounds] = {
+BOUNDS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("width", "hidden", "n_sampled_actions"), (1, math.inf)),
     **dict.fromkeys(("dropout", "discount", "expectile", "target_rate"), (0, 1)),
 }
