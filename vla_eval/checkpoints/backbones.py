@@ -29,11 +29,7 @@ WITHOUT = "Without trained weights: --set policy.pretrained_backbone_weights=nul
 
 
 def check_backbone(folder: Path, name: str) -> str:
-    """Compare the names and shapes of a backbone's weights with torchvision's network `name`; return a line.
-
-    Raises:
-        CheckpointError: weights are missing, unexpected or of another shape.
-    """
+    """Compare names and shapes of weights with torchvision's network `name`; return a line or raise."""
     with torch.device("meta"):
         network = getattr(torchvision.models, name)()
     wanted = {key: tuple(x.shape) for key, x in network.state_dict().items()}

@@ -109,7 +109,7 @@ class TestConfiguration:
             ({"inference_attention": "bidirectionl"}, "Did you mean 'bidirectional'"),
             ({"action_grid": "refited"}, "Did you mean 'refitted'"),
             ({"camera_fov_rad": 90.0}, r"radians in \(0, π\)"),
-            ({"pictures": []}, "`pictures` is empty"),
+            ({"pictures": []}, r"pictures is \[\], expected the fields"),
             ({"action_grid": "kept"}, "no base with a grid"),
         ],
     )

@@ -30,7 +30,7 @@ _listeners: list[list[Heard]] = []
 
 
 def note(heard: Heard) -> None:
-    """Say what was read of a text, to whoever listens."""
+    """Tell the listeners, if any, what was read of a text."""
     for listener in _listeners:
         listener.append(heard)
 
