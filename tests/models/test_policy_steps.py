@@ -30,7 +30,7 @@ from vla_eval.models.shared.images import (
 )
 from vla_eval.models.shared.normalization import Normalization, Normalizer, mask_all_but
 from vla_eval.models.shared.processor_steps import DecoderStep, EncoderStep
-from vla_eval.models.shared.trainable import check_lora, check_lora_target, matching, set_trainable
+from vla_eval.models.weights.trainable import check_lora, check_lora_target, matching, set_trainable
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "octo"
 ALL7 = mask_all_but(7, left_alone=(-1,))

@@ -18,8 +18,8 @@ from vla_eval.checkpoints.bases import how_to_get
 from vla_eval.checkpoints.closed_doors import let_through
 from vla_eval.checkpoints.files import WEIGHTS_FILE
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import listed
+from vla_eval.models.weights.exact import listed
+from vla_eval.models.weights.file import WeightFile
 
 FOLDER = Path("checkpoints")
 FETCHED: Mapping[str, str] = {"ResNet18_Weights.IMAGENET1K_V1": "resnet18"}

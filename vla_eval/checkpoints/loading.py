@@ -45,9 +45,9 @@ from vla_eval.checkpoints.processors import check_statistics, load_processors, o
 from vla_eval.checkpoints.saved_processor import refuse_built_in_normalization
 from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
 from vla_eval.models.families import family_of, register_families
-from vla_eval.models.shared.empty_weights import empty_weights
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import check_same, put_weights
+from vla_eval.models.weights.empty import empty_weights
+from vla_eval.models.weights.exact import check_same, put_weights
+from vla_eval.models.weights.file import WeightFile
 
 register_families()
 

@@ -23,8 +23,8 @@ from vla_eval.checkpoints.select_step import select_step
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.models.episodes.memory import remembers_singly
 from vla_eval.models.shared.earlier_frames import mask_field
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import check_fit
+from vla_eval.models.weights.exact import check_fit
+from vla_eval.models.weights.file import WeightFile
 
 INSTRUCTION = "pick the cube"
 

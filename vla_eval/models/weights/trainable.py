@@ -10,7 +10,7 @@ from typing import Any  # peft and lerobot are untyped
 from torch import nn
 
 from vla_eval.errors import TrainingError, did_you_mean
-from vla_eval.models.shared.weights import listed
+from vla_eval.models.weights.exact import listed
 
 ALL_LINEAR = "all-linear"
 _LORA = re.compile(r"^(?P<module>.+)\.lora_(?:A|B|embedding_A|embedding_B|magnitude_vector)\..+$")
