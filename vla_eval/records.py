@@ -10,17 +10,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
-from vla_eval.strict.json_text import (
-    Count,
-    Distance,
-    Positive,
-    Rate,
-    Seconds,
-    Source,
-    as_dataclass,
-    read_json,
-    read_version,
-)
+from vla_eval.strict.bounds import Count, Distance, Positive, Rate, Seconds
+from vla_eval.strict.json_text import Source, as_dataclass, read_json, read_version
 
 RECORD_VERSION = 1
 """Raise it when a field changes its meaning; readers refuse versions they do not know."""

@@ -24,11 +24,8 @@ class InterceptGrabEnv(RollingBallEnv):
 
     Description: a red ball rolls along y past the robot, which has to catch it between its fingers.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: ball pose 7, initial velocity 3, grasped 1, linear and angular velocity 3 + 3, tcp
-    to ball 3, gripper width 1, velocity of the ball relative to the tcp 3).
+    Observation space: `state` adds ball pose 7, initial velocity 3, grasped 1, linear and angular velocity
+    3 + 3, tcp to ball 3, gripper width 1, velocity of the ball relative to the tcp 3.
 
     Rewards: dense: 10 for approaching the ball; 10 and up to 135 more while it lies between the fingers; up
     to 30 within 2.5 cm of it; 100 while it is grasped; 300 if solved.

@@ -14,7 +14,7 @@ from vla_eval.control_modes import ABSOLUTE_MODES, EE_DELTA_POS, EE_DELTA_POSE, 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.arm.arms import Arm
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
-from vla_eval.tasks.objects.bodies import yaw_rad
+from vla_eval.tasks.objects.bodies import length, yaw_rad
 
 
 class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
@@ -55,9 +55,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
 
     def arm_speed(self) -> torch.Tensor:
         """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
-        qvel = self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)]
-        speed: torch.Tensor = torch.linalg.norm(qvel, dim=1)
-        return speed
+        return length(self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)])
 
     def check_motion(self) -> None:
         """Raise `TaskArgumentError` if the scripted motion cannot be made in this control mode."""
