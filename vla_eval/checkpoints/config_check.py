@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from typing import Any, Union, get_args, get_origin, get_type_hints  # Any: JSON, and types of lerobot's
 
 from vla_eval.errors import CheckpointError
-from vla_eval.strict.json_fields import FETCH_AGAIN, get_count, wrong_type
-from vla_eval.strict.json_text import WORDS
+from vla_eval.strict.json_fields import FETCH_AGAIN, WORDS, get_count, wrong_type
 
 MAX_ACTIONS = 10_000  # of a chunk or a history, in control steps: many times the longest episode
 MOST: Mapping[str, int] = {"layers": 1_000, "depth": 1_000, "cameras": 100}

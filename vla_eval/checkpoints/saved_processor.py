@@ -15,7 +15,13 @@ from safetensors import safe_open
 
 from vla_eval.checkpoints.files import CONFIG_FILE, POSTPROCESSOR_FILE, PREPROCESSOR_FILE, WEIGHTS_FILE
 from vla_eval.errors import CheckpointError
-from vla_eval.strict.json_fields import FETCH_AGAIN, get_mapping, get_text, read_json, wrong_type
+from vla_eval.strict.json_fields import (
+    FETCH_AGAIN,
+    get_mapping,
+    get_text,
+    read_json,
+    wrong_type,
+)
 from vla_eval.strict.json_text import shown
 
 STATE_SUFFIX = ".safetensors"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vla_eval.data.facts_file import FactsFile
 from vla_eval.data.manifest import MIKASA_FOLDER, FileDigest
-from vla_eval.strict.bounds import Count, Positive
+from vla_eval.strict.json_text import Count, Positive
 
 IMPORT_FILE = MIKASA_FOLDER / "import.json"
 FORMAT_VERSION = 1

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.errors import DatasetError, some_of
-from vla_eval.strict.bounds import Count, Positive
-from vla_eval.strict.json_text import Source, as_dataclass, read_file, read_json, shown
+from vla_eval.strict.json_text import Count, Positive, Source, as_dataclass, read_file, read_json, shown
 
 INFO_FILE = Path("meta/info.json")
 REMEDY = "It is not read. Fetch the dataset again, from where you trust it."

@@ -27,8 +27,16 @@ from vla_eval.core import FloatArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
 from vla_eval.storage.durable import replace_file
-from vla_eval.strict.bounds import Count, Positive
-from vla_eval.strict.json_text import Source, as_dataclass, read_file, read_json, read_version, shown
+from vla_eval.strict.json_text import (
+    Count,
+    Positive,
+    Source,
+    as_dataclass,
+    read_file,
+    read_json,
+    read_version,
+    shown,
+)
 
 FORMAT_VERSION = 1
 """Of the files below. Raise it when a field changes its meaning; readers refuse versions they do not know."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from vla_eval.data.facts_file import FactsFile
 from vla_eval.data.manifest import MIXTURE_FILE, FileDigest
 from vla_eval.seeding import SeedRange, seed_ranges
-from vla_eval.strict.bounds import Count, Positive
+from vla_eval.strict.json_text import Count, Positive
 
 FORMAT_VERSION = 1
 

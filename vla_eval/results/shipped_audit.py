@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vla_eval.errors import ReportError
-from vla_eval.strict.bounds import Count, Positive, Rate
-from vla_eval.strict.json_text import Source, as_dataclass, loads, read_file, shorten
+from vla_eval.strict.json_text import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
 
 AuditProtocol = Literal["paper", "strict", "official"]
 STRICT: Mapping[str, bool] = {

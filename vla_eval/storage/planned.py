@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 from vla_eval.errors import some_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.shard import Shard
-from vla_eval.strict.bounds import Count, Positive
-from vla_eval.strict.json_text import Source, as_dataclass
+from vla_eval.strict.json_text import Count, Positive, Source, as_dataclass
 
 _NAMED = re.compile(r"(?P<name>\w[\w.-]*)=(?P<checkpoints>.+)", re.DOTALL)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from vla_eval.errors import RecipeError
-from vla_eval.strict.bounds import Positive
+from vla_eval.strict.json_text import Positive
 
 WRITTEN = re.compile(r"(\d{1,6})/(\d{1,6})", re.ASCII)
 

@@ -10,6 +10,7 @@ from typing import Any  # Any: JSON of another program
 
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.strict.decoding import check_value
+from vla_eval.strict.json_text import WORDS as WORDS
 from vla_eval.strict.json_text import loads, shown, wrong
 
 MAX_BYTES = 64 << 20  # the largest that were seen hold statistics of dozens of datasets: under 1 MiB

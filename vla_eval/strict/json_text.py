@@ -16,6 +16,11 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 from vla_eval.errors import VlaEvalError
 from vla_eval.plain_text import printable
 from vla_eval.strict.bounds import MAX_DEPTH
+from vla_eval.strict.bounds import Count as Count
+from vla_eval.strict.bounds import Distance as Distance
+from vla_eval.strict.bounds import Positive as Positive
+from vla_eval.strict.bounds import Rate as Rate
+from vla_eval.strict.bounds import Seconds as Seconds
 
 if TYPE_CHECKING:
     from pydantic_core import SchemaValidator

@@ -29,7 +29,7 @@ from vla_eval.errors import RecordingError
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import EnvSpec, PolicySpec
-from vla_eval.strict.bounds import Count, Positive
+from vla_eval.strict.json_text import Count, Positive
 
 SLOT = 0
 ONE_BY_ONE = ChunkingSpec(n_action_steps=1)
