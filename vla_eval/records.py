@@ -146,7 +146,7 @@ class EpisodeRecord:
             where: file and line number, for the message.
 
         Raises:
-            RunFolderError: the line is no record, one of another version, or one that cannot be true.
+            RunFolderError: the line is not a record, one of another version, or one that cannot be true.
         """
         source = Source(where=where, what="an episode record", remedy=REMEDY, error=RunFolderError)
         data = read_json(line, source)
@@ -179,7 +179,7 @@ REQUIRED_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeTiming:
-    """Wall-clock seconds of one episode; kept beside the record, never part of it.
+    """Wall-clock seconds of one episode; kept next to the record, never part of it.
 
     Attributes:
         key: the episode's.

@@ -69,7 +69,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         "check",
         help="say all that differs from what is expected (exit code 1 if something has to be changed)",
     )
-    check.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, whoever made it")
+    check.add_argument("dataset", metavar="DIR", type=Path, help="any dataset, also one made elsewhere")
 
     adopt = action("adopt", help="use a dataset that lerobot-edit-dataset has edited")
     adopt.add_argument("dataset", metavar="DIR", type=Path, help="a dataset with this project's fields")

@@ -34,7 +34,7 @@ def parse_json(content: bytes, *, where: str) -> dict[str, Any]:
         where: the file, for messages.
 
     Raises:
-        CheckpointError: it is no JSON, or holds something else.
+        CheckpointError: it is not JSON, or holds something else.
     """
     try:
         data = loads(content)

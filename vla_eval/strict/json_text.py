@@ -1,7 +1,7 @@
 """Read JSON, and check it against the types of a dataclass. Knows nothing of what the values mean.
 
 Strict means: no field twice, none unknown, none missing, no text where a number is expected, no number that
-is not finite, no nesting without end. Whoever reads says what to do about it.
+is not finite, no nesting without end. The reader says what to do about it.
 """
 
 import functools
@@ -131,7 +131,7 @@ def read_file(path: Path, source: Source) -> bytes:
 
     Raises:
         FileNotFoundError: there is nothing of this name.
-        VlaEvalError: of `source.error`: it is no file, or cannot be read.
+        VlaEvalError: of `source.error`: it is not a file, or cannot be read.
     """
     try:
         if path.is_symlink() and not path.exists():
@@ -162,7 +162,7 @@ def loads(
         non_finite: see `read_json`.
 
     Raises:
-        ValueError: it is no JSON, or not strict; the message says what was found.
+        ValueError: it is not JSON, or not strict; the message says what was found.
     """
     text = content if isinstance(content, str) else content.decode("utf-8")
     try:

@@ -61,7 +61,7 @@ def load_yaml(text: str, *, where: str) -> Any:  # Any: whatever the YAML holds
 
 
 class _RefusedError(Exception):
-    """YAML that is no plain data."""
+    """YAML that is not plain data."""
 
     def __init__(self, problem: str, mark: _Mark) -> None:
         super().__init__(problem)

@@ -28,7 +28,7 @@ def checked_image_size(size_px: object, *, task: str) -> int:
     """Return the argument `image_size`.
 
     Raises:
-        TaskArgumentError: it is no possible size.
+        TaskArgumentError: the size is impossible.
     """
     if isinstance(size_px, int) and MIN_IMAGE_SIZE_PX <= size_px <= MAX_IMAGE_SIZE_PX:
         return size_px
@@ -106,7 +106,7 @@ def offered_by(task: TaskSpec, env_kwargs: Mapping[str, object]) -> EnvSpec:
     """Return what a task offers with these arguments, without making its environment.
 
     Raises:
-        TaskArgumentError: the image size is no possible one.
+        TaskArgumentError: the image size is impossible.
         UnknownNameError: there is no such control mode.
     """
     size_px = checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=task.id)

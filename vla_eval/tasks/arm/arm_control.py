@@ -68,8 +68,8 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     def hold_action(self) -> torch.Tensor:
         """Return the (B, A) action that moves neither arm nor fingers, with the present gripper width.
 
-        In a delta mode it is no motion; in `pd_joint_pos` the joints' present targets, in `pd_ee_pose` the
-        present pose.
+        In a delta mode all motions are 0; in `pd_joint_pos` it is the joints' present targets, in
+        `pd_ee_pose` the present pose.
 
         Raises:
             TaskArgumentError: the control mode has no action for that.
