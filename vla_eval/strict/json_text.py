@@ -1,7 +1,8 @@
 """Read JSON, and check it against the types of a dataclass. Knows nothing of what the values mean.
 
 Strict means: no field twice, none unknown, none missing, no text where a number is expected, no number that
-is not finite, no nesting without end. The reader says what to do about it.
+is not finite, no nesting without end. The reader says what to do about it. The text is read by `json`, as
+pydantic's own parser accepts a field twice.
 """
 
 import functools

@@ -8,9 +8,8 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness
 
-GRIP_HALF_PLANE_M = (
-    0.04  # the ball lies between the fingers: within this in x and in y of the tool centre point,
-)
+# The ball lies between the fingers: within this in x and in y of the tool centre point,
+GRIP_HALF_PLANE_M = 0.04
 GRIP_HALF_HEIGHT_M = 0.03  # within this in z,
 GRIP_RADIUS_M = 0.04  # within this altogether,
 BALL_DIAMETER_WIDTH_M = 0.04  # and the fingers are at least this far apart.
