@@ -89,8 +89,8 @@ class EpisodeStart:
         run: which of several independent runs (training seeds) this is, from 0.
         instruction: the language instruction.
         horizon_steps: the episode ends after so many control steps.
-        row: the episode's row in a forward pass that it shares with others. A network gives a row the same
-            bits only in the same place of a pass of the same size, so that the plan fixes it.
+        row: the episode's row in a forward pass that it shares with others. Batched results are bit-identical
+            only at a fixed row and batch size, so the plan fixes the row.
     """
 
     slot: int
@@ -168,7 +168,7 @@ class Policy(Protocol):
         """What the policy reads and how long its chunks are."""
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Begin these episodes: forget all else that was known of their slots.
+        """Begin these episodes: forget all else about their slots.
 
         A probe also calls it in mid-episode (`RolloutSettings.reset_policy_at_step`), with the same start.
         """
@@ -194,7 +194,7 @@ class ForgettingPolicy(Policy, Protocol):
     """A policy that can release the memory of an episode that is over, before the next `reset`."""
 
     def forget(self, slots: Sequence[int]) -> None:
-        """Release what is known of these slots; nothing is asked of them before their next `reset`."""
+        """Release the memory of these slots: their next call is `reset`."""
 
 
 class StepObserver(Protocol):

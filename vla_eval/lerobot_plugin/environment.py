@@ -5,9 +5,9 @@ no seeds in its results. For figures use `mikasa-vla eval`.
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any  # lerobot and gymnasium's vector environments are untyped here
+from typing import Any, get_args  # lerobot and gymnasium's vector environments are untyped here
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from lerobot.envs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from numpy.typing import NDArray
 
-from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.environment import EnvSettings, RenderSettings, WristMesh
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.envs.factory import make_env
@@ -249,14 +249,11 @@ def _state_kind(name: str) -> StateKind:
 
 
 def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
-    known: Mapping[str, RenderSettings] = {
-        "shipped": RenderSettings(wrist_mesh="shipped", backend=backend),
-        "whole": RenderSettings(wrist_mesh="whole", backend=backend),
-        "simplified": RenderSettings(wrist_mesh="simplified", backend=backend),
-    }
-    if wrist_mesh not in known:
-        raise unknown_name("mesh", wrist_mesh, known, where="env.wrist_mesh")
-    return known[wrist_mesh]
+    meshes: tuple[WristMesh, ...] = get_args(WristMesh)
+    for mesh in meshes:
+        if mesh == wrist_mesh:
+            return RenderSettings(wrist_mesh=mesh, backend=backend)
+    raise unknown_name("mesh", wrist_mesh, meshes, where="env.wrist_mesh")
 
 
 def _vector(make: Callable[[], MikasaGym], n_envs: int, *, in_processes: bool) -> Any:
