@@ -22,12 +22,7 @@ GB = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedRates:
-    """What is assumed of a machine.
-
-    Attributes:
-        steps_per_second: control steps of one worker, images included.
-        inference_seconds: of one inference of a learned policy; scripted ones take none.
-    """
+    """What is assumed of one worker, images included, and of an inference of a learned policy."""
 
     steps_per_second: float = 20.0
     inference_seconds: float = 0.2
@@ -38,12 +33,9 @@ class EvaluationEffort:
     """What is left of an evaluation; steps, inferences and frames at most, as if no episode ended early.
 
     Attributes:
-        n_episodes, n_finished: of all, and those that have a result.
-        n_steps: control steps.
-        n_inferences: of all policies.
-        n_learned_inferences: of those that load weights.
+        n_finished: episodes that have a result.
+        n_learned_inferences: of policies that load weights.
         n_frames: images of two cameras that are rendered for policies and captures; see `n_rendered`.
-        n_workers: processes.
         copies: learned policies -> bytes of their weights; each worker loads its own copy.
         warnings: what a person should know before the first episode.
         notes: what could not be compared.
@@ -81,11 +73,7 @@ def describe_evaluation(
 def evaluation_effort(
     resolved: ResolvedEvaluation, *, allow_environment_change: bool = False
 ) -> EvaluationEffort:
-    """Return what is left to run.
-
-    Raises:
-        VlaEvalError: see `describe_evaluation`.
-    """
+    """Return what is left to run; errors are those of `describe_evaluation`."""
     config, plan = resolved.config, make_plan(resolved)
     records = check_startable(
         resolved.out,

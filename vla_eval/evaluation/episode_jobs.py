@@ -29,12 +29,9 @@ class EpisodeGroup:
     """Episodes that differ only in run and seed.
 
     Attributes:
-        key: its identity in the plan.
         adapter: registry name of the policy's code.
         args: the adapter's keyword arguments.
         env: the environment, before it is known which cameras the policy needs.
-        rollout: how the episodes are run.
-        instruction: the language instruction.
         n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
             policy is in it, else what its server says.
         checkpoint: of a policy of several checkpoints, which one; it has the run of that number alone.
@@ -59,14 +56,9 @@ class EpisodeGroup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeJob:
-    """One episode to run.
+    """One episode to run, where in a worker (`slot`) and in a forward pass (`row`, see `EpisodeStart.row`).
 
-    Attributes:
-        group: what it shares with others.
-        run, seed: which of them it is.
-        slot: where in a worker it runs.
-        row: where in a forward pass it is computed, see `EpisodeStart.row`. Slot and row are fixed by the
-            seed, so that no result depends on workers or order.
+    Slot and row are fixed by the seed, so that no result depends on workers or order.
     """
 
     group: EpisodeGroup

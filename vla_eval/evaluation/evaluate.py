@@ -11,7 +11,6 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self
 
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
@@ -73,9 +72,7 @@ class EvaluationSummary:
     """The result of one call of `evaluate`.
 
     Attributes:
-        out: the run folder.
-        n_episodes: how many episodes the run has in all.
-        n_open: how many of them have no result: not run, or ended in an error.
+        n_open: episodes without a result: not run, or ended in an error.
         n_errors: how many ended in an error in this call.
         was_stopped: the observer asked to stop.
     """
@@ -94,13 +91,9 @@ def evaluate(
     allow_environment_change: bool = False,
     observer: EvaluationObserver | None = None,
 ) -> EvaluationSummary:
-    """Run all episodes of an evaluation that have no result yet.
+    """Run all episodes of an evaluation that have no result yet; `command` is what the user typed.
 
-    Args:
-        resolved: what to evaluate, where: `resolve` makes it.
-        command: what the user typed, for the record.
-        allow_environment_change: continue although package versions or the machine have changed.
-        observer: gets the progress.
+    `allow_environment_change` continues although package versions or the machine have changed.
 
     Raises:
         VlaEvalError: a mistake that every episode would repeat; `TooManyErrorsError` if so many
@@ -256,9 +249,7 @@ class _Bookkeeper:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Store what has come, whatever ended the run."""
         self.store()
 

@@ -68,7 +68,6 @@ class TableRow:
     """One row: a policy at one or more numbers of action steps.
 
     Attributes:
-        name: what the table calls it.
         policy: recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`.
         n_action_steps: actions executed per inference; each checkpoint is evaluated at all of them.
         tasks: those of the table's tasks that the row is for; None: all.
@@ -105,13 +104,11 @@ class ModelTable:
         datasets: folder with one dataset per task, named like the task.
         steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
         run_seeds: one fine-tuning each; the SEM is over them.
-        episodes, seed_start: of each evaluation.
         controls: scripted policies next to the rows of a task, at each of their numbers of action steps.
         protocol: the published protocol whose summary figure is printed below the table; None: none.
-        simulator: what the evaluations run on.
         env: arguments of all tasks, such as the control mode of the datasets.
-        render, stop_at_success: see `EvalConfig`.
         finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
+        episodes, seed_start, simulator, render, stop_at_success: see `EvalConfig`.
         allow_unreplayed: see `FinetuneConfig`.
     """
 
@@ -159,14 +156,9 @@ class ModelTable:
 
 
 def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[str] = ()) -> ModelTable:
-    """Return the part of a table that has these tasks and rows, in the table's order.
+    """Return the part of a table that has these tasks and rows (none: all), in the table's order.
 
     The folders are those of the whole table.
-
-    Args:
-        table: the whole.
-        tasks: names of tasks; none: all.
-        rows: names of rows; none: all.
 
     Raises:
         UnknownNameError: one is not in the table.
@@ -201,20 +193,12 @@ class Finetuning(NamedTuple):
 
 
 def is_model_table(name: str) -> bool:
-    """Whether a configuration is a table of learned policies, and no evaluation.
-
-    Raises:
-        UnknownNameError, RecipeError: there is no such configuration, or it cannot be read.
-    """
+    """Whether a configuration is a table of learned policies; errors are those of `recipe_fields`."""
     return "rows" in recipe_fields("configs", name)
 
 
 def load_model_table(name: str) -> ModelTable:
-    """Read a table.
-
-    Raises:
-        UnknownNameError, RecipeError: see `load_recipe`.
-    """
+    """Read a table; errors are those of `load_recipe`."""
     return load_recipe("configs", name, ModelTable).value
 
 
@@ -255,12 +239,7 @@ def evaluations(
 
     Each row has run folders of its own, so that a table keeps its results when rows or tasks are added.
     The recipes that name the checkpoints are written to `out`: a row keeps its name, wherever its
-    weights are.
-
-    Args:
-        table: what to evaluate.
-        out: folder of the table.
-        adapters: row -> adapter where it is not lerobot's.
+    weights are. `adapters` names the adapter of each row whose adapter is not lerobot's.
     """
     own = adapters or {}
     folder = out / EVALUATION_FOLDER

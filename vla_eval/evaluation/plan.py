@@ -6,7 +6,7 @@ first episode. Knows nothing of processes or files of results.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from typing import Any, NamedTuple
 
 from vla_eval.checkpoints.execution_fields import ignored_fields
@@ -215,11 +215,8 @@ def _noted[T](
 
 def _ignored(groups: Sequence[EpisodeGroup]) -> tuple[str, ...]:
     """Return what of the checkpoints' configurations is ignored, each once."""
-    said: dict[str, None] = {}
-    for group in groups:
-        chunking = group.rollout.chunking
-        said.update(dict.fromkeys(ignored_fields(group.adapter, group.args, chunking=chunking)))
-    return tuple(said)
+    said = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
+    return tuple(dict.fromkeys(chain.from_iterable(said)))
 
 
 def _sentences(

@@ -31,14 +31,7 @@ def images_read(policies: Sequence[PolicyEntry]) -> dict[str, Reads]:
 
 
 def n_rendered(job: EpisodeJob, config: EvalConfig, *, reads: Reads, n_steps: int) -> int:
-    """Return at how many control steps of an episode images are rendered at most.
-
-    Args:
-        job: the episode.
-        config: of its evaluation.
-        reads: what its policy has to be given.
-        n_steps: after how many control steps it ends at the latest.
-    """
+    """Return at how many control steps of an episode of `n_steps` images are rendered at most."""
     for_policy = 0
     if reads == "every" or (reads == "last" and config.eager_rendering):
         for_policy = n_steps

@@ -112,11 +112,7 @@ def resolve(
 ) -> ResolvedEvaluation:
     """Read the policies of a configuration, ask policy servers, and decide what it leaves open.
 
-    Args:
-        config: what to evaluate.
-        backend: where the workers run.
-        out: the run folder; None: a folder in `runs/`, or that of its shard.
-        shard: run only this part of the episodes.
+    The arguments are the fields of `ResolvedEvaluation`; `out` is by default a folder in `runs/`.
 
     Raises:
         VlaEvalError: a policy cannot be read; see `load_policy_entry`.

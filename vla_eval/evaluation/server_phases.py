@@ -28,12 +28,7 @@ CONNECTION_ERRORS = frozenset(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Phase:
-    """Episodes that are run before the next ones begin.
-
-    Attributes:
-        jobs: the episodes, as planned.
-        policy: the shared policy; None: policies that are in the workers.
-    """
+    """Episodes run before the next ones begin, of the shared `policy`; None: of policies in the workers."""
 
     jobs: tuple[EpisodeJob, ...]
     policy: str | None
@@ -52,12 +47,7 @@ def phases(plan: Plan) -> Iterator[Phase]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadyPhase:
-    """A phase that can be run.
-
-    Attributes:
-        jobs: its episodes as workers get them.
-        servers: those that its episodes need; None: it needs none.
-    """
+    """A phase as workers get it, and the servers that its episodes need; None: it needs none."""
 
     jobs: Sequence[EpisodeJob]
     servers: SharedServers | None
@@ -78,12 +68,7 @@ def with_servers(
 ) -> Iterator[ReadyPhase | None]:
     """Give a phase as workers get it; of a shared policy, while its servers are there.
 
-    Args:
-        phase: the episodes.
-        resolved: what is evaluated, and where the servers run.
-        plan: what the servers' policies are called in the configuration.
-        logs: folder for what the servers write.
-        stops: asked while servers start; true: give up, and give None.
+    `stops` is asked while servers start; true: give up, and give None.
 
     Raises:
         VlaEvalError: a server cannot be started.

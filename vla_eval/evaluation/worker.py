@@ -95,7 +95,6 @@ class EpisodeRunner:
     def __init__(
         self, heartbeat: Heartbeat, tell: Callable[[Notice], None], capture: EpisodeCapture | None = None
     ) -> None:
-        """Start with nothing made."""
         self._capture = capture
         self._heartbeat = heartbeat
         self._tell = tell
@@ -142,14 +141,14 @@ class EpisodeRunner:
         ]
         # By the episode of slot 0, even if it has a result already and is not in the batch.
         seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
-        tapes = self._capture.tapes(batch.jobs) if self._capture else None
+        tapes = self._capture.tapes(starts) if self._capture else None
         count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
         observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         if self._capture and tapes:
-            self._capture.write(batch.jobs, tapes, named, env=env.spec, heartbeat=self._heartbeat)
+            self._capture.write(starts, tapes, named, env=env.spec, heartbeat=self._heartbeat)
         return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
 
     def _tell_sentences(self, group: EpisodeGroup, policy: Policy) -> None:

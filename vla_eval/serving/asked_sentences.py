@@ -14,11 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 class AskedSentences:
-    """Compares sentences with those of the training, and looks at what was read of them.
-
-    Args:
-        hosted: the policy.
-    """
+    """Compares sentences with those of the training, and looks at what was read of them."""
 
     def __init__(self, hosted: HostedPolicy) -> None:
         self._policy, self._name = hosted.policy, hosted.policy.spec.name

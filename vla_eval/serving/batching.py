@@ -80,8 +80,6 @@ class Batcher:
         policy: nobody else may call it any more.
         n_rows: rows of a pass.
         action_dims: names of an action's numbers.
-        metrics: counts what is done.
-        clock: seconds; not of a calendar.
     """
 
     def __init__(
@@ -115,13 +113,9 @@ class Batcher:
         self._put(_Forget(slot=slot))
 
     def close(self, *, seconds: float | None = None) -> bool:
-        """Finish the pass under way, cancel what has not begun, and end the thread.
+        """Finish the pass under way, cancel what has not begun, and end the thread; return whether it ended.
 
-        Args:
-            seconds: how long the pass may take until its thread is left alone; None: as long as it takes.
-
-        Returns:
-            Whether the thread has ended.
+        After `seconds` the thread is left alone; None: it is waited for as long as the pass takes.
         """
         with self._changed:
             self._is_closed = True
@@ -221,14 +215,10 @@ class Batcher:
 
 
 def next_pass(queue: deque[_Request], *, n_rows: int) -> tuple[list[_Request], deque[_Request]]:
-    """Return what is done next, oldest first, and what stays in the queue.
+    """Return what is done next, oldest first, and what stays in the queue, for a pass of `n_rows`.
 
     The oldest request is always taken. One for a row that is taken waits, and so does all that was asked
     later for the same slot.
-
-    Args:
-        queue: the requests, oldest first.
-        n_rows: rows of a pass.
     """
     chosen: list[_Request] = []
     left: deque[_Request] = deque()

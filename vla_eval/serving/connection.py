@@ -39,14 +39,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """What all connections of a server share.
-
-    Attributes:
-        sessions: all sessions.
-        batcher: asks the policy.
-        sentences: looks at what clients ask it with.
-        debug: whether errors are sent with their traceback.
-    """
+    """What all connections of a server share; `debug`: errors are sent with their traceback."""
 
     sessions: SessionTable
     batcher: Batcher
@@ -55,13 +48,7 @@ class Service:
 
 
 class ClientConnection:
-    """Answers the requests of one connection.
-
-    Args:
-        socket: the connection.
-        number: its number, different from that of every other one.
-        service: what it shares with others.
-    """
+    """Answers the requests of one connection, whose number no other one has."""
 
     def __init__(self, socket: ServerConnection, number: int, service: Service) -> None:
         self._socket, self._number, self._service = socket, number, service
@@ -88,11 +75,7 @@ class ClientConnection:
             self._service.sessions.drop_connection(self._number)
 
     async def finish_replies(self, seconds: float) -> None:
-        """Wait until what the policy has answered is sent; for a server that stops.
-
-        Args:
-            seconds: how long at most: a client may not read.
-        """
+        """Wait until the policy's answers are sent, but not for long: a client may not read."""
         if self._replies:
             await asyncio.wait(self._replies, timeout=seconds)
 
@@ -155,10 +138,10 @@ class ClientConnection:
         """Send the reply to a request once the policy has answered."""
         try:
             result = await asyncio.wrap_future(cast("Future[Inference | None]", done))
-            now = time.monotonic()
-            reply = (
-                self._reset_reply(begun, now) if result is None else self._chunk_reply(result, session, start)
-            )
+            reset_ms = 1000 * (time.monotonic() - begun)
+            reply = {"status": "reset", "server_timing": {"reset_ms": reset_ms}}
+            if result is not None:
+                reply = self._chunk_reply(result, session, start)
             echo = {key: request[key] for key in ("session_id", "step") if request.get(key) is not None}
             await self._socket.send(packb({**reply, **echo}))
             self._previous_seconds = time.monotonic() - begun
@@ -169,9 +152,6 @@ class ClientConnection:
         finally:
             session.n_pending -= 1
             session.used_at = time.monotonic()
-
-    def _reset_reply(self, begun: float, now: float) -> dict[str, Any]:
-        return {"status": "reset", "server_timing": {"reset_ms": 1000 * (now - begun)}}
 
     def _chunk_reply(self, result: Inference, session: Session, start: EpisodeStart | None) -> dict[str, Any]:
         timing = {"infer_ms": 1000 * result.infer_seconds, "queue_ms": 1000 * result.queue_seconds}

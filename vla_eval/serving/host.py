@@ -56,7 +56,6 @@ class HostOptions:
     device: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, {"max_batch": (1, MAX_SERVER_ROWS), "n_action_steps": (1, MAX_STEPS)})
 
 
@@ -65,9 +64,6 @@ class HostedPolicy:
     """A policy that is ready to be served.
 
     Attributes:
-        policy: the policy.
-        metadata: what the server reports.
-        reader: reads its observations.
         task: the task of an episode whose client names none.
         ignored: what its checkpoint asks for that is not done here.
     """

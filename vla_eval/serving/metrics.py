@@ -15,10 +15,7 @@ class Counts:
     """What was counted since the start.
 
     Attributes:
-        n_inferences: chunks.
-        n_passes: calls of the policy.
         n_errors: inferences or beginnings of episodes at which the policy failed.
-        infer_seconds: in the policy.
         queue_seconds: added up over all inferences: between the request and the beginning of its pass.
     """
 
@@ -32,9 +29,7 @@ class Counts:
 class ServerMetrics:
     """Counts; the thread that infers writes them, others read.
 
-    Args:
-        clock: seconds; not of a calendar.
-        on_pass: called with the seconds of each pass, in the thread that infers.
+    That thread also calls `on_pass` with the seconds of each pass.
     """
 
     def __init__(
@@ -49,13 +44,7 @@ class ServerMetrics:
         self._reported, self._reported_at = Counts(), clock()
 
     def count_pass(self, *, n_requests: int, infer_seconds: float, queue_seconds: float) -> None:
-        """Count a pass.
-
-        Args:
-            n_requests: chunks that it gave.
-            infer_seconds: how long it took.
-            queue_seconds: how long its requests had waited, added up.
-        """
+        """Count a pass; `queue_seconds` is what its requests had waited, added up."""
         with self._lock:
             counts = self._counts
             self._counts = replace(

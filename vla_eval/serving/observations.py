@@ -57,11 +57,7 @@ class ObservationReader:
         return layouts
 
     def read(self, request: Mapping[str, Any], *, step: int) -> Observation:
-        """Return the observation that a request holds.
-
-        Args:
-            request: what the client sent, decoded.
-            step: control steps executed before it.
+        """Return the observation that a request holds, after `step` control steps.
 
         Raises:
             RequestError: an image or the state is missing, or has another shape or type.
@@ -95,12 +91,7 @@ class ObservationReader:
 
 
 def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) -> ObservationReader:
-    """Return what reads the observations of a policy.
-
-    Args:
-        policy: which cameras and states it needs.
-        env: their sizes.
-        end_effector: whether the policy reads the kind `eef`.
+    """Return what reads the observations of a policy; `end_effector`: it also reads the kind `eef`.
 
     Raises:
         SpecMismatchError: the policy has a camera for which the wire has no key.

@@ -62,7 +62,6 @@ class ServerOptions:
     """Where and how to serve.
 
     Attributes:
-        host: address to listen on.
         port: TCP port; 0: a free one.
         api_key: what clients must send; None: nothing.
         idle_seconds: sessions without a message for so long are dropped.
@@ -78,12 +77,6 @@ class ServerOptions:
     log_seconds: float = LOG_SECONDS
 
     def __post_init__(self) -> None:
-        """Check the ranges, and the key.
-
-        Raises:
-            RecipeError: a number is out of range.
-            ServeError: the key cannot be sent in a header.
-        """
         check_bounds(self, {"port": (0, MAX_PORT), "idle_seconds": (0.001, MAX_SECONDS)})
         problem = None if self.api_key is None else key_problem(self.api_key)
         if problem is not None:
@@ -91,13 +84,7 @@ class ServerOptions:
 
 
 class PolicyServer:
-    """Serves one policy until it is stopped.
-
-    Args:
-        hosted: the policy.
-        options: where and how.
-        metrics: counts what is done; None: new ones.
-    """
+    """Serves one policy until it is stopped."""
 
     def __init__(
         self, hosted: HostedPolicy, options: ServerOptions, metrics: ServerMetrics | None = None
@@ -130,12 +117,8 @@ class PolicyServer:
     async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> bool:
         """Serve until `stop` is set; then finish the pass under way, and close all connections.
 
-        Returns:
-            Whether the policy has answered; if not, its thread still runs.
-
-        Args:
-            stop: set by the caller to end.
-            ready: called once with the port when clients can connect.
+        Calls `ready` once, with the port, when clients can connect. Returns whether the policy has answered;
+        if not, its thread still runs.
 
         Raises:
             ServeError: the address cannot be listened on.
@@ -235,14 +218,9 @@ def run_server(
 ) -> None:
     """Serve until SIGINT or SIGTERM; a second one ends the process at once.
 
-    Within `END_SECONDS` of the first one the process has ended, whatever the policy does.
-
-    Args:
-        hosted: the policy.
-        options: where and how.
-        ready: called once with the port when clients can connect.
-        ends: called in a thread of its own; when it returns, the server stops as well.
-        metrics: counts what is done; None: new ones.
+    Within `END_SECONDS` of the first one the process has ended, whatever the policy does. `ready` is called
+    once, with the port, when clients can connect; `ends` in a thread of its own: when it returns, the server
+    stops as well.
 
     Raises:
         ServeError: the address cannot be listened on.

@@ -40,12 +40,12 @@ class Session:
         name: its id within the connection; None: the connection itself.
         slot: where the policy keeps what it remembers of it.
         row: its row of a pass.
+        used_at: time of its last message, by the clock of the table.
         episode: what was begun last; None before.
         was_reset: whether it was begun by a `reset`.
         frames: frames that the policy has not been given yet.
         step: the step of the newest frame; None before the first.
         n_pending: requests that have no reply yet.
-        used_at: time of its last message, by the clock of the table.
     """
 
     connection: int
@@ -70,7 +70,6 @@ class SessionTable:
         n_rows: rows of a pass.
         task: the task of an episode whose client names none.
         forget: called with the slot of each session that is dropped.
-        clock: seconds; not of a calendar.
     """
 
     def __init__(
@@ -94,12 +93,7 @@ class SessionTable:
         return len(self._sessions)
 
     def session(self, connection: int, request: Mapping[str, Any], *, address: str) -> Session:
-        """Return the session of a request; a new one for an id that is new.
-
-        Args:
-            connection: number of the connection.
-            request: what it sent.
-            address: of the machine that the connection comes from.
+        """Return the session of a request, for an id that is new a new one; `address` is that of its machine.
 
         Raises:
             RequestError: the id is not text, its session was dropped, or there are too many.

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from vla_eval.errors import VlaEvalError
@@ -23,7 +22,6 @@ from vla_eval.wire.metadata import ServerMetadata
 from vla_eval.workers.backend import Backend, Service
 from vla_eval.workers.framing import BrokenMessageError, send_message
 from vla_eval.workers.inside import SharedStage, add_count, detach
-from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import Failed, as_exception, describe_error
 from vla_eval.workers.process import CLOSE_SECONDS
 from vla_eval.workers.start import VISIBLE_GPUS
@@ -61,13 +59,7 @@ class ServerReady:
 class SharedServers:
     """The servers of one policy; a context manager that leaves none behind.
 
-    Args:
-        options: the policy.
-        logs: folder for what the servers write.
-        start_seconds: how long a server may take until clients can connect.
-        preload: modules that servers need and that take long to import.
-        backend: where they run.
-        stops: asked while the servers start; true: give up.
+    `stops` is asked while they start, each for at most `start_seconds`; true: give up.
     """
 
     def __init__(
@@ -76,9 +68,9 @@ class SharedServers:
         *,
         logs: Path,
         start_seconds: float,
-        preload: Sequence[str] = (),
-        backend: Backend = LOCAL,
-        stops: Callable[[], bool] = lambda: False,
+        preload: Sequence[str],
+        backend: Backend,
+        stops: Callable[[], bool],
     ) -> None:
         self._options, self._start_seconds, self._stops = options, start_seconds, stops
         self._key = secrets.token_urlsafe(32)
@@ -134,9 +126,7 @@ class SharedServers:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End all servers: gently after success, at once after an exception."""
         if kind is None:
             for service in self._services:

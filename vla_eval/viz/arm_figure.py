@@ -11,14 +11,9 @@ SAME_PLACE_M = 0.01
 
 
 def arm_points_m(qpos: FloatArray, tcp_position_m: FloatArray) -> FloatArray | None:
-    """Return (10, 3): base, the seven joints, the flange and the tool centre point, world frame.
+    """Return (10, 3): base, the seven joints, the flange and the tool centre point, in m, world frame.
 
-    Args:
-        qpos: joint positions, rad; the first seven are the arm's.
-        tcp_position_m: (3,) where the simulator has the tool centre point.
-
-    Returns:
-        None if the line would not end there: it is another arm, or no arm at all.
+    None if the line would not end at the simulator's tool centre point: it is another arm, or no arm at all.
     """
     if len(qpos) < N_ARM_JOINTS:
         return None

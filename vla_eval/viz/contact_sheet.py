@@ -20,13 +20,7 @@ Rgb = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetRow:
-    """One episode of the sheet.
-
-    Attributes:
-        name: what stands beside its frames, a few short lines.
-        frames: (H, W, 3) uint8, all of one size.
-        edge: colour of a line around the frames; None: there is no line.
-    """
+    """One episode: a few short lines next to its frames, all of one size, each in an edge if it has one."""
 
     name: str
     frames: tuple[ImageArray, ...]
@@ -36,10 +30,7 @@ class SheetRow:
 def contact_sheet(columns: Sequence[str], rows: Sequence[SheetRow], *, title: Sequence[str] = ()) -> bytes:
     """Return a PNG file of all rows below each other; the same input gives the same bytes.
 
-    Args:
-        columns: what stands above the frames; as many as each row has.
-        rows: the episodes; all frames have one size.
-        title: lines above everything.
+    Above each frame stands the name of its column, above everything the lines of the title.
     """
     height, width = rows[0].frames[0].shape[:2]
     first_top = LABEL_PX * (len(title) + 1) + EDGE_PX + MARGIN_PX

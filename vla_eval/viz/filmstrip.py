@@ -22,13 +22,9 @@ class StripFrame(NamedTuple):
 
 
 def read_strip(path: Path, *, n_frames: int, n_steps: int, control_hz: float) -> list[StripFrame]:
-    """Return frames from the first to the last step, as evenly spaced as the video has them.
+    """Return frames of `write_video` from the first to the last step, as evenly spaced as the video has them.
 
-    Args:
-        path: a video that `write_video` has written.
-        n_frames: how many; fewer if the video has not so many.
-        n_steps: control steps of the episode, which the last frame is of.
-        control_hz: control steps per second.
+    They are fewer than `n_frames` if the video does not have as many.
 
     Raises:
         ViewingError: the video cannot be read.

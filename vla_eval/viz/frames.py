@@ -46,13 +46,9 @@ class Part:
 
 
 def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_held: int = 1) -> ImageArray:
-    """Return one frame of an episode, (H, W, 3) uint8 with even sides.
+    """Return one frame of an episode, (H, W, 3) uint8 with even sides, of a step that has images.
 
-    Args:
-        tape: the whole episode.
-        taped: the step to show; it must have images.
-        record: of the episode.
-        n_held: how many frames of the video this one is held for; above 1 it is said.
+    `n_held` is how many frames of the video this one is held for; above 1 it is said.
     """
     images = taped.result.observation.images
     small = [name for name in images if name != HUMAN_CAMERA]

@@ -18,7 +18,6 @@ class Moments(NamedTuple):
     """Captured steps of an episode.
 
     Attributes:
-        cue: the first one.
         reveal: the first one of the response phase; without phases, the one in the middle.
         touch: the first one at which a candidate has been touched; else the last one.
     """

@@ -20,15 +20,8 @@ def rrd_when_whole(
 ) -> Iterator[rr.RecordingStream]:
     """Give a stream to log to. The file gets its name once everything is in it.
 
-    Args:
-        path: the file; its folder is made.
-        recording_id: rerun's name of the recording.
-        blueprint: how the viewer lays it out.
-        failed: the message before the cause, if the file cannot be written.
-        advice: the message after the cause.
-
     Raises:
-        ViewingError: the file cannot be written.
+        ViewingError: the file cannot be written; `failed` is the message before the cause, `advice` after it.
     """
     unfinished = path.with_suffix(".part")
     try:

@@ -8,12 +8,9 @@ import rerun.blueprint as rrb
 def layout(
     cameras: Sequence[str], action_dims: Sequence[str], state_dims: Sequence[str] = ()
 ) -> rrb.Blueprint:
-    """Return the blueprint: the world and the cameras above, curves and words below.
+    """Return the blueprint: the world and the cameras with images above, curves and words below.
 
-    Args:
-        cameras: the cameras that have images.
-        action_dims: the entries of an action.
-        state_dims: the entries of the proprioception; of datasets alone.
+    `state_dims` are the entries of the proprioception; of datasets alone.
     """
     views = [rrb.Spatial2DView(origin=f"cameras/{name}", name=name) for name in cameras]
     above = rrb.Horizontal(

@@ -41,13 +41,9 @@ COLORS = {
 
 
 def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvSpec) -> None:
-    """Write one episode.
+    """Write one episode; the file is there whole or not at all.
 
-    Args:
-        tape: the episode.
-        record: of the episode.
-        path: the file; it is there whole or not at all.
-        env: names the numbers of an action, and the control steps per second for the timeline `time`.
+    `env` names the numbers of an action, and the control steps per second for the timeline `time`.
 
     Raises:
         ViewingError: the file cannot be written.

@@ -30,12 +30,9 @@ class TapedChunk:
 
 @dataclass(slots=True, kw_only=True)
 class EpisodeTape:
-    """One episode so far.
+    """One episode so far, with steps and chunks in order.
 
-    Attributes:
-        start: what the policy gets at the beginning.
-        frame_stride: images were requested every so many steps; others may have requested more.
-        steps, chunks: in order.
+    Images were requested at every `frame_stride`-th step; others may have requested more.
     """
 
     start: EpisodeStart
@@ -53,15 +50,9 @@ class EpisodeTape:
 
 
 class Tapes:
-    """Implements `StepObserver`.
-
-    Args:
-        slots: the slots whose episodes are kept.
-        frame_stride: images are requested every so many control steps, and at the last one.
-    """
+    """A `StepObserver` that keeps the episodes of some slots, with images at a stride and at the end."""
 
     def __init__(self, slots: Collection[int], *, frame_stride: int) -> None:
-        """Start with nothing taped."""
         self._slots = slots
         self._frame_stride = frame_stride
         self._horizons: set[int] = set()

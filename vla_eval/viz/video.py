@@ -37,7 +37,7 @@ def write_video(
         tape: the episode.
         record: its record.
         path: the mp4; it is there whole or not at all.
-        thumbnail: the JPEG: the frame of the cue and beside it that of the choice.
+        thumbnail: the JPEG: the frame of the cue and next to it that of the choice.
         stills: a small JPEG of cue, reveal and touch, for `report --filmstrip`.
         frame_rate_hz: captured steps per second of the episode, so that the video is as fast as the episode,
             but for the cue.

@@ -12,12 +12,7 @@ _URL = re.compile(r"(?P<recipe>[^@]*@)?(?P<urls>wss?://.*)", re.DOTALL)
 
 
 class NamedServer(NamedTuple):
-    """What a user wrote for a policy behind a socket.
-
-    Attributes:
-        recipe: the recipe before the `@`; None if there is none.
-        urls: the address, or several with commas.
-    """
+    """What a user wrote for a policy behind a socket: a recipe if one is before an `@`, and the URLs."""
 
     recipe: str | None
     urls: str

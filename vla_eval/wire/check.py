@@ -48,15 +48,9 @@ def check_remote(
 ) -> list[str]:
     """Check that a server keeps the protocol, and that its sessions do not affect each other.
 
-    Args:
-        url: `ws://HOST:PORT`.
-        api_key: sent as the header `Authorization: Api-Key KEY`.
-        timeout_seconds: how long a reply may take.
-        report: called with each requirement that is met, as soon as that is known.
-
-    Returns:
-        The requirements that are met, in the order in which they were checked. Of a server that does not
-        announce this protocol, also what could not be tried.
+    `report` is called with each requirement that is met, as soon as that is known. Returned are all of them,
+    in the order in which they were checked; of a server that does not announce this protocol, also what could
+    not be tried.
 
     Raises:
         CheckFailedError: one is not met; the message says which, and what was found.

@@ -62,11 +62,7 @@ class OpenpiClient:
     """openpi's words; sessions, resets and single frames only where the server announces them."""
 
     def __init__(self, connection: Connection) -> None:
-        """Read the server's metadata.
-
-        Raises:
-            RemotePolicyError: it says nothing, or something else.
-        """
+        """Read the server's metadata, or raise a `RemotePolicyError`."""
         self._connection = connection
         try:
             self._metadata = ServerMetadata.from_wire(connection.receive(), where=connection.url)
@@ -104,11 +100,7 @@ class OpenpiClient:
         self._connection.send({**fields, **self._address(session, "reset", step=0)})
 
     def take_reset(self, session: str) -> None:
-        """Wait until the episode has begun.
-
-        Raises:
-            RemotePolicyError: see `Connection.receive`; or the answer is another one.
-        """
+        """Wait until the episode has begun; errors are those of `Connection.receive`."""
         if not self._metadata.takes_reset:
             return
         answer = self._answer(session)
@@ -126,11 +118,7 @@ class OpenpiClient:
         self._connection.send({**request, **self._address(session, "infer", step=step)})
 
     def take_infer(self, session: str) -> Any:
-        """Return the actions of the answer, unchecked.
-
-        Raises:
-            RemotePolicyError: see `Connection.receive`; or the answer has no actions, or another's.
-        """
+        """Return the actions of the answer, unchecked; errors are those of `Connection.receive`."""
         answer = self._answer(session)
         if "actions" not in answer:
             error = answer.get("message", answer.get("error"))

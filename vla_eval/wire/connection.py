@@ -29,7 +29,18 @@ HTTP_UNAUTHORIZED = (401, 403)
 
 
 class Connection:
-    """A connection to one server; used by one thread."""
+    """A connection to one server; used by one thread.
+
+    Args:
+        url: `ws://HOST:PORT`.
+        timeout_seconds: how long a message is waited for.
+        connect_seconds: how long to try again while nobody listens there.
+        api_key: sent in the header `Authorization: Api-Key KEY`.
+        text_markers: see `codec.packb`.
+
+    Raises:
+        RemoteConnectionError: there is no server, or it refuses.
+    """
 
     def __init__(
         self,
@@ -40,18 +51,6 @@ class Connection:
         api_key: str | None = None,
         text_markers: bool = False,
     ) -> None:
-        """Connect.
-
-        Args:
-            url: `ws://HOST:PORT`.
-            timeout_seconds: how long a message is waited for.
-            connect_seconds: how long to try again while nobody listens there.
-            api_key: sent in the header `Authorization: Api-Key KEY`.
-            text_markers: see `codec.packb`.
-
-        Raises:
-            RemoteConnectionError: there is no server, or it refuses.
-        """
         self.url = url
         self._timeout_seconds = timeout_seconds
         self._text_markers = text_markers
@@ -74,15 +73,12 @@ class Connection:
             raise self._lost(exc) from exc
 
     def receive(self, *, accept_text: Collection[str] = ()) -> Any:
-        """Return the next message.
-
-        Args:
-            accept_text: frames of text, other than errors, that are returned as they are.
+        """Return the next message, or a frame of text that is in `accept_text`.
 
         Raises:
             RemoteTimeoutError: none came in time.
             RemoteConnectionError: the connection is lost, or was closed after an earlier error.
-            RemoteReplyError: it is an error of the server's, or no message.
+            RemoteReplyError: it is an error of the server's, or not a message.
         """
         try:
             frame = self._socket.recv(timeout=self._timeout_seconds)

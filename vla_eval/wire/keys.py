@@ -30,22 +30,16 @@ def key_problem(key: str) -> str | None:
 
 
 def key_headers(key: str | None) -> dict[str, str]:
-    """Return the headers that a client sends; none without a key.
-
-    Args:
-        key: one of which `key_problem` finds nothing.
-    """
+    """Return the headers that a client sends; none without a key, which `key_problem` has looked at."""
     if key is None:
         return {}
     return {HEADER: f"{SCHEME} {key.encode('utf-8').decode('latin-1') if IS_LATIN_1 else key}"}
 
 
 def refused(given: Sequence[str], key: str | None) -> HTTPStatus | None:
-    """Return the status with which a server refuses a client; None if it is let in.
+    """Return the status with which a server with this key refuses a client; None if it is let in.
 
-    Args:
-        given: the values of all headers `Authorization`.
-        key: the server's key; None: none is needed.
+    `given` are the values of all headers `Authorization`.
     """
     if len(given) > 1:
         return HTTPStatus.BAD_REQUEST

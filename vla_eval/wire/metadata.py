@@ -39,10 +39,8 @@ class ServerMetadata:
 
     Attributes:
         protocol: `openpi+1` if it is a server of this wire; a field that is None then means: there is none.
-        name: the policy's name.
         weights_known: whether it says which weights the policy has.
         weights_sha256: digest of the weights; None for a policy without weights, or if not known.
-        recipe_sha256: digest of the policy's recipe.
         chunk_size: actions of one reply.
         n_action_steps: actions executed per inference, where the evaluation names no number.
         control_mode, action_dims, control_hz: what the actions are for; `action_dims` are their names.
@@ -55,7 +53,6 @@ class ServerMetadata:
         batch_max: rows of a shared pass; see `EpisodeStart.row`.
         supports: which of `reset`, `observe`, `seed` and `row` may be sent.
         versions: package -> version, at the server.
-        n_sessions: sessions that it has at the moment.
         training_seeds: task -> the seeds of the demonstrations that the policy was trained on.
         sentences: task -> the sentences that the policy was trained with.
         other: what else it says.
@@ -139,11 +136,7 @@ class ServerMetadata:
 
     @classmethod
     def from_wire(cls, message: object, *, where: str) -> "ServerMetadata":
-        """Read the first message of a server.
-
-        Args:
-            message: what the server sent, decoded.
-            where: its address, for messages.
+        """Read the first message of a server; `where` is its address, for messages.
 
         Raises:
             RemoteReplyError: it is not a map, or a known field has another type.

@@ -22,14 +22,10 @@ class NumbersError(ValueError):
 
 
 def as_state(value: Any, names: Sequence[str]) -> np.ndarray[Any, Any]:
-    """Return a state as a new float32 array.
-
-    Args:
-        value: (len(names),) float32 or float64.
-        names: what each number is.
+    """Return a state, float32 or float64, as a new float32 array with a number for each name.
 
     Raises:
-        NumbersError: it has another type or shape, a number that is not finite, or a rotation that is none.
+        NumbersError: it has another type or shape, a number that is not finite, or not a rotation.
     """
     expected = f"an array of {len(names)} numbers, float32 or float64"
     if not isinstance(value, np.ndarray):

@@ -6,7 +6,6 @@ the jobs is the only one that writes results.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, Self
 
 from vla_eval.workers.jobs import Event, Job, JobSource
@@ -20,9 +19,7 @@ class Pool[J: Job, A](Protocol):
     def __enter__(self) -> Self:
         """Start nothing yet: workers start when there is work for them."""
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End all workers: gently after success, at once after an exception."""
 
     def run(self, queue: JobSource[J]) -> Iterator[Event[J, A]]:

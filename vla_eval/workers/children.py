@@ -58,12 +58,7 @@ def python_command(*arguments: str) -> list[str]:
 
 
 def bound_command(program: str, *arguments: str) -> list[str]:
-    """Return a command that is killed when the thread that starts it ends, however that happens.
-
-    Args:
-        program: its path.
-        arguments: those of the program.
-    """
+    """Return a command that is killed when the thread that starts it ends, however that happens."""
     # Isolated: it takes a hundredth of a second, and imports nothing from anywhere else.
     binding = [sys.executable, "-I", "-S", "-c", _BIND_AND_EXECUTE, str(os.getpid())]
     return [*binding, program, *arguments]

@@ -30,8 +30,7 @@ PR_SET_CHILD_SUBREAPER = 36
 def fork_guarded(lifeline: Connection) -> None:
     """Return in a child of this process, which stays behind as its guard and never returns.
 
-    Args:
-        lifeline: what the parent sends `ASK_WHERE` and `END` through.
+    The parent sends `ASK_WHERE` and `END` through `lifeline`.
     """
     with contextlib.suppress(PermissionError):  # a leader of a group is alone in it already
         os.setsid()  # signals to the command's group are for the command
@@ -54,11 +53,7 @@ def fork_guarded(lifeline: Connection) -> None:
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends, or the thread of the parent that started it.
-
-    Args:
-        parent: the parent's process id.
-    """
+    """Have the kernel kill this process when its parent ends, or the thread of the parent that started it."""
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before the line above
         os._exit(1)

@@ -34,7 +34,6 @@ class Heartbeat:
     """Writes the current stage to shared memory, and adds up the time per stage."""
 
     def __init__(self, shared: SharedStage) -> None:
-        """Take the memory to write to."""
         self._shared = shared
         self._stage: Stage | None = None
         self._since = 0.0

@@ -40,13 +40,7 @@ class MachineKind:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered[J: Job, A]:
-    """The result of one job.
-
-    Attributes:
-        job: the job.
-        answer: what the worker answered, or why it did not.
-        kind: the worker's machine; None: of the same kind as the one that plans.
-    """
+    """The result of one job; `kind` is that of the machine; None: the same as the planning machine."""
 
     job: J
     answer: A | Failed

@@ -8,10 +8,8 @@ class MachineLoad:
     """One machine of a cluster.
 
     Attributes:
-        name: what people call it.
         is_used: whether workers may be started on it; else it is gone, refused or set aside.
-        n_workers: workers that it has.
-        n_running: items that they have been given and have not answered.
+        n_running: items that its workers have been given and have not answered.
         n_done: items that they have answered.
         per_second: answered items per second since the machine was first seen.
         n_gpus: GPUs that the cluster may use.

@@ -18,7 +18,6 @@ class Failed:
     """An episode, or one of a batch, could not be run.
 
     Attributes:
-        error: what happened.
         refused: environment and policy cannot be made or do not fit, for a reason that this package
             knows: it will be the same for every episode of the group.
     """

@@ -12,12 +12,7 @@ MAX_PARCEL_BYTES = 64_000_000
 
 
 class PackedFolder(NamedTuple):
-    """A folder and all its files.
-
-    Attributes:
-        path: absolute, or below the working directory.
-        files: name below the folder -> content.
-    """
+    """A folder, its path absolute or below the working directory, and the content of each file by name."""
 
     path: str
     files: dict[str, bytes]
@@ -34,22 +29,14 @@ def fits(folders: Iterable[Path]) -> bool:
 
 
 def pack(path: str) -> PackedFolder:
-    """Read a folder.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Read a folder."""
     folder = Path(path)
     files = {file.relative_to(folder).as_posix(): file.read_bytes() for file in _files(folder)}
     return PackedFolder(path, files)
 
 
 def unpack(packed: PackedFolder) -> None:
-    """Write a folder; it appears whole or not at all. What is there already stays.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a folder; it appears whole or not at all. What is there already stays."""
     target = Path(packed.path)
     target.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))

@@ -15,7 +15,6 @@ import time
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import wait
-from types import TracebackType
 from typing import Self, cast
 
 from vla_eval.core import Stage
@@ -50,7 +49,6 @@ class WorkerPool[J: Job, A]:
     """
 
     def __init__(self, spec: WorkerSpec, *, size: int, first_index: int = 0) -> None:
-        """Start nothing yet: processes start when there is work for them."""
         self._spec, self._size, self._first_index = spec, size, first_index
         self._answers = (*spec.answers, Failed)
         self._context = worker_context(preload=spec.preload)
@@ -59,9 +57,7 @@ class WorkerPool[J: Job, A]:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End all processes: gently after success, at once after an exception."""
         idle = [worker for worker in self._workers.values() if worker.job is None and kind is None]
         for worker in idle:

@@ -65,8 +65,6 @@ class WorkerProcess:
     """One process; it starts with its first job.
 
     Args:
-        main: what it runs.
-        context: what makes it.
         index: which of the pool's workers it is, for messages.
         log: where its standard output and error go.
         predecessor: a process that is to end before this one starts: two policies are never loaded at once.

@@ -46,9 +46,8 @@ _starter: threading.Thread | None = None
 def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
     """Return what makes worker processes.
 
-    Args:
-        preload: modules that the server imports before the first fork. The server starts with the first
-            worker of this process; what is named later, workers import.
+    The server imports the modules of `preload` before the first fork. It starts with the first worker of
+    this process; what is named later, workers import.
     """
     if nvidia_driver_version() is not None:
         return multiprocessing.get_context("spawn")

@@ -30,7 +30,6 @@ class Place:
 
     Attributes:
         folder: the driver's working directory, which relative paths in jobs begin at.
-        variables: environment variables.
         path: where it imports from, for a policy's own module.
         logs: the driver's folder of logs; used where the storage is shared.
     """

@@ -22,12 +22,7 @@ from vla_eval.workers.process import WorkerMain, WorkerSpec
 
 @dataclass(frozen=True, slots=True)
 class ClusterBackend:
-    """The machines of a cluster; see `Backend`.
-
-    Attributes:
-        ray: the module, connected.
-        machines: those of the cluster.
-    """
+    """The machines of a cluster, and the connected module `ray`; see `Backend`."""
 
     ray: Any
     machines: Machines
@@ -84,11 +79,8 @@ def cluster(
 ) -> Iterator[ClusterBackend]:
     """Connect, look at every machine, and give what can be used of the cluster.
 
-    Args:
-        address: what `check_address` returns.
-        say: gets lines for a person.
-        allow_other_kind: use machines with another CPU model or driver, too.
-        needs: files and folders that each machine must have.
+    `address` is what `check_address` returns; `say` gets lines for a person. `allow_other_kind` uses machines
+    with another CPU model or driver, too; each machine must have the files and folders that it `needs`.
 
     Raises:
         MissingDependencyError: Ray is not installed.

@@ -45,10 +45,7 @@ def check_address(text: str) -> str:
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Give the module `ray`, connected to a cluster; disconnect in the end.
-
-    Args:
-        address: what `check_address` returns.
+    """Give the module `ray`, connected to the address from `check_address`; disconnect in the end.
 
     Raises:
         MissingDependencyError: Ray, or the part of it that `ray://` needs, is not installed.
@@ -113,11 +110,7 @@ def on_machine(node: str) -> Any:
 
 
 def load_ray() -> Any:
-    """Import Ray.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """Import Ray, or raise `MissingDependencyError`."""
     try:
         return importlib.import_module("ray")
     except ImportError as exc:

@@ -38,8 +38,6 @@ class Machine:
 
     Attributes:
         node: its id in the cluster.
-        name: what people call it.
-        address: its IP address.
         n_cores, n_gpus: what the cluster may use of it.
         facts: its facts; None: it has not answered yet.
         refused: why it is not used; empty: it is.
@@ -47,11 +45,10 @@ class Machine:
         was_sent: whether folders that it did not have were sent to it.
         kind: what kind it is; None: the same as the planning machine.
         n_used: workers that it has.
-        n_running: items that they have been given and have not answered.
-        n_done: items that they have answered.
+        n_errors_in_a_row: workers that died and jobs that failed since its last answer.
         services: the policy servers on it.
         seen_at: `time.monotonic` when it came.
-        n_errors_in_a_row: workers that died and jobs that failed since its last answer.
+        name, n_running, n_done: see `MachineLoad`.
     """
 
     node: str
@@ -97,14 +94,7 @@ class Machine:
 
 
 class Machines:
-    """All machines of the cluster that the driver is connected to.
-
-    Args:
-        ray: the module, connected.
-        allow_other_kind: use machines with another CPU model or driver, too.
-        needs: files and folders that each must have.
-        say: gets lines for a person.
-    """
+    """All machines of the cluster that the driver is connected to; see `cluster` for the arguments."""
 
     def __init__(
         self,
@@ -163,12 +153,7 @@ class Machines:
             self.say(self.progress())
 
     def note_error(self, machine: Machine, what: str) -> None:
-        """Count an error of a machine; one that errs again and again is set aside, unless it is the last.
-
-        Args:
-            machine: where.
-            what: the error, for a person.
-        """
+        """Count an error of a machine; one that errs again and again is set aside, unless it is the last."""
         machine.n_errors_in_a_row += 1
         if machine.n_errors_in_a_row < MAX_ERRORS_IN_A_ROW or not machine.is_usable:
             return

@@ -27,8 +27,6 @@ class NodeFacts:
 
     Attributes:
         environment: commit, package versions, CPU, drivers; see `collect_environment`.
-        vulkan: names of its Vulkan drivers.
-        free_bytes: memory that is free.
         n_gpus: GPUs with a driver.
         missing: what is wrong with the files that it was asked for.
         absent: folders that it was asked for, does not have, and can be sent.
@@ -60,12 +58,7 @@ class NodeFacts:
 
 
 def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFacts:
-    """Return the facts of the machine that this runs on.
-
-    Args:
-        needs: which files and folders it is to have.
-        folder: the planning machine's working directory.
-    """
+    """Return the facts of this machine; `folder` is the planning machine's working directory."""
     with contextlib.chdir(folder) if Path(folder).is_dir() else contextlib.nullcontext():
         missing = tuple(wrong for need in needs if (wrong := need.objection()) is not None)
         absent = tuple(dict.fromkeys(path for need in needs for path in need.absent()))
@@ -81,13 +74,7 @@ def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFact
 
 
 def receive(folders: Sequence[PackedFolder], needs: tuple[Needed, ...], *, folder: str) -> NodeFacts:
-    """Write the folders that this machine did not have, and return its facts again.
-
-    Args:
-        folders: in the order in which they are to appear.
-        needs: see `node_facts`.
-        folder: the planning machine's working directory, where relative paths begin.
-    """
+    """Write the folders that this machine did not have, in their order, and return its facts again."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with contextlib.chdir(folder):
@@ -109,13 +96,7 @@ def free_memory_bytes() -> int:
 
 
 def objections(found: NodeFacts, expected: NodeFacts, *, allow_other_kind: bool) -> tuple[str, ...]:
-    """Return why a machine cannot be used; none: it can.
-
-    Args:
-        found: its facts.
-        expected: those of the machine that plans.
-        allow_other_kind: accept another CPU model or driver.
-    """
+    """Return why a machine with the facts `found` cannot be used with the planning one; none: it can."""
     wrong = [str(change) for change in find_changes(_code(expected), _code(found), prefix="")]
     if not allow_other_kind and (changes := find_changes(expected.kind, found.kind, prefix="")):
         listed = "; ".join(map(str, changes))

@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Self  # Ray is optional: not looked at by mypy
 
 from vla_eval.errors import ClusterError
@@ -60,10 +59,7 @@ class ClusterPool[J: Job, A]:
     """Some actors with a worker process each; a context manager that leaves none behind.
 
     Args:
-        ray: the module, connected.
-        machines: where actors may be.
-        spec: what a worker is made of.
-        place: what it takes over from the driver.
+        place: what a worker takes over from the driver.
         size: how many at most.
         takes_gpu: whether a GPU is reserved for each.
     """
@@ -93,9 +89,7 @@ class ClusterPool[J: Job, A]:
         """Start nothing yet."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End all actors: gently after success, at once after an exception."""
         idle = [worker for worker in self._workers.values() if worker.is_ready and not worker.given]
         if kind is None and idle:

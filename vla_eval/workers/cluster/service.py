@@ -25,10 +25,6 @@ class ClusterService:
     """An actor with a guarded process; see `Service`.
 
     Args:
-        ray: the module, connected.
-        machine: where it runs.
-        main: what its process runs.
-        preload: modules that it needs and that take long to import.
         place: what it takes over from the driver.
         index: which of the services it is.
         has_gpu: whether a GPU is reserved for it; Ray then sets `CUDA_VISIBLE_DEVICES`.
