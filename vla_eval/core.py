@@ -1,8 +1,8 @@
 """The contracts of one evaluated episode: observations in, chunks of actions out, a result per step.
 
 Read this file, then `rollout.py`, and you can follow an episode from reset to record. Everything
-here is numpy and the standard library: it knows nothing of simulators, models or files. What a task
-says of its episode has a file of its own, `task_state.py`.
+here is numpy and the standard library: it knows nothing of simulators, models or files. A task's
+status and true state have a file of their own, `task_state.py`.
 
 A *slot* is one of the episodes that run side by side in one environment object; every per-episode
 value is keyed by it. An episode is a function of (task, seed, actions) alone, whatever its slot.

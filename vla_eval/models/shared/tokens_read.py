@@ -1,7 +1,7 @@
 """Listen to what tokenizers make of sentences, wherever a policy calls one: in its processor or its network.
 
-Whoever tokenizes answers by itself: transformers' tokenizers are listened to while they are called, and code
-with words of its own says so by `note`. Nothing here knows a family of policies.
+No caller has to report: transformers' tokenizers are listened to while they are called, and code with words
+of its own calls `note`. Nothing here knows a family of policies.
 """
 
 import contextlib

@@ -4,7 +4,7 @@ The policy's own queue of actions is never used: `predict_action_chunk` is asked
 the loop executes as much of the chunk as it wants. Its own queue of observations is not used either:
 the frames of an episode are kept here, per slot, at control rate, however long the chunk is.
 
-Three kinds of policies, told apart by their configuration:
+Three kinds of policies; the configuration decides:
 
 - `observation_delta_indices` is None, or has frames of the future, which only training has (FastWAM): it
   reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).

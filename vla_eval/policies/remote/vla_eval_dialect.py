@@ -41,7 +41,7 @@ class VlaEvalClient:
 
     @property
     def metadata(self) -> ServerMetadata:
-        """What the server said of itself in its greeting."""
+        """The metadata in the server's greeting."""
         return self._metadata
 
     @property
