@@ -14,12 +14,12 @@ from typing import Any  # lerobot is untyped
 import torch
 from lerobot.policies import make_pre_post_processors
 from torch import Tensor
+from training_speed import random_samples
 
 from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.models.families import family_of
 from vla_eval.testing.random_checkpoint import plain_statistics, stand_in_config
-from vla_eval.testing.training_speed import random_samples
 from vla_eval.training.cost.sample_cost import count
 from vla_eval.training.job import load_finetune_recipe
 

@@ -227,7 +227,7 @@ def _rehearse(check: Check, name: str) -> dict[str, Any]:
 
 
 def _training(check: Check, name: str) -> dict[str, Any]:
-    from vla_eval.testing.training_speed import measure_steps
+    from training_speed import measure_steps
 
     with _small(check, name) as (recipe, tiny):
         folder = check.out / "training"

@@ -208,8 +208,8 @@ def store(file: Path, records: Mapping[str, Any]) -> None:
 
 def lines(records: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the tables, when and where they were measured, and why a part has no result."""
-    # Here and not above: the room imports torch, whose memory would be there beside the parts.
-    from vla_eval.testing.rehearsal_table import rehearsal_tables
+    # Here and not above: tests import this file from elsewhere.
+    from rehearsal_table import rehearsal_tables
 
     commits = sorted({_shown(record["version"]) for record in records.values()})
     tables = rehearsal_tables({name: x["result"] for name, x in records.items() if "result" in x})

@@ -145,7 +145,7 @@ def test_a_first_inference_that_repeats_an_earlier_rhythm_is_refused() -> None:
     [("n_action_steps", 0), ("delay_steps", -1), ("ensemble_decay", -0.1), ("first_inference_step", -1)],
 )
 def test_values_out_of_range_are_refused(field: str, value: float) -> None:
-    with pytest.raises(RecipeError, match=rf"chunking\.{field} is {value}, expected ≥"):
+    with pytest.raises(RecipeError, match=rf"chunking\.{field} is {value}, expected a number ≥"):
         ChunkingSpec(**{"n_action_steps": 1, field: value})
 
 

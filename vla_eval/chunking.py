@@ -18,13 +18,13 @@ skip`), as a robot that keeps moving during inference must do; or the whole chun
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from vla_eval.core import ActionChunk, FloatArray
 from vla_eval.errors import RecipeError, SpecMismatchError
-from vla_eval.strict.bounds import MAX_STEPS, check_bounds
+from vla_eval.strict.bounds import MAX_STEPS, Bounds, Steps, check_bounds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,17 +36,14 @@ class ChunkingSettings:
     """
 
     mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
-    delay_steps: int = 0
+    delay_steps: Annotated[int, Bounds(0, MAX_STEPS)] = 0
     delay_alignment: Literal["skip", "stale"] = "skip"
-    ensemble_decay: float = 0.01  # the value of ACT's public code
-    first_inference_step: int = 0
+    ensemble_decay: Annotated[float, Bounds(0)] = 0.01  # the value of ACT's public code
+    first_inference_step: Annotated[int, Bounds(0)] = 0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("delay_steps", "ensemble_decay", "first_inference_step"):
-            if getattr(self, name) < 0:
-                raise RecipeError(f"chunking.{name} is {getattr(self, name)}, expected ≥ 0.")
-        check_bounds(self, {"delay_steps": (0, MAX_STEPS)}, prefix="chunking.")
+        check_bounds(self, prefix="chunking.")
 
     def at(self, n_action_steps: int) -> "ChunkingSpec":
         """Return the chunking at a number of action steps."""
@@ -62,14 +59,11 @@ class ChunkingSpec(ChunkingSettings):
         RecipeError: a value out of its range.
     """
 
-    n_action_steps: int
+    n_action_steps: Steps
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.n_action_steps < 1:
-            raise RecipeError(f"chunking.n_action_steps is {self.n_action_steps}, expected ≥ 1.")
-        check_bounds(self, {"n_action_steps": (1, MAX_STEPS)}, prefix="chunking.")
-        ChunkingSettings.__post_init__(self)  # super() does not know the class that `slots` makes
+        check_bounds(self, prefix="chunking.")
         if self.first_inference_step >= self.n_action_steps:
             raise RecipeError(
                 f"chunking.first_inference_step is {self.first_inference_step}, expected less than "

@@ -1,8 +1,8 @@
 """The contracts of one evaluated episode: observations in, chunks of actions out, a result per step.
 
 Read this file, then `rollout.py`, and you can follow an episode from reset to record. Everything
-here is numpy and the standard library: it knows nothing of simulators, models or files. What a task
-says of its episode has a file of its own, `task_state.py`.
+here is numpy and the standard library: it knows nothing of simulators, models or files. A task's
+status and true state have a file of their own, `task_state.py`.
 
 A *slot* is one of the episodes that run side by side in one environment object; every per-episode
 value is keyed by it. An episode is a function of (task, seed, actions) alone, whatever its slot.
@@ -89,8 +89,8 @@ class EpisodeStart:
         run: which of several independent runs (training seeds) this is, from 0.
         instruction: the language instruction.
         horizon_steps: the episode ends after so many control steps.
-        row: the episode's row in a forward pass that it shares with others. A network gives a row the same
-            bits only in the same place of a pass of the same size, so that the plan fixes it.
+        row: the episode's row in a forward pass that it shares with others. Batched results are bit-identical
+            only at a fixed row and batch size, so the plan fixes the row.
     """
 
     slot: int
@@ -168,7 +168,7 @@ class Policy(Protocol):
         """What the policy reads and how long its chunks are."""
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Begin these episodes: forget all else that was known of their slots.
+        """Begin these episodes: forget all else about their slots.
 
         A probe also calls it in mid-episode (`RolloutSettings.reset_policy_at_step`), with the same start.
         """
@@ -194,7 +194,7 @@ class ForgettingPolicy(Policy, Protocol):
     """A policy that can release the memory of an episode that is over, before the next `reset`."""
 
     def forget(self, slots: Sequence[int]) -> None:
-        """Release what is known of these slots; nothing is asked of them before their next `reset`."""
+        """Release the memory of these slots: their next call is `reset`."""
 
 
 class StepObserver(Protocol):

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.core import ImageArray, Observation, ObservationWindow, SimEnv, StepResult
+from vla_eval.core import Observation, ObservationWindow, SimEnv, StepResult
 from vla_eval.errors import SpecMismatchError, TaskArgumentError
 from vla_eval.specs import PolicySpec
 from vla_eval.task_state import Phase
@@ -144,18 +144,14 @@ class CueView:
 def _hidden(observation: Observation, boxes: CueBoxes, kind: CueViewKind) -> Observation:
     images = {}
     for name, image in observation.images.items():
-        mask = _mask(image, boxes.get(name, ()))
+        mask = np.zeros(image.shape[:2], dtype=np.bool_)
+        for box in boxes.get(name, ()):
+            mask[box.top : box.bottom, box.left : box.right] = True
         if kind == "hidden_elsewhere":
             mask = _elsewhere(mask, where=f"{name}, step {observation.step}")
-        images[name] = _painted(image, mask)
+        images[name] = image.copy()
+        images[name][mask] = GREY
     return replace(observation, images=images)
-
-
-def _mask(image: ImageArray, boxes: tuple[PixelBox, ...]) -> PixelMask:
-    mask = np.zeros(image.shape[:2], dtype=np.bool_)
-    for box in boxes:
-        mask[box.top : box.bottom, box.left : box.right] = True
-    return mask
 
 
 def _elsewhere(mask: PixelMask, *, where: str) -> PixelMask:
@@ -172,9 +168,3 @@ def _elsewhere(mask: PixelMask, *, where: str) -> PixelMask:
         f"cue_view=hidden_elsewhere: {where}: the cue takes {mask.mean():.0%} of the image, and as much of "
         "this form is not there beside it. Leave this view out for this task."
     )
-
-
-def _painted(image: ImageArray, mask: PixelMask) -> ImageArray:
-    painted = image.copy()
-    painted[mask] = GREY
-    return painted

@@ -36,7 +36,7 @@ class EpisodeLog:
         n_steps: control steps executed.
         last_inference_step: of the policy; -1 before the first one.
         success_step: control steps executed when the success rule first held.
-        tcp_start_m: where the tool centre point began; None if its pose is no state of the environment.
+        tcp_start_m: where the tool centre point began; None if its pose is not a state of the environment.
         tcp_reach_m: how far it ever was from there.
     """
 
@@ -195,7 +195,7 @@ def check_chunk(chunk: object, spec: PolicySpec, action_spec: ActionSpec, log: E
 
 
 def chunk_problem(chunk: object, *, chunk_size: int, dims: Sequence[str]) -> str | None:
-    """Return why a policy's answer is no chunk of actions; None if it is one.
+    """Return why a policy's answer is not a chunk of actions; None if it is one.
 
     Args:
         chunk: what the policy returned.

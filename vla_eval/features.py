@@ -6,14 +6,14 @@ simulators, whose observation it takes as `core.Observation`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.core import FloatArray, StepResult
-from vla_eval.errors import RecipeError, SpecMismatchError
-from vla_eval.strict.bounds import MAX_STEPS
+from vla_eval.errors import SpecMismatchError
+from vla_eval.strict.bounds import Bounds, Steps, check_bounds
 
 MAX_CRF = 63  # of AV1; H.264 takes up to 51
 FPS = 20  # control steps per second; every frame is one control step
@@ -62,16 +62,12 @@ class EncoderSettings:
 
     vcodec: str = "h264"
     pix_fmt: str = "yuv444p"
-    crf: int = 12
-    g: int = 2
+    crf: Annotated[int, Bounds(0, MAX_CRF)] = 12
+    g: Steps = 2
 
     def __post_init__(self) -> None:
         """Check the ranges; whether the codec knows the format is lerobot's to say."""
-        if not 0 <= self.crf <= MAX_CRF or not 1 <= self.g <= MAX_STEPS:
-            raise RecipeError(
-                f"encoder: crf is {self.crf}, g is {self.g}; expected crf ≥ 0 and g ≥ 1, crf ≤ {MAX_CRF} and "
-                f"g ≤ {MAX_STEPS}."
-            )
+        check_bounds(self, prefix="encoder.")
 
 
 def dataset_features(

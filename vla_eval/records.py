@@ -10,17 +10,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
-from vla_eval.strict.json_text import (
-    Count,
-    Distance,
-    Positive,
-    Rate,
-    Seconds,
-    Source,
-    as_dataclass,
-    read_json,
-    read_version,
-)
+from vla_eval.strict.bounds import Count, Distance, Positive, Rate, Seconds
+from vla_eval.strict.json_text import Source, as_dataclass, read_json, read_version
 
 RECORD_VERSION = 1
 """Raise it when a field changes its meaning; readers refuse versions they do not know."""
@@ -155,7 +146,7 @@ class EpisodeRecord:
             where: file and line number, for the message.
 
         Raises:
-            RunFolderError: the line is no record, one of another version, or one that cannot be true.
+            RunFolderError: the line is not a record, one of another version, or one that cannot be true.
         """
         source = Source(where=where, what="an episode record", remedy=REMEDY, error=RunFolderError)
         data = read_json(line, source)
@@ -188,7 +179,7 @@ REQUIRED_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeTiming:
-    """Wall-clock seconds of one episode; kept beside the record, never part of it.
+    """Wall-clock seconds of one episode; kept next to the record, never part of it.
 
     Attributes:
         key: the episode's.

@@ -81,7 +81,7 @@ def rollout(
         SpecMismatchError: policy, environment, chunking and view of the cue do not fit together, or the first
             inference is after the end of the episode.
         MissingInstructionError: an episode has no instruction.
-        InvalidActionError: the policy returned something that is no finite chunk.
+        InvalidActionError: the policy returned something that is not a finite chunk.
         SimulationError: the simulator returned a reward or a state that is not finite.
     """
     check_compatible(policy.spec, env.spec)

@@ -1,4 +1,4 @@
-"""What a task says of its episode: its status, for the record; the true state, for scripted controls.
+"""What a task reports about its episode: its status, for the record; the true state, for scripted controls.
 
 Knows nothing of simulators. A learned policy is given none of it.
 """

@@ -32,8 +32,8 @@ from vla_eval.checkpoints.loading import (
 from vla_eval.cli.main import main
 from vla_eval.errors import CheckpointError, VlaEvalError
 from vla_eval.models.families import FAMILIES, family_of
-from vla_eval.models.shared.empty_weights import empty_weights
 from vla_eval.models.shared.tokens_read import Readings
+from vla_eval.models.weights.empty import empty_weights
 from vla_eval.policies.lerobot.policy import LeRobotPolicy
 from vla_eval.testing.tiny_models import (
     tiny_paligemma,

@@ -233,8 +233,8 @@ def test_on_a_terminal_bars_still_move_and_their_texts_are_plain() -> None:
 def test_nothing_is_printed_past_the_streams() -> None:
     """Every module prints through `sys.stdout` and `sys.stderr`, which the command and workers replace."""
     allowed = {
-        "cli/progress.py": {"os.write"},  # a constant sentence, from a signal's handler
-        "cli/json_progress.py": {"os.write"},
+        "cli/terminal/progress.py": {"os.write"},  # a constant sentence, from a signal's handler
+        "cli/terminal/json_progress.py": {"os.write"},
         "storage/durable.py": {"os.write"},
         "workers/framing.py": {"os.write"},
         "workers/process.py": {"os.write"},

@@ -5,8 +5,9 @@ from typing import Any
 import pytest
 
 from vla_eval.errors import RecipeError
+from vla_eval.strict.bounds import MAX_DEPTH
 from vla_eval.strict.decoding import load_yaml
-from vla_eval.strict.yaml_data import MAX_CHARACTERS, MAX_DEPTH, MAX_VALUES
+from vla_eval.strict.yaml_data import MAX_CHARACTERS, MAX_VALUES
 
 
 def refusal(text: str) -> str:

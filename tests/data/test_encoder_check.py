@@ -29,7 +29,8 @@ def lerobot_encodes(settings: EncoderSettings, file: Path) -> bool:
             stream = container.add_stream(config.vcodec, 20, options=options)
             stream.pix_fmt, stream.width, stream.height = config.pix_fmt, 128, 128
             image = Image.fromarray(np.zeros((128, 128, 3), np.uint8))
-            container.mux(stream.encode(av.VideoFrame.from_image(image)))
+            for _ in range(4):
+                container.mux(stream.encode(av.VideoFrame.from_image(image)))
             container.mux(stream.encode())
     except (ValueError, av.FFmpegError):
         return False

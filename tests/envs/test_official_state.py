@@ -11,7 +11,7 @@ from vla_eval.envs.official_episode import OfficialEpisode
 from vla_eval.envs.official_state import read_bodies, read_candidates
 from vla_eval.errors import SpecMismatchError
 from vla_eval.tasks.catalog import SUITES, task_spec
-from vla_eval.tasks.catalogs.official_controls import n_candidates
+from vla_eval.tasks.catalogs.official_catalog import n_candidates
 
 CUE_STEPS, DELAY_STEPS = 2, 1
 REVEALED = CUE_STEPS + DELAY_STEPS

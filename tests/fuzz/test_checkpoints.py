@@ -29,7 +29,7 @@ from vla_eval.checkpoints.processors import register_steps
 from vla_eval.checkpoints.safe_processors import load_processor, resolve_step
 from vla_eval.checkpoints.saved_processor import check_paths, read_saved_processor
 from vla_eval.errors import VlaEvalError
-from vla_eval.models.shared.empty_weights import empty_weights
+from vla_eval.models.weights.empty import empty_weights
 from vla_eval.policies.recipe import load_policy_recipe
 
 CONFIG, PREPROCESSOR, ADAPTER = "config.json", "policy_preprocessor.json", "adapter_config.json"

@@ -12,9 +12,9 @@ from tests.checkpoints.small_checkpoints import pi0  # noqa: F401  a fixture
 from vla_eval.checkpoints.loading import LoadOptions, load_weights, read_config
 from vla_eval.errors import CheckpointError
 from vla_eval.models.families import FAMILIES
-from vla_eval.models.shared.empty_weights import empty_weights
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import put_weights
+from vla_eval.models.weights.empty import empty_weights
+from vla_eval.models.weights.exact import put_weights
+from vla_eval.models.weights.file import WeightFile
 from vla_eval.testing.tiny_models import tiny_paligemma
 
 

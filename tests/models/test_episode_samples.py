@@ -109,7 +109,7 @@ def test_images_are_not_moved_at_zero_pixels_nor_outside_training() -> None:
 
 
 def test_a_negative_shift_is_refused() -> None:
-    with pytest.raises(RecipeError, match="shift_px is -1, expected a number of pixels ≥ 0"):
+    with pytest.raises(RecipeError, match="shift_px is -1, expected a number ≥ 0"):
         config(shift_px=-1)
 
 
@@ -159,7 +159,7 @@ def test_actions_beyond_the_next_decision_are_those_of_waiting_where_that_is_ask
     assert first[1] == first[2] == [0.5] * CHUNK
     assert first[3] == given[ACTION_KEY][0, 3 : 3 + CHUNK, 0].tolist()
     assert (episodes.goal_counts[0] > 0).tolist() == [False, False, False, True, True]
-    with pytest.raises(RecipeError, match="expected masks_beyond_decision to be true, too"):
+    with pytest.raises(RecipeError, match="masks_beyond_decision is False, expected it to be set"):
         config(waits_beyond_decision=True)
 
 

@@ -30,7 +30,7 @@ from vla_eval.models.shared.images import (
 )
 from vla_eval.models.shared.normalization import Normalization, Normalizer, mask_all_but
 from vla_eval.models.shared.processor_steps import DecoderStep, EncoderStep
-from vla_eval.models.shared.trainable import check_lora, check_lora_target, matching, set_trainable
+from vla_eval.models.weights.trainable import check_lora, check_lora_target, matching, set_trainable
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "octo"
 ALL7 = mask_all_but(7, left_alone=(-1,))
@@ -293,7 +293,7 @@ class TestTrainable:
     def test_only_what_a_pattern_matches_as_a_whole_is_trained(self) -> None:
         assert set_trainable(Tiny(), [r"head\..*"], what="x") == ("head.weight", "head.bias")
 
-    @pytest.mark.parametrize(("pattern", "message"), [("haed", "matches none"), ("(", "no regular expr")])
+    @pytest.mark.parametrize(("pattern", "message"), [("haed", "matches none"), ("(", "not a regular expr")])
     def test_a_pattern_that_matches_nothing_is_an_error(self, pattern: str, message: str) -> None:
         with pytest.raises(TrainingError, match=message):
             matching(["head", "q"], [pattern], what="finetune.x")

@@ -48,6 +48,13 @@ SAY_INSTEAD = {
     r"roads?": "shortcut, way",
     r"wonders?": "surprising",
     r"beside other (work|load|things)": "with other load",
+    r"(?<!there )(?<!where )(is|are|was|were) no (?!longer|more|less|one|evidence|proof)": "is not a …",
+    r"(says?|said) of (itself|themselves|its|it|them)": "reports, states, metadata",
+    r"(is|are|was) known of": "is known about",
+    r"whence": "from where",
+    r"so that not": "…, so not all …",
+    r"whoever": "anyone who, code that",
+    r"(tell|tells) (whether|which \w+ from|\w+ from)": "distinguish, show",
 }
 
 ALLOWED = (
@@ -62,8 +69,8 @@ FORBIDDEN = {
     re.compile(rf"(?<![\w-]){word}(?![\w-])", re.IGNORECASE): say for word, say in SAY_INSTEAD.items()
 }
 BACKTICKS = re.compile(r"`[^`\n]*`")
-FIELD = re.compile(r"^\s*[\w*, ]+:(?=\s|$)")
-"""The names before a colon in a docstring's list of attributes or arguments."""
+FIELD = re.compile(r"^\s+\*{0,2}\w+(?:(?:, | / )\*{0,2}\w+)*:(?=\s|$)")
+"""The names before a colon in a docstring's list of attributes or arguments: no sentence begins like this."""
 
 
 class Line(NamedTuple):
@@ -169,3 +176,9 @@ def test_docstrings_comments_and_messages_of_python_are_read() -> None:
     found = [(line.number, line.text) for line in words_of_python("a.py", source)]
     assert (3, "A picture.") in found and (5, " of eyes") in found and (5, "# anew") in found
     assert "pictures" not in [text for _, text in found]
+
+
+def test_a_sentence_before_a_colon_is_read_and_a_name_is_not() -> None:
+    docstring = '"""Do it.\n\nWhoever asks: nobody.\n    whoever: a name.\n    first, whoever: two.\n"""\n'
+    found = [offence for line in words_of_python("x.py", docstring) for offence in offences(line)]
+    assert found == ["x.py:3: 'Whoever': say anyone who, code that"]

@@ -25,12 +25,12 @@ from vla_eval.models.octo import conversion as octo
 from vla_eval.models.octo import flax_names
 from vla_eval.models.openvla import conversion as openvla
 from vla_eval.models.openvla.conversion_options import OpenVLAOptions
-from vla_eval.models.shared.weight_file import write_weights
 from vla_eval.models.spatialvla import conversion as spatialvla
 from vla_eval.models.spatialvla import described as spatialvla_files
 from vla_eval.models.spatialvla.action_grid import AXES, uniform_grid
 from vla_eval.models.spatialvla.conversion_options import SpatialVLAOptions
 from vla_eval.models.spatialvla.sizes import NetworkSizes
+from vla_eval.models.weights.file import write_weights
 from vla_eval.testing.random_checkpoint import random_parts
 
 SHARD_BYTES = 5_000_000_000  # of a file of a published checkpoint, at most

@@ -17,7 +17,7 @@ from vla_eval.checkpoints.fast_tokens import load_fast_tokenizer
 from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.weight_file import write_weights
+from vla_eval.models.weights.file import write_weights
 from vla_eval.testing import rehearsal
 from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsal import RehearsalOptions, rehearse, rehearse_checkpoint

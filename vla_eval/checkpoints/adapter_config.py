@@ -40,11 +40,7 @@ LOOKED_AT = frozenset(
 
 
 def read_adapter_config(path: Path) -> Any:
-    """Return peft's configuration of an adapter.
-
-    Raises:
-        CheckpointError: it is damaged, not LoRA, or uses a part of peft that is not allowed.
-    """
+    """Return peft's configuration of an adapter, which has to be plain LoRA; else raise `CheckpointError`."""
     from peft import LoraConfig  # optional extra of lerobot
 
     data = read_json(path)
@@ -63,11 +59,7 @@ def read_adapter_config(path: Path) -> Any:
 
 
 def lora_fields(data: Mapping[str, Any], *, where: str) -> dict[str, Any]:
-    """Return the fields that peft is given.
-
-    Raises:
-        CheckpointError: one is of another type or out of its range, or it is no LoRA.
-    """
+    """Return the fields that peft is given; `CheckpointError` for one of another type or range."""
     if data.get("peft_type") != "LORA":
         raise CheckpointError(
             f"{where}: 'peft_type': expected 'LORA', found {shown(data.get('peft_type'))}. {FETCH_AGAIN}"

@@ -18,8 +18,8 @@ from vla_eval.checkpoints.bases import how_to_get
 from vla_eval.checkpoints.closed_doors import let_through
 from vla_eval.checkpoints.files import WEIGHTS_FILE
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import listed
+from vla_eval.models.weights.exact import listed
+from vla_eval.models.weights.file import WeightFile
 
 FOLDER = Path("checkpoints")
 FETCHED: Mapping[str, str] = {"ResNet18_Weights.IMAGENET1K_V1": "resnet18"}
@@ -29,11 +29,7 @@ WITHOUT = "Without trained weights: --set policy.pretrained_backbone_weights=nul
 
 
 def check_backbone(folder: Path, name: str) -> str:
-    """Compare the names and shapes of a backbone's weights with torchvision's network `name`; return a line.
-
-    Raises:
-        CheckpointError: weights are missing, unexpected or of another shape.
-    """
+    """Compare names and shapes of weights with torchvision's network `name`; return a line or raise."""
     with torch.device("meta"):
         network = getattr(torchvision.models, name)()
     wanted = {key: tuple(x.shape) for key, x in network.state_dict().items()}

@@ -85,11 +85,7 @@ def _guarded(original: Any, guard: Guard) -> Any:
 
 @contextlib.contextmanager
 def closed() -> Iterator[None]:
-    """Close the doors within the context.
-
-    Raises:
-        CheckpointError: what was refused, also where a library continued without it.
-    """
+    """Close the doors in the context; raise what was refused, also where a library continued."""
     refused: list[CheckpointError] = []
     _open[id(refused)] = refused
     try:

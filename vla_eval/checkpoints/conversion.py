@@ -18,7 +18,7 @@ from vla_eval.models.families import FAMILIES, family_of_base
 from vla_eval.models.family import Base, imported
 from vla_eval.models.shared.options import typed
 from vla_eval.models.shared.original import Original
-from vla_eval.models.shared.weights import put_weights
+from vla_eval.models.weights.exact import put_weights
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 

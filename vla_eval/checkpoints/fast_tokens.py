@@ -54,11 +54,7 @@ class FastActionTokenizer:
 
 
 def load_fast_tokenizer(name: str) -> FastActionTokenizer:
-    """Read a tokenizer from a folder, or from the local cache by its published name.
-
-    Raises:
-        CheckpointError: it is not there, or of another scheme.
-    """
+    """Read a tokenizer of this scheme from a folder, or from the local cache by its published name."""
     try:
         file = Path(str(cached_file(name, SETTINGS_FILE)))
         settings = read_json(file)

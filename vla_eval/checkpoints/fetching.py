@@ -188,7 +188,16 @@ def _check_files(part: RemotePart, folder: Path) -> None:
 
 def _publish(base: Base, parts: list[RemotePart], downloads: Path, out: Path) -> Path:
     """Convert what was fetched, or give it its name; note where it came from."""
-    note = json.dumps({"base": base.name, "terms": base.terms, "parts": [_noted(x) for x in parts]}, indent=2)
+    of_parts = [
+        {
+            "repo_id": part.source.repo_id,
+            "commit": part.commit,
+            "licence": part.licence,
+            "files": {name: file._asdict() for name, file in part.files.items()},
+        }
+        for part in parts
+    ]
+    note = json.dumps({"base": base.name, "terms": base.terms, "parts": of_parts}, indent=2)
     if base.options is None:
         (downloads / BASE_FILE).write_text(f"{note}\n", encoding="utf-8")
         downloads.rename(out)
@@ -203,15 +212,6 @@ def _publish(base: Base, parts: list[RemotePart], downloads: Path, out: Path) ->
     return out
 
 
-def _noted(part: RemotePart) -> dict[str, object]:
-    return {
-        "repo_id": part.source.repo_id,
-        "commit": part.commit,
-        "licence": part.licence,
-        "files": {name: file._asdict() for name, file in part.files.items()},
-    }
-
-
 def _check(base: Base, folder: Path) -> str:
     # Here and not above: see `_publish`.
     from vla_eval.checkpoints.backbones import check_backbone
@@ -220,7 +220,7 @@ def _check(base: Base, folder: Path) -> str:
     with _offline():
         if base.is_backbone:
             return check_backbone(folder, base.name)
-        return check_structure(find_checkpoint(folder)).line()
+        return check_structure(find_checkpoint(folder))
 
 
 @contextlib.contextmanager

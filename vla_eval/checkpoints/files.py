@@ -38,7 +38,6 @@ LAST = "last"
 SHIPPED_FOLDER = "checkpoints"
 FACTS_VERSION = 1
 """Of `mikasa_training.json`. Raise it when a field changes its meaning."""
-CHUNK_BYTES = 1 << 20
 # How the model was trained does not change what it is; the rest is for people.
 NOT_HASHED = frozenset({"train_config.json", "README.md", ".gitattributes", BASE_FILE})
 
@@ -84,11 +83,7 @@ class TrainingFacts:
 def find_checkpoint(path: Path) -> Path:
     """Return the folder with the weights, given that folder, a checkpoint, or a fine-tuning run.
 
-    Args:
-        path: the folder; or the name alone of one in `checkpoints/`, the user's or the package's.
-
-    Raises:
-        CheckpointError: there is none.
+    A name alone may be that of a folder in `checkpoints/`, the user's or the package's.
     """
     places = [path]
     if path.name == str(path):
@@ -171,11 +166,7 @@ def checkpoint_sha256(path: Path) -> str:
 
 
 def adapter_base(folder: Path) -> Path | None:
-    """Return where the checkpoint that a LoRA adapter was trained on lies; None for a whole model.
-
-    Raises:
-        CheckpointError: the adapter's description is damaged.
-    """
+    """Return where the checkpoint that a LoRA adapter was trained on lies; None for a whole model."""
     file = folder / ADAPTER_CONFIG_FILE
     if not file.is_file():
         return None
@@ -186,12 +177,7 @@ def adapter_base(folder: Path) -> Path | None:
 def adapter_bases(folder: Path, *, base_checkpoint: str | None = None) -> list[Path]:
     """Return the checkpoints below a LoRA adapter that are there, nearest first; none for a whole model.
 
-    Args:
-        folder: of the adapter.
-        base_checkpoint: where its base lies; None: where it was in training.
-
-    Raises:
-        CheckpointError: one is its own base, or its base's.
+    `base_checkpoint`: where its base lies; None: where it was in training. None may be its own base.
     """
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         return []
@@ -217,11 +203,7 @@ def write_facts(folder: Path, facts: TrainingFacts) -> None:
 
 
 def read_facts(folder: Path) -> TrainingFacts | None:
-    """Return what the policy saw in training; None for a checkpoint that another program made.
-
-    Raises:
-        CheckpointError: the file is damaged or of another version.
-    """
+    """Return what the policy saw in training; None for a checkpoint that another program made."""
     path = folder / FACTS_FILE
     if not path.is_file():
         return None
@@ -252,8 +234,5 @@ def unreadable(file: Path, exc: Exception) -> CheckpointError:
 
 def file_sha256(path: Path) -> str:
     """Return the sha256 of one file."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(CHUNK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

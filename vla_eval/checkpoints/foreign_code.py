@@ -75,11 +75,8 @@ TRUSTS = (
 def no_foreign_code(kind: str) -> Iterator[None]:
     """Let nothing that a checkpoint names be run while it is loaded, unless it is checked or installed.
 
-    Args:
-        kind: lerobot's type of policy; what its family replaces in lerobot stands there meanwhile.
-
-    Raises:
-        CheckpointError: such code would have been run, also where lerobot or transformers caught the error.
+    What the family of this type replaces in lerobot stands there meanwhile. Code that would have been run is
+    a `CheckpointError`, also where lerobot or transformers caught the error.
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(only_data())
@@ -198,18 +195,14 @@ def _without_kernels(look_up: Callable[..., Any], *args: Any, **kwargs: Any) -> 
 
 
 def _refuse_adapter(_original: object, *args: object, **_: object) -> NoReturn:
-    refuse(f"{_folder(args)}: {ADAPTER_OF_BACKBONE}")
+    named = next((f"{arg!s:.300}" for arg in args if isinstance(arg, str | Path)), "a backbone")
+    refuse(f"{named}: {ADAPTER_OF_BACKBONE}")
 
 
 ADAPTER_OF_BACKBONE = (
     "expected a whole model as a backbone, found an adapter, which peft would load. Merge it into its base "
     "with the program that made it."
 )
-
-
-def _folder(args: tuple[object, ...]) -> str:
-    """Return the argument that names a folder or a repository, for messages."""
-    return next((f"{arg!s:.300}" for arg in args if isinstance(arg, str | Path)), "a backbone")
 
 
 def _no_adapter(find: Callable[..., str | None], *args: Any, **kwargs: Any) -> str | None:

@@ -45,9 +45,9 @@ from vla_eval.checkpoints.processors import check_statistics, load_processors, o
 from vla_eval.checkpoints.saved_processor import refuse_built_in_normalization
 from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
 from vla_eval.models.families import family_of, register_families
-from vla_eval.models.shared.empty_weights import empty_weights
-from vla_eval.models.shared.weight_file import WeightFile
-from vla_eval.models.shared.weights import check_same, put_weights
+from vla_eval.models.weights.empty import empty_weights
+from vla_eval.models.weights.exact import check_same, put_weights
+from vla_eval.models.weights.file import WeightFile
 
 register_families()
 
@@ -195,10 +195,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) -> Any:
     """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer.
 
-    Args:
-        config: of the policy.
-        where: its checkpoint, for messages.
-        kwargs: further arguments of the constructor.
+    `where` is its checkpoint, for messages; `kwargs` are further arguments of the constructor.
 
     Raises:
         CheckpointError: the configuration does not fit, a file is missing, or code would have been run.
@@ -225,11 +222,7 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
     """Return the policy with exactly the weights of a checkpoint, see `fill_policy`.
 
-    Args:
-        folder: with `model.safetensors`, or with a LoRA adapter.
-        config: what `read_config` returned.
-        options: `device`, `dtype` and `base_checkpoint` are used.
-        kwargs: further arguments of the policy's constructor.
+    `kwargs` are further arguments of its constructor.
     """
     return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
         config.device
@@ -252,7 +245,7 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
     """
     if (folder / ADAPTER_CONFIG_FILE).is_file():
         return _fill_adapter(policy, folder, options)
-    weights = read_weights(folder / WEIGHTS_FILE)
+    weights = WeightFile(folder / WEIGHTS_FILE)
     put_weights(
         policy,
         weights,
@@ -281,15 +274,6 @@ def begin_from(policy: Any, base: Path) -> None:
     begin()
 
 
-def read_weights(path: Path) -> WeightFile:
-    """Return the tensors of a safetensors file, which are read one at a time.
-
-    Raises:
-        CheckpointError: it is missing or damaged.
-    """
-    return WeightFile(path)
-
-
 def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
     """Load a LoRA adapter on top of the checkpoint that it was trained on."""
     from peft import get_peft_model_state_dict  # optional extra of lerobot
@@ -302,7 +286,7 @@ def _fill_adapter(policy: Any, folder: Path, options: LoadOptions) -> Any:
             f"not there. Name its folder with `base_checkpoint` in the recipe's args."
         )
     file = folder / ADAPTER_WEIGHTS_FILE
-    config, weights = read_adapter_config(folder / ADAPTER_CONFIG_FILE), dict(read_weights(file))
+    config, weights = read_adapter_config(folder / ADAPTER_CONFIG_FILE), dict(WeightFile(file))
     # What the adapter was trained with in full comes with it: the base need not have it.
     names = config.modules_to_save or ()
     beside = [start for start in getattr(policy, "new_in_finetuning", ()) if start.split(".")[-2] in names]

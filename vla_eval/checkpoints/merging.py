@@ -22,15 +22,10 @@ NOT_COPIED = (ADAPTER_CONFIG_FILE, ADAPTER_WEIGHTS_FILE, "README.md", "train_con
 
 
 def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, device: str = "cpu") -> Path:
-    """Write a checkpoint whose weights are base plus adapter; return its folder.
+    """Write a checkpoint `out` whose weights are base plus adapter; return it.
 
-    Sums are made in the precision of the base: in bfloat16 the actions differ by its rounding.
-
-    Args:
-        path: the adapter's checkpoint, or a run.
-        out: a folder that is not there yet.
-        base_checkpoint: where the base lies; None: where it was in training.
-        device: where to compute.
+    Sums are made in the precision of the base: in bfloat16 the actions differ by its rounding. Without
+    `base_checkpoint`, the base is where it was in training.
     """
     folder = find_checkpoint(path)
     if not (folder / ADAPTER_CONFIG_FILE).is_file():

@@ -160,6 +160,6 @@ def _numbers(file: Path) -> dict[str, list[float]]:
 
     try:
         tensors = load_file(file)
-    except Exception as exc:  # safetensors raises its own class, which is no public name
+    except Exception as exc:  # safetensors raises a class of its own that is not public
         raise unreadable(file, exc) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}

@@ -16,10 +16,7 @@ from vla_eval.strict.json_fields import FETCH_AGAIN
 def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
     """Raise one `CheckpointError` for whatever lerobot, torch and transformers raise within.
 
-    Args:
-        where: the checkpoint.
-        kind: lerobot's type of policy.
-        what: what fails, for the message.
+    It says that the policy of this type, of the checkpoint `where`, cannot do `what`.
     """
     try:
         yield

@@ -41,24 +41,19 @@ Overrides = Mapping[str, Mapping[str, Any]]
 
 
 def resolve_step(step: SavedStep) -> type[Any]:
-    """Return the class of a step; nothing is called.
-
-    Raises:
-        CheckpointError: it is no processor step, or not one of lerobot's, of a plug-in's, or of ours.
-    """
+    """Return the class of a step of lerobot's, of a plug-in's, or of ours; nothing is called."""
     if step.registry_name is not None:
         found = ProcessorStepRegistry._registry.get(step.registry_name)
         if found is None:
             raise CheckpointError(
                 f"{step.where}: expected a processor step that is registered, found "
-                f"{step.registry_name!r:.100}. "
-                "Install the package that it is from (`lerobot_policy_…`), or the lerobot that wrote the "
-                "checkpoint."
+                f"{step.registry_name!r:.100}. Install the package that it is from (`lerobot_policy_…`), or "
+                "the lerobot that wrote the checkpoint."
             )
     else:
         found = _imported(step)
     if not _is_step(found) or found.__module__ == NOT_OF_A_POLICY:
-        raise _refused(step, "which is no step of a policy's processor")
+        raise _refused(step, "which is not a step of a policy's processor")
     return found  # type: ignore[no-any-return]  # lerobot is untyped
 
 
@@ -141,8 +136,7 @@ def _imported(step: SavedStep) -> Any:
     except ImportError as exc:
         raise CheckpointError(
             f"{step.where}: the code {step.imported!r:.100} cannot be imported: {exc}. Install what it "
-            "needs, or "
-            "the version of lerobot that wrote the checkpoint."
+            "needs, or the version of lerobot that wrote the checkpoint."
         ) from exc
     found = vars(loaded).get(name)
     if _is_step(found) and not found.__module__.startswith(f"{module.partition('.')[0]}."):
@@ -185,7 +179,7 @@ def _state(step: SavedStep) -> dict[str, Any] | None:
         return None
     try:
         return dict(load(step.state_file.read_bytes()))
-    except Exception as exc:  # safetensors raises its own class, which is no public name
+    except Exception as exc:  # safetensors raises a class of its own that is not public
         raise unreadable(step.state_file, exc) from exc
 
 
@@ -197,8 +191,7 @@ def _made(step: SavedStep, cls: type[Any], overrides: Mapping[str, Any]) -> Any:
     except Exception as exc:  # whatever a step's constructor raises: tokenizers have their own zoo
         raise CheckpointError(
             f"{step.where}: the step {step.name!r:.100} cannot be made: {exc!s:.1000} Name a local folder "
-            "with "
-            "`tokenizer` in the recipe's args if it is the tokenizer that is missing; nothing is "
+            "with `tokenizer` in the recipe's args if it is the tokenizer that is missing; nothing is "
             "downloaded unless HF_HUB_OFFLINE=0 is set."
         ) from exc
 

@@ -80,11 +80,7 @@ class SavedProcessor:
 
 
 def read_saved_processor(path: Path) -> SavedProcessor:
-    """Read a processor's description; nothing is imported.
-
-    Raises:
-        CheckpointError: it is missing, damaged, or names files that are missing or outside of the checkpoint.
-    """
+    """Read a processor's description; nothing is imported. Files that it names lie in the checkpoint."""
     if path.parent.is_dir() and not path.exists():
         refuse_built_in_normalization(path.parent)
         raise _missing(path)
@@ -119,18 +115,14 @@ def _step(path: Path, index: int, step: object) -> SavedStep:
 
 
 def refuse_built_in_normalization(folder: Path) -> None:
-    """Refuse weights that hold their normalisation: of a LeRobot before its processors.
-
-    Raises:
-        CheckpointError: the weights in the folder do, or are damaged.
-    """
+    """Raise `CheckpointError` for weights that hold their normalisation, as before LeRobot's processors."""
     file = folder / WEIGHTS_FILE
     if not file.is_file():
         return
     try:
         with safe_open(file, framework="np") as header:
             names = list(header.keys())
-    except Exception as exc:  # safetensors raises its own class, which is no public name
+    except Exception as exc:  # safetensors raises a class of its own that is not public
         raise unreadable(file, exc) from exc
     built_in = [name for name in names if name.startswith(BUILT_IN) and name.endswith(BUILT_IN_STATISTICS)]
     if built_in:
@@ -155,9 +147,8 @@ def _missing(path: Path) -> CheckpointError:
 def _state_file(folder: Path, name: str, *, where: str) -> Path:
     if not name.endswith(STATE_SUFFIX) or Path(name).is_absolute() or leads_out(name, folder):
         raise CheckpointError(
-            f"{where}: 'state_file': expected a {STATE_SUFFIX} file inside of {folder}, found "
-            f"{shown(name)}. It "
-            "is not read."
+            f"{where}: 'state_file': expected a {STATE_SUFFIX} file inside of {folder}, found {shown(name)}. "
+            "It is not read."
         )
     if not (folder / name).exists():
         raise _missing(folder / name)
@@ -170,16 +161,15 @@ def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> Non
         if leads_out(value, folder):
             raise CheckpointError(
                 f"{step.where}: {step.name!r:.100} is to be given {key:.100} = {shown(value)}, a path "
-                "outside of the "
-                f"checkpoint. A step may only read {folder}. Put what it needs there; a tokenizer's folder "
-                "can be named with `tokenizer` in the recipe's args."
+                f"outside of the checkpoint. A step may only read {folder}. Put what it needs there; a "
+                "tokenizer's folder can be named with `tokenizer` in the recipe's args."
             )
 
 
 def leads_out(value: str, folder: Path) -> bool:
     """Whether a text, read as a path, leads out of a folder, by itself or by a link.
 
-    A text that is no path at all, such as a name of the Hub, does not.
+    A text that is not a path, such as a name of the Hub, does not.
     """
     if "\0" in value or value.startswith("~") or ".." in Path(value).parts:
         return True

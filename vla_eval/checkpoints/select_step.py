@@ -21,12 +21,9 @@ class Step(NamedTuple):
 
 
 def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | None) -> Step:
-    """Return the next action of an episode.
+    """Return the next action of an episode for its newest frame (B, …), by a policy that was just reset.
 
-    Args:
-        policy: whose `reset` was just called.
-        batch: the newest frame (B, …).
-        queues: those after the previous step, which are not changed; None: the episode begins.
+    `queues`: those after the previous step, which are not changed; None: the episode begins.
     """
     owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
     for name, value in (queues or {}).items():

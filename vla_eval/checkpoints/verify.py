@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import torch
-from safetensors import safe_open
 from torch import Tensor
 
 from vla_eval.checkpoints.files import WEIGHTS_FILE, checkpoint_sha256, weights_file
@@ -18,14 +17,14 @@ from vla_eval.checkpoints.loading import (
     load_checkpoint,
     make_unfilled_policy,
     read_config,
-    read_weights,
 )
 from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, history, noise_shape
 from vla_eval.checkpoints.select_step import select_step
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.models.episodes.memory import remembers_singly
 from vla_eval.models.shared.earlier_frames import mask_field
-from vla_eval.models.shared.weights import check_fit
+from vla_eval.models.weights.exact import check_fit
+from vla_eval.models.weights.file import WeightFile
 
 INSTRUCTION = "pick the cube"
 
@@ -66,24 +65,8 @@ class Verified:
         ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Structure:
-    """What a checkpoint's header and its configuration agree about: type, tensors in the file, parameters."""
-
-    kind: str
-    n_tensors: int
-    n_parameters: int
-
-    def line(self) -> str:
-        """Return a line for a person."""
-        return (
-            f"{self.kind}, {self.n_tensors} tensors with the names and shapes of the network, none missing, "
-            f"none left over; {self.n_parameters:,} parameters"
-        )
-
-
-def check_structure(folder: Path) -> Structure:
-    """Compare the names and shapes of a whole model's weights with the network, without loading them.
+def check_structure(folder: Path) -> str:
+    """Compare names and shapes of a whole model's weights with the network, unread; return a line.
 
     A base needs no statistics: a fine-tuning gives it those of its dataset. Types may differ from the
     configuration's, since a recipe chooses the precision.
@@ -94,22 +77,17 @@ def check_structure(folder: Path) -> Structure:
     config = read_config(folder, LoadOptions(device="cpu"))
     policy = make_unfilled_policy(config, where=folder)
     file = folder / WEIGHTS_FILE
-    weights = read_weights(file)
+    weights = WeightFile(file)
     check_fit(policy, weights, where=str(file), cast=True)
-    return Structure(
-        kind=config.type,
-        n_tensors=len(weights),
-        n_parameters=sum(x.numel() for x in policy.parameters()),
+    n_parameters = sum(x.numel() for x in policy.parameters())
+    return (
+        f"{config.type}, {len(weights)} tensors with the names and shapes of the network, none missing, "
+        f"none left over; {n_parameters:,} parameters"
     )
 
 
 def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
-    """Load a checkpoint strictly and let it act once on random images.
-
-    Raises:
-        CheckpointError: weights, processors or statistics are not complete.
-        InvalidActionError: the actions have another shape than declared, or are not finite.
-    """
+    """Load a checkpoint strictly and let it act once on random images; actions have to be finite."""
     loaded = load_checkpoint(path, options)
     with loaded.acting():
         actions = _act(loaded)
@@ -125,19 +103,13 @@ def verify_checkpoint(path: Path, options: LoadOptions) -> Verified:
     return Verified(
         folder=loaded.folder,
         kind=loaded.config.type,
-        n_tensors=_count_tensors(file),
+        n_tensors=len(WeightFile(file)),
         n_parameters=sum(x.numel() for x in parameters),
         n_trained=sum(x.numel() for x in parameters if x.requires_grad),
         statistics=_used_statistics(loaded),
         chunk=expected,
         sha256=checkpoint_sha256(loaded.folder),
     )
-
-
-def _count_tensors(file: Path) -> int:
-    """Count by the header alone: the weights have been read once already."""
-    with safe_open(file, framework="pt") as header:
-        return len(header.keys())
 
 
 @torch.no_grad()
@@ -168,7 +140,7 @@ def random_batch(config: Any, deltas: tuple[int, ...], draws: torch.Generator) -
     times = (len(deltas),) if deltas else ()
     for key, feature in config.input_features.items():
         if not key.startswith("observation."):
-            raise CheckpointError(f"the field '{key}' is no observation; nothing can be made up for it.")
+            raise CheckpointError(f"the field '{key}' is not an observation; nothing can be made up for it.")
         batch[key] = torch.rand(1, *times, *feature.shape, generator=draws)
         if times:
             batch[f"{key}_is_pad"] = torch.zeros(1, *times, dtype=torch.bool)

@@ -1,10 +1,11 @@
 """`mikasa-vla check`: does a policy, or the server of one, keep its contract?"""
 
 import argparse
-import os
+import functools
 import sys
 from typing import Any
 
+from vla_eval.cli.shared.arguments import add_verb, api_key_of
 from vla_eval.errors import RecipeError
 
 URL_SCHEMES = ("ws://", "wss://")
@@ -22,13 +23,12 @@ EPILOG = "exit codes: 0 all requirements are met; 1 one is not, or a mistake; 13
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "check",
         help="check whether a policy, or a policy server, keeps its contract",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("policy", metavar="POLICY", help="name, file, folder, or ws://HOST:PORT")
     parser.add_argument(
@@ -51,18 +51,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _print_met(requirement: str) -> None:
+    print(f"ok  {requirement}", flush=True)
+
+
 def _check_server(args: argparse.Namespace) -> list[str]:
     from vla_eval.testing.check_remote import check_remote
 
     if args.task is not None:
         raise RecipeError("--task is for a local policy: a server says itself what it reads.")
-    api_key = None
-    if args.api_key_env is not None:
-        api_key = os.environ.get(args.api_key_env)
-        if not api_key:
-            raise RecipeError(
-                f"--api-key-env: the variable '{args.api_key_env}' is not set. Put the server's key into it."
-            )
+    api_key = api_key_of(args)
     timeout_seconds = DEFAULT_TIMEOUT_SECONDS if args.timeout_seconds is None else args.timeout_seconds
     if not timeout_seconds > 0:
         raise RecipeError(f"--timeout-seconds: expected a number above 0, found {timeout_seconds:g}.")
@@ -76,12 +74,5 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
         raise RecipeError(
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
-    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, say=_print_said)
-
-
-def _print_met(requirement: str) -> None:
-    print(f"ok  {requirement}", flush=True)
-
-
-def _print_said(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    say = functools.partial(print, file=sys.stderr, flush=True)
+    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, say=say)

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the comparison.
 
     Raises:
-        VlaEvalError: a RUN is no run folder, or there is nothing to compare.
+        VlaEvalError: a RUN is not a run folder, or there is nothing to compare.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.results.sweep import compare_runs

@@ -1,9 +1,14 @@
-"""`mikasa-vla completion`: print the completion of verbs, flags and names for a shell."""
+"""`mikasa-vla completion`: print the completion of verbs, flags and names for a shell.
+
+Not by shtab: it completes no names by verb, and would be another dependency.
+"""
 
 import argparse
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
+
+from vla_eval.cli.shared.arguments import add_verb
 
 DESCRIPTION = """Print what a shell needs to complete verbs, flags, and names of tasks, policies and configs.
 
@@ -12,6 +17,7 @@ DESCRIPTION = """Print what a shell needs to complete verbs, flags, and names of
   fish: mikasa-vla completion fish > ~/.config/fish/completions/mikasa-vla.fish
 
 The names are those of this version and of the working directory, at the time of the call."""
+ZSH = "#compdef mikasa-vla\nautoload -U +X bashcompinit && bashcompinit\n"
 NAMES_OF_FLAG = {"--task": "tasks", "--policy": "policies"}
 NAMES_OF_VERB = {"eval": "configs", "show": "tasks", "check": "policies"}
 
@@ -32,12 +38,11 @@ class Words(NamedTuple):
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "completion",
         help="print the completion for a shell",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("shell", choices=tuple(_SHELLS), help="the shell")
 
@@ -101,10 +106,6 @@ def _bash(words: Words) -> str:
 complete -F _mikasa_vla mikasa-vla"""
 
 
-def _zsh(words: Words) -> str:
-    return "\n".join(["#compdef mikasa-vla", "autoload -U +X bashcompinit && bashcompinit", _bash(words)])
-
-
 def _fish(words: Words) -> str:
     lines = [f"complete -c mikasa-vla -n __fish_use_subcommand -f -a '{' '.join(words.flags)}'"]
     for verb, flags in words.flags.items():
@@ -118,4 +119,8 @@ def _fish(words: Words) -> str:
     return "\n".join(lines)
 
 
-_SHELLS: Mapping[str, Callable[[Words], str]] = {"bash": _bash, "zsh": _zsh, "fish": _fish}
+_SHELLS: Mapping[str, Callable[[Words], str]] = {
+    "bash": _bash,
+    "zsh": lambda words: f"{ZSH}{_bash(words)}",
+    "fish": _fish,
+}

@@ -1,6 +1,7 @@
 """`mikasa-vla dataset …`: convert, mix, check, describe and share demonstrations."""
 
 import argparse
+import functools
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -24,10 +25,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         "dataset", help="convert, mix, describe or share datasets", allow_abbrev=False
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
+    action = functools.partial(actions.add_parser, allow_abbrev=False)
 
-    convert = actions.add_parser(
-        "convert", help="to or from the paper's layout, or to another control mode", allow_abbrev=False
-    )
+    convert = action("convert", help="to or from the paper's layout, or to another control mode")
     convert.add_argument("source", metavar="SRC", type=Path, help="folder of one task")
     goal = convert.add_mutually_exclusive_group(required=True)
     goal.add_argument("--to", choices=("npz", "lerobot"), help="the layout to write")
@@ -61,44 +61,38 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     add_flags(convert, "--workers")
     convert.set_defaults(workers="auto")
 
-    mix = actions.add_parser(
-        "mix", help="make one dataset of several, for a policy that learns several tasks", allow_abbrev=False
-    )
+    mix = action("mix", help="make one dataset of several, for a policy that learns several tasks")
     mix.add_argument("datasets", metavar="DIR", type=Path, nargs="+", help="complete datasets, one per task")
     mix.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
 
-    check = actions.add_parser(
+    check = action(
         "check",
         help="say all that differs from what is expected (exit code 1 if something has to be changed)",
-        allow_abbrev=False,
     )
-    check.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, whoever made it")
+    check.add_argument("dataset", metavar="DIR", type=Path, help="any dataset, also one made elsewhere")
 
-    adopt = actions.add_parser(
-        "adopt", help="use a dataset that lerobot-edit-dataset has edited", allow_abbrev=False
-    )
+    adopt = action("adopt", help="use a dataset that lerobot-edit-dataset has edited")
     adopt.add_argument("dataset", metavar="DIR", type=Path, help="a dataset with this project's fields")
     adopt.add_argument("--task", metavar="T", help="task id of its demonstrations")
 
-    leak = actions.add_parser(
+    leak = action(
         "check-leak",
         help="whether demonstrations begin as the evaluation's episodes do (exit code 1 if any does)",
-        allow_abbrev=False,
     )
     leak.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, or what `convert` reads")
     leak.add_argument("--task", metavar="T", help="task id, for datasets that name none")
     leak.add_argument("--seeds", metavar="A-B", type=seeds_argument, help="seeds of the evaluation (1-100)")
 
-    card = actions.add_parser("card", help="write README.md and a contact sheet", allow_abbrev=False)
+    card = action("card", help="write README.md and a contact sheet")
     card.add_argument("dataset", metavar="DIR", type=Path, help="a complete dataset")
     card.add_argument("--license", metavar="ID", help="licence as the Hub names it (recordings: mit)")
 
-    push = actions.add_parser("push", help="upload a complete dataset to the Hub", allow_abbrev=False)
+    push = action("push", help="upload a complete dataset to the Hub")
     push.add_argument("dataset", metavar="DIR", type=Path, help="a complete dataset")
     push.add_argument("repo_id", metavar="REPO_ID", help="USER/NAME on the Hub")
     push.add_argument("--private", action="store_true", help="make the repository a private one")
 
-    pull = actions.add_parser("pull", help="download a dataset from the Hub", allow_abbrev=False)
+    pull = action("pull", help="download a dataset from the Hub")
     pull.add_argument("repo_id", metavar="REPO_ID", help="USER/NAME on the Hub")
     pull.add_argument("out", metavar="DIR", type=Path, help="a new folder")
     pull.add_argument("--revision", metavar="REV", help="branch, tag or commit (default: the newest)")

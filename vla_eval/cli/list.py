@@ -11,7 +11,7 @@ from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.config.prompts import instruction_for, load_prompts
+from vla_eval.config.prompts import PromptRecipe, instruction_for
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import PluginError, RecipeError, VlaEvalError
 from vla_eval.evaluation.model_table import ModelTable, is_model_table
@@ -33,7 +33,7 @@ READY, TO_TRAIN, FROM_BASE = (
 REMOTE = "behind a socket: needs a server"
 FOR_TESTS, ADAPTERS = "for tests: tiny, with random weights", "adapters without a recipe of their own"
 TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
-RecipeClass = type[PolicyRecipe] | type[EvalConfig] | type[ModelTable] | type[DatasetRecipe] | type[Protocol]
+RecipeClass = type[EvalConfig | ModelTable | DatasetRecipe | Protocol | PromptRecipe]
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -104,7 +104,8 @@ def _tasks(suite: Suite = "paper") -> Groups:
 
 def _task(spec: TaskSpec) -> Row:
     cells = (spec.id, f"{spec.horizon_steps} steps", f"{spec.memory} memory")
-    chance = () if spec.split else (f"chance {_chance(spec.chance_success)}",)
+    known = "measured" if spec.chance_success is None else f"{spec.chance_success:.2g}"
+    chance = () if spec.split else (f"chance {known}",)
     return (*cells, *chance, f"“{instruction_for(spec)}”")
 
 
@@ -114,10 +115,6 @@ def _families() -> Groups:
         needed = ", ".join(f"env.{name}" for name in spec.open_arguments)
         rows.append((spec.id, f"needs {needed}" if needed else "needs no argument"))
     return {UNGROUPED: rows}
-
-
-def _chance(chance: float | None) -> str:
-    return "measured" if chance is None else f"{chance:.2g}"
 
 
 def _policies() -> Groups:
@@ -149,22 +146,6 @@ def _group(name: str, recipe: PolicyRecipe) -> str:
     return TO_TRAIN if base is None or Path(base).name in FIRST_TRAININGS else FROM_BASE
 
 
-def _configs() -> Groups:
-    return _recipes("configs", lambda name: ModelTable if is_model_table(name) else EvalConfig)
-
-
-def _prompts() -> Groups:
-    return {UNGROUPED: [(name, load_prompts(name).value.description) for name in list_recipes("prompts")]}
-
-
-def _datasets() -> Groups:
-    return _recipes("datasets", lambda _name: DatasetRecipe)
-
-
-def _protocols() -> Groups:
-    return _recipes("protocols", lambda _name: Protocol)
-
-
 def _recipes(folder: Folder, class_of: Callable[[str], RecipeClass]) -> Groups:
     rows: list[Row] = []
     for name in list_recipes(folder):
@@ -184,8 +165,8 @@ _LISTS: dict[str, Callable[[], Groups]] = {
     "tasks": _tasks,
     "families": _families,
     "policies": _policies,
-    "configs": _configs,
-    "prompts": _prompts,
-    "datasets": _datasets,
-    "protocols": _protocols,
+    "configs": lambda: _recipes("configs", lambda name: ModelTable if is_model_table(name) else EvalConfig),
+    "prompts": lambda: _recipes("prompts", lambda _name: PromptRecipe),
+    "datasets": lambda: _recipes("datasets", lambda _name: DatasetRecipe),
+    "protocols": lambda: _recipes("protocols", lambda _name: Protocol),
 }

@@ -9,7 +9,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
@@ -106,7 +106,7 @@ def _run(arguments: list[str]) -> int:
         args, unknown = parser.parse_known_args(arguments)
         if unknown:
             return _fail(_unknown_arguments(parser, first, unknown))
-        if (no_text := next((one for one in _words(args) if not _is_utf8(one)), None)) is not None:
+        if (no_text := next((one for one in _values(args) if not _is_text(one)), None)) is not None:
             return _fail(_no_text(no_text))
         if getattr(args, "no_lock", False):
             os.environ[OFF_VARIABLE] = "1"
@@ -163,10 +163,7 @@ def _add_no_lock(parser: argparse.ArgumentParser) -> None:
 
 def _paths(args: argparse.Namespace) -> list[Path]:
     """Return what may be a file or a folder that the user named: it may be written to."""
-    named = [value for value in vars(args).values() if isinstance(value, Path)]
-    lists = [value for value in vars(args).values() if isinstance(value, list)]
-    paths = [one for each in lists for one in each if isinstance(one, Path)]
-    return [*named, *paths, *(Path(word) for word in _words(args) if word)]
+    return [Path(one) for one in _values(args) if isinstance(one, str | Path) and one != ""]
 
 
 def _verb(name: str) -> Verb:
@@ -200,19 +197,18 @@ def _fail(message: str) -> int:
     return EXIT_USER_MISTAKE
 
 
-def _no_text(argument: str) -> str:
+def _no_text(argument: object) -> str:
     return f"expected text in UTF-8, found {argument!a:.{MAX_SHOWN}}. Correct the argument."
 
 
-def _words(args: argparse.Namespace) -> list[str]:
-    """Return what goes into records and messages as text; the names of files and folders may be any bytes."""
-    values = vars(args).values()
-    each = [one for value in values for one in (value if isinstance(value, list) else [value])]
-    return [one for one in each if isinstance(one, str)]
+def _values(args: argparse.Namespace) -> Iterator[object]:
+    for value in vars(args).values():
+        yield from value if isinstance(value, list) else (value,)
 
 
-def _is_utf8(argument: str) -> bool:
-    return not any("\ud800" <= character <= "\udfff" for character in argument)
+def _is_text(value: object) -> bool:
+    """Whether it can go into records and messages; the names of files and folders may be any bytes."""
+    return not isinstance(value, str) or not any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
 def _with_short_words(message: str) -> str:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Run each task as it is and with one thing changed, on the same seeds, and compare.
 
-swap: another cue in the same scene. Who follows the cue chooses what was shown in each of the two worlds.
+swap: another cue in the same scene. A policy that uses the cue changes its choice with it.
 order: the same items in another order (Seq, Chain). shuffle: as order, with the right answer as before.
 blank: the cue phase passes without a cue. freeze: the policy sees the cue's first frame throughout.
 mask: part of the image is hidden. late: nothing is shown before the cue. cue, delay: other lengths of the
@@ -39,7 +39,7 @@ appearance: light, camera, colours.
 With --grid, chunk lengths against the lengths of the phases: what of the cue falls into an inference?
 
 CONFIG is a file, or the name of one in configs/; without it, name at least one --task and one --policy.
-The controls oracle, cue_blind and body_memory are run beside the policies. The same command resumes."""
+The controls oracle, cue_blind and body_memory are run as well. The same command resumes."""
 EPISODES = 50
 
 

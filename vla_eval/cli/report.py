@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     """Read the runs, and print their table or write their page.
 
     Raises:
-        VlaEvalError: a RUN is no run folder, holds nothing yet, or has no such baseline.
+        VlaEvalError: a RUN is not a run folder, holds nothing yet, or has no such baseline.
     """
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.probe.report_text import probe_texts

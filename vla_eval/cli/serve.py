@@ -7,7 +7,8 @@ import os
 import sys
 from typing import Any
 
-from vla_eval.errors import MAX_SHOWN, RecipeError
+from vla_eval.cli.shared.arguments import add_verb, api_key_of
+from vla_eval.errors import MAX_SHOWN
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
@@ -17,12 +18,11 @@ network; an answer does not depend on who else is there."""
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
+    parser = add_verb(
+        subparsers,
         "serve",
         help="serve a policy to simulators and other clients over WebSocket",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument(
         "--policy", required=True, metavar="P", help="name in policies/, file, or folder of a checkpoint"
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     options = ServerOptions(
         host=args.host,
         port=args.port,
-        api_key=_api_key(args.api_key_env),
+        api_key=api_key_of(args),
         idle_seconds=args.idle_seconds,
         debug=args.debug,
     )
@@ -95,20 +95,6 @@ def run(args: argparse.Namespace) -> int:
 
     run_server(hosted, options, ready=ready)
     return 0
-
-
-def _api_key(variable: str | None) -> str | None:
-    """Return the key that the environment variable holds.
-
-    Raises:
-        RecipeError: it is not set.
-    """
-    if variable is None:
-        return None
-    key = os.environ.get(variable, "")
-    if not key:
-        raise RecipeError(f"--api-key-env {variable}: expected a key in this variable, found it not set.")
-    return key
 
 
 def _is_loopback(host: str) -> bool:

@@ -45,7 +45,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what is known of the task without starting a simulator."""
+    """Explain the task, without starting a simulator."""
     spec = task_spec(args.task)
     if spec.is_official:
         return _show_official(spec, args.prompt_set)
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show_official(spec: TaskSpec, prompt_set: str) -> int:
-    """Print what is known of a task of the official package, which need not be installed."""
+    """Explain a task of the official package, which need not be installed."""
     split = f", {spec.split} split" if spec.split else ""
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory{split})")
     _print("instruction", f"“{instruction_for(spec, prompt_set)}”")

@@ -14,6 +14,7 @@ HUMAN_CAMERA = "human_camera"
 """Name of the camera for people; no policy can request it."""
 
 Simulator = Literal["maniskill", "fake"]
+WristMesh = Literal["shipped", "whole", "simplified"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +28,7 @@ class RenderSettings:
         backend: `auto`, `cpu`, `gpu`, or a device as SAPIEN names it (`cuda:1`).
     """
 
-    wrist_mesh: Literal["shipped", "whole", "simplified"] = "shipped"
+    wrist_mesh: WristMesh = "shipped"
     backend: str = "auto"
 
 

@@ -39,7 +39,7 @@ class LoraRecipe:
         target_modules: regular expression of the modules that get one; None: lerobot's choice, which for
             π0 and π0.5 is the action expert's attention and the projections, not the language model.
             `all-linear` is refused: it would take heads and embeddings, too.
-        full_modules: last names of modules that are trained in full beside the adapters.
+        full_modules: last names of modules that are trained in full in addition to the adapters.
     """
 
     rank: Rank = 16

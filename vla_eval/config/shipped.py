@@ -14,6 +14,6 @@ def search_folders(kind: str) -> tuple[Path, ...]:
         kind: name of the folder: `configs`, `policies`, `prompts`, `datasets`, `protocols` or `checkpoints`.
     """
     packaged = PACKAGE_ROOT / "recipes_data" / kind
-    # An editable checkout has no recipes_data: these folders are beside the package.
+    # An editable checkout has no recipes_data: these folders are next to the package.
     shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / kind
     return tuple(dict.fromkeys((Path.cwd() / kind, shipped)))

@@ -227,11 +227,6 @@ class FakeEnv:
         touched = tuple(episode.touched)
         return touched == episode.targets if self._in_order else set(touched) == set(episode.targets)
 
-    def _chance(self) -> float | None:
-        if not self._n_items:
-            return None
-        return chance_of_several(self._n_items, self._n_shown, in_order=self._in_order)
-
     def _phase(self, episode: _Episode) -> Phase:
         if episode.step >= self._response_step:
             return "response"
@@ -254,7 +249,9 @@ class FakeEnv:
             fail=is_lost,
             target=only_one(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
-            chance_success=self._chance(),
+            chance_success=chance_of_several(self._n_items, self._n_shown, in_order=self._in_order)
+            if self._n_items
+            else None,
             candidate_places=places_from_right(episode.candidates_m[:, :2]),
             right_candidates=episode.targets,
             touched_candidates=tuple(episode.touched),

@@ -23,7 +23,7 @@ from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
 from vla_eval.envs.true_states import with_true_states
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
-from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
+from vla_eval.oracles.arm_model import gripper_command
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
@@ -84,8 +84,7 @@ class OfficialEnv:
         """Return the (7,) action that moves nothing; see `SimEnv.hold_action`."""
         finger_m = float(self._envs[slot].agent.robot.get_qpos()[0, -2:].mean())
         action = np.zeros(len(ACTION.dims), dtype=np.float32)
-        command = (finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1
-        action[-1] = np.clip(command, -1, 1)
+        action[-1] = gripper_command(finger_m)
         return action
 
     def close(self) -> None:

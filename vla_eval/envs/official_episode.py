@@ -30,7 +30,7 @@ def waiting_of(env: Any) -> Waiting:
 
 
 class OfficialEpisode:
-    """What is known of a running episode at the step that was noted last.
+    """A running episode at the step that was noted last.
 
     Attributes:
         phase: the phase; what happens between cue and choice is a delay, also where mugs are shuffled.

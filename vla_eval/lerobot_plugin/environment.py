@@ -7,7 +7,7 @@ no seeds in its results. For figures use `mikasa-vla eval`.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal  # lerobot and gymnasium's vector environments are untyped here
+from typing import Any, get_args  # lerobot and gymnasium's vector environments are untyped here
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from lerobot.envs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from numpy.typing import NDArray
 
-from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.environment import EnvSettings, RenderSettings, WristMesh
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.envs.factory import make_env
@@ -248,10 +248,10 @@ def _state_kind(name: str) -> StateKind:
 
 
 def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
-    meshes: tuple[Literal["shipped", "whole", "simplified"], ...] = ("shipped", "whole", "simplified")
-    for known in meshes:
-        if known == wrist_mesh:
-            return RenderSettings(wrist_mesh=known, backend=backend)
+    meshes: tuple[WristMesh, ...] = get_args(WristMesh)
+    for mesh in meshes:
+        if mesh == wrist_mesh:
+            return RenderSettings(wrist_mesh=mesh, backend=backend)
     raise unknown_name("mesh", wrist_mesh, meshes, where="env.wrist_mesh")
 
 

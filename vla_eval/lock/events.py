@@ -36,7 +36,7 @@ def audit(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def refused(what: str) -> LockedError:
-    """Log what was refused, and return the error: whoever asked may swallow it."""
+    """Log what was refused, and return the error: the code that asked may swallow it."""
     message = f"refused to {what}: what a checkpoint, a dataset or a server brings along may not."
     logger.warning("%s", message)
     return LockedError(f"{message} {HOW_TO_UNLOCK}")

@@ -7,7 +7,6 @@ that are understood from their configuration alone need no row. Standard library
 import importlib
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 from vla_eval.models.family import Base, Family, Source, Tiny
@@ -19,15 +18,13 @@ SHARDS = ("*.json", "*.safetensors", "tokenizer.model")
 GEMMA = "weights: Gemma Terms of Use; code: Apache-2.0"
 OPEN_X = {"gripper": "unit_open"}  # of Open X-Embodiment, on which all that are converted were trained
 BYTES = {"tokenizer_name": "bytes"}
-TINY_POLICY: Mapping[str, Any] = MappingProxyType(
-    {
-        "chunk_size": 4,
-        "n_action_steps": 4,
-        "num_inference_steps": 2,
-        "image_resolution": [56, 56],
-        "dtype": "float32",
-    }
-)
+TINY_POLICY: Mapping[str, Any] = {
+    "chunk_size": 4,
+    "n_action_steps": 4,
+    "num_inference_steps": 2,
+    "image_resolution": [56, 56],
+    "dtype": "float32",
+}
 """Fields of a tiny policy of the π0 family."""
 _STAGES = "vla_eval.models.shared.stages"
 _STAND_INS = "vla_eval.testing.stand_ins"
@@ -38,19 +35,12 @@ _PALIGEMMA = Source(
     patterns=TOKENIZER,
     folder="tokenizer",
 )
-_RESNET18 = Base(
-    name="resnet18",
-    title="ResNet-18 of torchvision, trained on ImageNet (IMAGENET1K_V1)",
-    terms="BSD-3-Clause",
-    parts=(
-        Source(
-            repo_id="timm/resnet18.tv_in1k",
-            revision="bbd144b3e5565108aad885f145491d11bc6ce807",
-            patterns=("model.safetensors",),
-        ),
-    ),
-    is_backbone=True,
-)
+
+
+def _of_lerobot(name: str, title: str, repo_id: str, revision: str | None, *parts: Source) -> Base:
+    """Return a base of the π0 family: PaliGemma's tokenizer, further parts, and lerobot's weights."""
+    weights = Source(repo_id=f"lerobot/{repo_id}", revision=revision, patterns=WEIGHTS)
+    return Base(name=name, title=title, terms=GEMMA, parts=(_PALIGEMMA, *parts, weights))
 
 
 def _octo_base(size: str, revision: str, fields: Mapping[str, Any]) -> Base:
@@ -114,21 +104,7 @@ _PI0 = Family(
     stand_in=f"{_STAND_INS}:paligemma",
     built_tiny=_TINY_PALIGEMMA,
     tiny=Tiny(fields={**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": 2}),
-    bases=(
-        Base(
-            name="pi0_base",
-            title="π0",
-            terms=GEMMA,
-            parts=(
-                _PALIGEMMA,
-                Source(
-                    repo_id="lerobot/pi0_base",
-                    revision="25c379b52ba2ff8788cab921758a3cc3fe3f77f2",
-                    patterns=WEIGHTS,
-                ),
-            ),
-        ),
-    ),
+    bases=(_of_lerobot("pi0_base", "π0", "pi0_base", "25c379b52ba2ff8788cab921758a3cc3fe3f77f2"),),
 )
 _PI05 = replace(
     _PI0,
@@ -139,22 +115,26 @@ _PI05 = replace(
     lora_targets=r"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj"
     r"|model\.(action_in_proj|action_out_proj|time_mlp_in|time_mlp_out))",
     tiny=None,
-    bases=(
-        Base(
-            name="pi05_base",
-            title="π0.5",
-            terms=GEMMA,
-            parts=(
-                _PALIGEMMA,
-                Source(
-                    repo_id="lerobot/pi05_base",
-                    revision="b211f3d44c36b6acfcf7ae94a64e8e96f75a64ba",
-                    patterns=WEIGHTS,
-                ),
-            ),
-        ),
-    ),
+    bases=(_of_lerobot("pi05_base", "π0.5", "pi05_base", "b211f3d44c36b6acfcf7ae94a64e8e96f75a64ba"),),
 )
+
+
+def _ours(folder: str, docs: str) -> dict[str, Any]:
+    """Return the fields of a row that follow from the names of our modules and functions."""
+    configuration = f"vla_eval.models.{folder}.configuration_{folder}"
+    return {
+        "type": f"mikasa_{folder}",
+        "configuration": configuration,
+        "docs": f"docs/{docs}.md",
+        "stages": f"{configuration}:network_stages",
+    }
+
+
+def _converted(folder: str, options: str) -> dict[str, Any]:
+    module = f"vla_eval.models.{folder}.conversion"
+    return {"converter": f"{module}:read_original", "convert_options": f"{module}_options:{options}"}
+
+
 _ADDS_MEMORY: dict[str, Any] = {
     "configuration": "vla_eval.models.vla_memory.configuration_vla_memory",
     "docs": "docs/vla_memory.md",
@@ -170,7 +150,21 @@ _ROWS = (
         saved_per_linear=1.04,
         counts_all_layers=True,
         tiny=Tiny(),
-        bases=(_RESNET18,),
+        bases=(
+            Base(
+                name="resnet18",
+                title="ResNet-18 of torchvision, trained on ImageNet (IMAGENET1K_V1)",
+                terms="BSD-3-Clause",
+                parts=(
+                    Source(
+                        repo_id="timm/resnet18.tv_in1k",
+                        revision="bbd144b3e5565108aad885f145491d11bc6ce807",
+                        patterns=("model.safetensors",),
+                    ),
+                ),
+                is_backbone=True,
+            ),
+        ),
     ),
     Family(
         type="diffusion",
@@ -202,19 +196,16 @@ _ROWS = (
             )
         },
         bases=(
-            Base(
-                name="pi0_fast_base",
-                title="π0-FAST",
-                terms=GEMMA,
-                parts=(
-                    _PALIGEMMA,
-                    Source(
-                        repo_id="lerobot/fast-action-tokenizer",
-                        revision=None,
-                        patterns=("*.json", "tokenizer*"),  # its code is not fetched: it is read as data
-                        folder="action_tokenizer",
-                    ),
-                    Source(repo_id="lerobot/pi0fast-base", revision=None, patterns=WEIGHTS),
+            _of_lerobot(
+                "pi0_fast_base",
+                "π0-FAST",
+                "pi0fast-base",
+                None,
+                Source(
+                    repo_id="lerobot/fast-action-tokenizer",
+                    revision=None,
+                    patterns=("*.json", "tokenizer*"),  # its code is not fetched: it is read as data
+                    folder="action_tokenizer",
                 ),
             ),
         ),
@@ -234,28 +225,19 @@ _ROWS = (
     Family(type="groot", cuts_chunk=True),
     Family(type="molmoact2", cuts_chunk=True),
     Family(
-        type="mikasa_memory",
-        configuration="vla_eval.models.memory.configuration_memory",
-        docs="docs/positive_control.md",
-        stages="vla_eval.models.memory.configuration_memory:network_stages",
+        **_ours("memory", "positive_control"),
         saved_per_linear=1.91,
         counts_all_layers=True,
         tiny=Tiny(),
     ),
     Family(
-        type="mikasa_offline_rl",
-        configuration="vla_eval.models.offline_rl.configuration_offline_rl",
-        docs="docs/offline_rl.md",
-        stages="vla_eval.models.offline_rl.configuration_offline_rl:network_stages",
+        **_ours("offline_rl", "offline_rl"),
         saved_per_linear=1.4,
         counts_all_layers=True,
         tiny=Tiny(),
     ),
     Family(
-        type="mikasa_sequence",
-        configuration="vla_eval.models.sequence.configuration_sequence",
-        docs="docs/sequence_policies.md",
-        stages="vla_eval.models.sequence.configuration_sequence:network_stages",
+        **_ours("sequence", "sequence_policies"),
         saved_per_linear=1.1,
         counts_all_layers=True,
         tiny=Tiny(),
@@ -264,15 +246,11 @@ _ROWS = (
     replace(_PI0, type="mikasa_pi0", wraps=_PI0.type, **_ADDS_MEMORY),
     replace(_PI05, type="mikasa_pi05", wraps=_PI05.type, **_ADDS_MEMORY),
     Family(
-        type="mikasa_octo",
-        configuration="vla_eval.models.octo.configuration_octo",
-        docs="docs/octo.md",
+        **_ours("octo", "octo"),
         is_built_empty=True,
-        stages="vla_eval.models.octo.configuration_octo:network_stages",
         stand_in_fields=BYTES,
         tiny=Tiny(recipe="octo_tiny"),
-        converter="vla_eval.models.octo.conversion:read_original",
-        convert_options="vla_eval.models.octo.conversion_options:OctoOptions",
+        **_converted("octo", "OctoOptions"),
         bases=(
             _octo_base("small", "dc9aa3019f764726c770814b27e4ab0fc6e32a58", {}),
             # Source: octo/model/components/transformer.py of the original, `vit_b`; `vit_s` is the default.
@@ -284,15 +262,11 @@ _ROWS = (
         ),
     ),
     Family(
-        type="mikasa_openvla",
-        configuration="vla_eval.models.openvla.configuration_openvla",
-        docs="docs/openvla.md",
+        **_ours("openvla", "openvla"),
         is_built_empty=True,
-        stages="vla_eval.models.openvla.configuration_openvla:network_stages",
         stand_in_fields=BYTES,
         tiny=Tiny(recipe="openvla_oft_tiny"),
-        converter="vla_eval.models.openvla.conversion:read_original",
-        convert_options="vla_eval.models.openvla.conversion_options:OpenVLAOptions",
+        **_converted("openvla", "OpenVLAOptions"),
         adapters={"openvla": "vla_eval.policies.lerobot.paper_compat:make_paper_compat"},
         bases=(
             Base(
@@ -311,19 +285,15 @@ _ROWS = (
         ),
     ),
     Family(
-        type="mikasa_spatialvla",
-        configuration="vla_eval.models.spatialvla.configuration_spatialvla",
-        docs="docs/spatialvla.md",
+        **_ours("spatialvla", "spatialvla"),
         is_built_empty=True,
-        stages="vla_eval.models.spatialvla.configuration_spatialvla:network_stages",
         saved_per_linear=1.9,
         stand_in_fields={
             **BYTES,  # whose tokens have these numbers
             "sizes": {"pad_token": 0, "bos_token": 1, "stop_token": 2, "newline_token": 201},
         },
         tiny=Tiny(recipe="spatialvla_tiny"),
-        converter="vla_eval.models.spatialvla.conversion:read_original",
-        convert_options="vla_eval.models.spatialvla.conversion_options:SpatialVLAOptions",
+        **_converted("spatialvla", "SpatialVLAOptions"),
         bases=(
             Base(
                 name="spatialvla_4b",

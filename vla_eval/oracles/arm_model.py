@@ -109,6 +109,11 @@ def wrapped_rad(angle_rad: float, period_rad: float = 2 * np.pi) -> float:
     return float((angle_rad + period_rad / 2) % period_rad - period_rad / 2)
 
 
+def gripper_command(finger_m: float) -> float:
+    """Return the gripper command that holds the fingers at this position each."""
+    return float(np.clip((finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1, -1, 1))
+
+
 def action_row(translation: Vector, gripper: float, turn: float = 0.0) -> NDArray[np.float32]:
     """Return the (7,) action with this translation, turn about world z and gripper command.
 

@@ -1,4 +1,4 @@
-"""Expert for Intercept: wait beside the ball's lane, let the ball into the fingers, push it to the goal.
+"""Expert for Intercept: wait next to the ball's lane, let the ball into the fingers, push it to the goal.
 
 The gripper stays 3 cm open. Both fingers are aligned along y and hold the 4 cm ball like a cradle while
 it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
@@ -72,7 +72,7 @@ class _Play:
     """State of the model: arm, ball in the plane of the table, and the controller's internal state.
 
     Attributes:
-        stage: `wait` beside the lane, `follow` the ball, `close` the gap, `push`.
+        stage: `wait` next to the lane, `follow` the ball, `close` the gap, `push`.
         side_speed_m_s: the commanded speed along y while pushing.
     """
 
@@ -182,7 +182,7 @@ def _command(play: _Play) -> model.Vector:
 
 
 def _waiting_place_m(play: _Play) -> model.Vector:
-    """Return (x, y) beside the lane from which a push carries the ball to the goal."""
+    """Return (x, y) next to the lane from which a push carries the ball to the goal."""
     lane_x = float(play.ball_m[0])
     v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
     run_up_y = float(play.goal_m[0] - lane_x) * v_y / play.tactics.push_speed_m_s + MEET_Y_EXTRA_M

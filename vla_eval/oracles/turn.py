@@ -22,9 +22,8 @@ OVER_M = 0.015  # the arm descends within this horizontal distance of the peg's 
 DESCEND_RAD = 0.35  # once the fingers are aligned to this angle: 8 cm between them leave room around 5 cm,
 CLOSE_RAD = 0.12  # and closes once they are aligned to this angle
 AT_GRASP_M = 0.008
-DESCENT = (
-    0.5  # of full speed: faster, the arm swerves by 1 cm per step, which an open-loop plan cannot correct
-)
+# Of full speed: faster, the arm swerves by 1 cm per step, which an open-loop plan cannot correct.
+DESCENT = 0.5
 PEG_WIDTH_M = 0.05
 HELD_WIDTH_M = 0.052
 AT_ANGLE_RAD = 0.02

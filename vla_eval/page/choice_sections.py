@@ -1,5 +1,6 @@
 """The page's section on choices: targets, first choices and causes of failure."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -72,7 +73,7 @@ def choices(material: Material) -> Choices | None:
     return Choices(
         explanations=tuple(EXPLANATIONS.values()),
         table=PrintedTable(columns=columns, rows=cells_of(columns, found)),
-        missing=_missing([report for _, report in found]),
+        missing=tuple(_missing([report for _, report in found])),
         matrices={
             material.name_of(row, with_task=True): tuple(
                 _matrix(report, kind, row.task) for kind in KIND_NAMES if report.confusion[kind]
@@ -82,20 +83,16 @@ def choices(material: Material) -> Choices | None:
     )
 
 
-def _missing(reports: list[ChoiceReport]) -> tuple[str, ...]:
-    said = []
+def _missing(reports: list[ChoiceReport]) -> Iterator[str]:
     if not all(report.reach_is_known for report in reports):
-        said.append(
+        yield (
             "Some records (of an earlier version) do not say how far the arm moved. For them, “could not "
             "move” cannot be distinguished from “never chose”."
         )
     if any(not report.confusion["place"] and report.confusion["item"] for report in reports):
-        said.append(
-            "Some records do not say where the candidates were. For them, no habit of place can be found."
-        )
+        yield "Some records do not say where the candidates were. For them, no habit of place can be found."
     if any(not report.confusion["item"] for report in reports):
-        said.append("If several candidates are right, there is no single target and no matrix.")
-    return tuple(said)
+        yield "If several candidates are right, there is no single target and no matrix."
 
 
 def _n_episodes(cause: Cause, of: tuple[Row, ChoiceReport]) -> str:

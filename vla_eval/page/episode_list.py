@@ -37,9 +37,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     Each is a list in the order of `FIELDS`; what is undefined is null. Texts are numbers into lists of texts,
     so that 30,000 episodes fit into a file of a few megabytes.
 
-    Args:
-        material: the data of the page.
-        folder: of the page, from which captures are linked; None: the current one.
+    Captures are linked from the folder of the page; None: the current one.
     """
     files = _files(material, folder or Path())
     errors: dict[str, int] = {}

@@ -26,9 +26,9 @@ MAX_MESSAGE = 400  # characters of an error's message
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LatencyTable:
-    """Times of inferences; `n_unknown` rows have no timing. No table if none has."""
+    """Times of inferences; `n_unknown` rows have no timing."""
 
-    table: PrintedTable | None
+    table: PrintedTable
     n_unknown: int
 
 
@@ -57,11 +57,11 @@ def latency(material: Material) -> LatencyTable:
             )
     times = ("ms per inference, median", "slowest episode", "s per episode, median")
     table = page_table(rows, text=("policy", "run"), numbers=("episodes", *times))
-    return LatencyTable(table=table if rows else None, n_unknown=n_unknown)
+    return LatencyTable(table=table, n_unknown=n_unknown)
 
 
-def errors_table(material: Material) -> PrintedTable | None:
-    """Return errors by cause, the most frequent first; None if there are none."""
+def errors_table(material: Material) -> PrintedTable:
+    """Return errors by cause, the most frequent first."""
     runs = (run for row in material.table.rows for run in row.episodes.runs)
     records = (record for run in runs for record in run.records.values())
     errors = [(record, record.error) for record in records if record.error is not None]
@@ -71,8 +71,6 @@ def errors_table(material: Material) -> PrintedTable | None:
         record, error = next(one for one in errors if (one[1].kind, one[1].stage) == (kind, stage))
         where = f"{record.policy} on {record.task}, seed {record.seed}"
         rows.append([kind, stage, str(n), f"{where}: {error.message[:MAX_MESSAGE]}"])
-    if not rows:
-        return None
     return page_table(rows, text=("kind", "during"), numbers=("episodes",), code=("the first of them",))
 
 
@@ -150,10 +148,10 @@ def _data_uri(kind: str, path: Path) -> str:
 
 
 class Listing(NamedTuple):
-    """Names and values behind a title; without a table, `missing` says so."""
+    """Names and values behind a title; without any, `missing` says so."""
 
     title: str
-    table: PrintedTable | None
+    table: PrintedTable
     missing: str
 
 
@@ -229,5 +227,4 @@ def _lock(run: StoredRun) -> list[str]:
 
 def _listing(title: str, values: dict[str, str], missing: str) -> Listing:
     rows = [[name, value] for name, value in values.items()]
-    table = page_table(rows, text=("name",), code=("value",)) if rows else None
-    return Listing(title, table, missing)
+    return Listing(title, page_table(rows, text=("name",), code=("value",)), missing)

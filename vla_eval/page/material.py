@@ -36,12 +36,7 @@ class Material:
         return [row for row in self.table.rows if row.task == task]
 
     def name_of(self, row: Row, *, with_task: bool = False) -> str:
-        """Return the name of a row within its task: policy, K, and the letter of its variant.
-
-        Args:
-            row: of the table.
-            with_task: begin with the task, if the page has several.
-        """
+        """Return the name of a row: its task, if asked for and if there are several; policy, K, variant."""
         parts = [row.task] if with_task and len(self.tasks) > 1 else []
         name = " · ".join([*parts, row.policy, f"K={row.n_action_steps}"])
         return f"{name} ({self.table.variants[row.variant]})" if row.variant else name

@@ -131,8 +131,8 @@ def chunk_sweep(material: Material) -> PrintedTable | str:
     return replace(table, columns=tuple(columns))
 
 
-def paired_table(material: Material) -> PrintedTable | None:
-    """Return the counts of each policy against each baseline; None if none is compared."""
+def paired_table(material: Material) -> PrintedTable:
+    """Return the counts of each policy against each baseline."""
     rows = []
     for row in material.table.rows:
         for found in row[PAIRED]:
@@ -149,8 +149,6 @@ def paired_table(material: Material) -> PrintedTable | None:
                     _p(found.corrected_p),
                 ]
             )
-    if not rows:
-        return None
     counted = ("pairs", "both", "only it", "only the baseline", "neither")
     return page_table(rows, text=("policy", "against"), numbers=(*counted, "difference", "p", "p (Holm)"))
 

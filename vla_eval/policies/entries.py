@@ -26,7 +26,7 @@ class PolicyEntry:
         recipes: one; or one per run, for a policy of several checkpoints.
         texts: what the configuration calls each of them.
         is_by_run: whether each recipe is a run of its own.
-        server: of a policy behind a socket, what its server said of itself.
+        server: of a policy behind a socket, its server's metadata.
     """
 
     name: str

@@ -3,7 +3,7 @@
 A name is looked up among ours, then among installed packages that declare the entry point group
 `vla_eval.policies`; a name with a colon is `module:attr`. Nothing is imported before it is asked for.
 
-Whoever writes `module:attr` into a recipe trusts that module: it is imported. A recipe from elsewhere must
+A module named in a recipe is trusted: it is imported. A recipe from elsewhere must
 not reach Python's own functions that way, so modules of the standard library and `__main__` hold no adapter;
 and what is found is called only if it is a function or a class that takes a context.
 """
@@ -122,11 +122,10 @@ def policy_factory(adapter: str) -> PolicyFactory:
 
 
 def make_from_adapter(adapter: str, context: PolicyContext, args: Mapping[str, Any]) -> Policy:
-    """Make a policy of an adapter, with global generators seeded by its name.
+    """Make a policy of an adapter with a recipe's arguments, global generators seeded by its name.
 
     Raises:
-        UnknownNameError, MissingDependencyError: see `policy_factory`.
-        RecipeError: the adapter does not take these arguments, which come from a recipe.
+        RecipeError: the adapter does not take these arguments. Else see `policy_factory`.
     """
     factory = policy_factory(adapter)
     seed_global_generators("policy", context.name)

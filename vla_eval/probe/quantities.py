@@ -82,12 +82,7 @@ class SwapQuantities:
 
 
 def pair_up(drawn: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) -> list[Pair]:
-    """Return the pairs with a result in both worlds, by run and seed.
-
-    Args:
-        drawn: episodes of one task, policy and n_action_steps in one world.
-        other: the same in another world.
-    """
+    """Return the pairs of one task, policy and K with a result in both worlds, by run and seed."""
     partner = {(r.run, r.seed): r for r in other if r.outcome != "error"}
     pairs = [
         Pair(r, partner[r.run, r.seed]) for r in drawn if r.outcome != "error" and (r.run, r.seed) in partner

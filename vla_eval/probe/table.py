@@ -166,12 +166,7 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
 
 
 def with_contrasts(rows: Sequence[ProbeRow], worlds: Worlds) -> list[ProbeRow]:
-    """Return the rows of one policy, those of an appearance compared with the longest delay.
-
-    Args:
-        rows: one per world.
-        worlds: in the same order.
-    """
+    """Compare the rows of an appearance with that of the longest delay; a row per world, of one policy."""
     delays = [
         (row.delay_steps, index)
         for index, row in enumerate(rows)

@@ -140,14 +140,7 @@ class _Copy(NamedTuple):
 
 
 def group_runs(runs: Sequence[StoredRun]) -> Grouping:
-    """Sort the episodes of all runs into rows.
-
-    Args:
-        runs: what the run folders hold.
-
-    Returns:
-        Rows in the order of tasks and policies in the configurations, then by `n_action_steps`.
-    """
+    """Sort the episodes of all runs into rows: by task and policy as in the configurations, then by K."""
     labels = variant_labels(runs)
     found: dict[RowKey, dict[int, list[_Copy]]] = defaultdict(lambda: defaultdict(list))
     n_doubles: dict[str, int] = defaultdict(int)

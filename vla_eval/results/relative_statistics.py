@@ -14,8 +14,8 @@ SMALLEST_SHOWN_P = 0.001
 VAGUE = 0.4  # width of an interval of chance; 20 episodes at a third have 0.39
 BY_ARITHMETIC = ("1/N", "catalogue")
 """Sources of a chance that was not measured."""
-LEAST_COMPARISONS = 2
-"""As many have columns in CSV and JSON, in whatever table."""
+NO_BASELINES = ("baseline", "second baseline")
+"""Words for the baselines that a table has not: so many have columns in any table, empty ones included."""
 FIRST_NAMES = (
     *("baseline", "baseline_n_action_steps", "paired_difference", "paired_low", "paired_high"),
     *("n_pairs", "paired_p", "paired_p_raw"),
@@ -29,7 +29,7 @@ def _ordinal(number: int) -> str:
 
 def _paired_cells(comparisons: Sequence[Comparison | None]) -> dict[str, Cell]:
     cells: dict[str, Cell] = {}
-    for number in range(max(LEAST_COMPARISONS, len(comparisons))):
+    for number in range(max(len(NO_BASELINES), len(comparisons))):
         names = FIRST_NAMES if not number else [f"{_ordinal(number)}_{name}" for name in NEXT_NAMES]
         one = comparisons[number] if number < len(comparisons) else None
         cells |= dict.fromkeys(names)
@@ -43,7 +43,7 @@ def _paired_cells(comparisons: Sequence[Comparison | None]) -> dict[str, Cell]:
 def _paired_column(number: int, baseline: str) -> Column[Row]:
     prefix = f"{_ordinal(number)}_" if number else ""
     return Column(
-        f"vs {baseline or f'{prefix}baseline'.replace('_', ' ')}",
+        f"vs {baseline}",
         lambda row: _shown_difference(row[PAIRED][number] if number < len(row[PAIRED]) else None),
         name=f"{prefix}difference",
         rank=min(number, 1),

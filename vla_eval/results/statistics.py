@@ -19,7 +19,7 @@ from vla_eval.results.own_statistics import (
     SUCCESS,
 )
 from vla_eval.results.printed_table import UNDEFINED, Column
-from vla_eval.results.relative_statistics import CEILING, CHANCE, CORRECTED, LEAST_COMPARISONS, PAIRED
+from vla_eval.results.relative_statistics import CEILING, CHANCE, CORRECTED, NO_BASELINES, PAIRED
 from vla_eval.results.success_table import Row, Statistic
 
 STATISTICS: tuple[Statistic[Any], ...] = (  # Any: each has values of its own type
@@ -55,7 +55,7 @@ def printed_columns(baselines: Sequence[str] = ()) -> Mapping[str, Column[Row]]:
     for statistic in STATISTICS:
         found += statistic.columns
         if statistic.column_of is not None:
-            names = (*baselines, *[""] * (LEAST_COMPARISONS - len(baselines)))
+            names = (*baselines, *NO_BASELINES)[: max(len(NO_BASELINES), len(baselines))]
             found += [statistic.column_of(number, name) for number, name in enumerate(names)]
     return {column.name: column for column in sorted(found, key=lambda one: (one.is_last, one.rank))}
 

@@ -31,7 +31,7 @@ class Statistic[V]:
     notes: "Callable[[Sequence[Row]], Iterable[str]]" = lambda _: ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """One policy on one task, at one `n_action_steps` and one variant of the settings; or one run of it.
 

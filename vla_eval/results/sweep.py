@@ -174,10 +174,5 @@ def episodes_to_settle(difference: float, discordance: float, *, level: float = 
 
 
 def discordance_of_independent(first: float, second: float) -> float:
-    """Return how often two policies differ if their outcomes are independent.
-
-    Args:
-        first: success rate of one.
-        second: success rate of the other.
-    """
+    """Return how often two policies with these success rates differ if their outcomes are independent."""
     return first * (1 - second) + second * (1 - first)

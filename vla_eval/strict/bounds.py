@@ -5,11 +5,14 @@ it would fill the memory, or fail in every episode.
 """
 
 import functools
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from vla_eval.errors import RecipeError
 
+MAX_DEPTH = 50  # of nesting: what this program writes is at most 7 deep
+MAX_COUNT = 2**63 - 1
 MAX_SEED = 2**32 - 1  # of numpy's `RandomState`, from which ManiSkill takes its generators
 MAX_EPISODES = 1_000_000  # in one run folder: its plan and its records are held in memory
 MAX_PROCESSES = 1024
@@ -26,9 +29,21 @@ class Bounds(NamedTuple):
     """Least and most, both allowed: `Annotated[int, Bounds(1, 9)]`."""
 
     least: float
-    most: float
+    most: float = math.inf
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:  # Any: pydantic's own types
+        """Return pydantic's description of the annotation; that of a number with its bounds."""
+        schema = handler(source)
+        if schema["type"] not in ("int", "float"):
+            return schema
+        return {**schema, "ge": self.least} | ({} if math.isinf(self.most) else {"le": self.most})
 
 
+Count = Annotated[int, Bounds(0, MAX_COUNT)]
+Positive = Annotated[int, Bounds(1, MAX_COUNT)]
+Rate = Annotated[float, Bounds(0.0, 1.0)]
+Seconds = Annotated[float, Bounds(0.0)]
+Distance = Annotated[float, Bounds(0.0)]
 Episodes = Annotated[int, Bounds(1, MAX_EPISODES)]
 Steps = Annotated[int, Bounds(1, MAX_STEPS)]
 TrainingSteps = Annotated[int, Bounds(1, MAX_TRAINING_STEPS)]

@@ -2,23 +2,22 @@
 
 Strict means: no unknown field, no field twice, no text where a list or a number is expected, no
 `true` where a number is expected, no number that is infinite. A mistyped name or value is an error,
-never a default.
+never a default. Not by pydantic: of a union it names the branches, not what the field may be, and every verb
+would wait 0.15 s for it.
 """
 
 import dataclasses
 import functools
 import math
-import reprlib
 import types
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
+from vla_eval.strict.bounds import MAX_DEPTH
+from vla_eval.strict.json_text import WORDS, shown, wrong
 from vla_eval.strict.renamed import current_names, use_current_names, warn_renamed
-from vla_eval.strict.yaml_data import MAX_DEPTH
 from vla_eval.strict.yaml_data import load_yaml as load_yaml
-
-_short = reprlib.Repr(maxstring=80, maxlist=8, maxdict=8, maxother=80, maxlong=30).repr
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
@@ -39,9 +38,9 @@ def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
     return decoded
 
 
-def check_value(hint: Any, value: object, *, path: str) -> None:  # Any: a type annotation
-    """Raise `RecipeError` unless the value is what the annotation says; `path` names it in the message."""
-    _decoded(hint, value, path=path)
+def check_value(hint: Any, value: object, *, path: str) -> Any:  # Any: a type annotation, and such a value
+    """Return the value as the annotation says, or raise `RecipeError`; `path` names it in the message."""
+    return _decoded(hint, value, path=path)
 
 
 def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: str) -> None:
@@ -64,7 +63,7 @@ def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: 
             data[step.name] = {}
         child = data[step.name]
         if not isinstance(child, dict):
-            raise RecipeError(f"{where}: '{step.name}' is {_short(child)}, which has no fields.")
+            raise RecipeError(f"{where}: '{step.name}' is {shown(child)}, which has no fields.")
         data = child
     _rename(steps[-1], data)
     data[steps[-1].name] = value
@@ -160,7 +159,7 @@ def _finite(value: float, *, path: str) -> float:
     except OverflowError:  # a whole number of more than 308 digits
         number = math.inf
     if not math.isfinite(number):
-        raise RecipeError(f"'{path}': expected a finite number, found {_short(value)}.")
+        raise RecipeError(f"'{path}': expected a finite number, found {shown(value)}.")
     return number
 
 
@@ -201,8 +200,7 @@ def _wrong(path: str, expected: str, value: object) -> str:
         hint = f" Write it in brackets: [{value:.80}]."
     elif "number" in expected and isinstance(value, str) and _reads_as_number(value):
         hint = " Write it without quotes or leading zeros, with a point and a sign in the exponent: 1.0e-3."
-    found = _TYPE_WORDS.get(type(value), "something else")
-    return f"'{path}': expected {expected}, found {_short(value)} ({found}).{hint}"
+    return wrong(path, expected, value) + hint
 
 
 def _reads_as_number(text: str) -> bool:
@@ -211,18 +209,6 @@ def _reads_as_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-_TYPE_WORDS: dict[type, str] = {
-    str: "text",
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    dict: "a mapping",
-    list: "a list",
-    tuple: "a list",
-    type(None): "nothing",
-}
 
 
 def _describe(hint: Any) -> str:  # Any: a type annotation
@@ -236,4 +222,4 @@ def _describe(hint: Any) -> str:  # Any: a type annotation
         return f"a list, each entry {_describe(get_args(hint)[0])}"
     if origin is dict or _is_dataclass_type(hint):
         return "a mapping"
-    return _TYPE_WORDS.get(hint, str(hint))
+    return WORDS.get(hint, str(hint))

@@ -1,7 +1,6 @@
 """The one reader of a checkpoint's JSON, which others wrote. Standard library only.
 
-It returns plain data, as strict as `strict_json` makes it. Whoever reads a field says which type it has,
-with the functions below.
+It returns plain data, as strict as `json_text` makes it. The functions below return a field of one type.
 """
 
 import stat
@@ -9,20 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any  # Any: JSON of another program
 
-from vla_eval.errors import CheckpointError
-from vla_eval.strict.json_text import loads, shown
+from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.strict.decoding import check_value
+from vla_eval.strict.json_text import WORDS as WORDS
+from vla_eval.strict.json_text import loads, shown, wrong
 
 MAX_BYTES = 64 << 20  # the largest that were seen hold statistics of dozens of datasets: under 1 MiB
 FETCH_AGAIN = "Fetch the checkpoint again, from where you trust it."
-WORDS: Mapping[type, str] = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "text",
-    list: "a list",
-    dict: "a mapping",
-    type(None): "nothing",
-}
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -42,7 +34,7 @@ def parse_json(content: bytes, *, where: str) -> dict[str, Any]:
         where: the file, for messages.
 
     Raises:
-        CheckpointError: it is no JSON, or holds something else.
+        CheckpointError: it is not JSON, or holds something else.
     """
     try:
         data = loads(content)
@@ -54,36 +46,26 @@ def parse_json(content: bytes, *, where: str) -> dict[str, Any]:
 
 
 def get_mapping(data: Mapping[str, Any], key: str, *, where: str) -> dict[str, Any]:
-    """Return a field that is a mapping; an empty one if it is absent or null.
-
-    Raises:
-        CheckpointError: it is something else.
-    """
-    value = data.get(key)
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise wrong_type(where, key, "a mapping", value)
-    return value
+    """Return a field that is a mapping; an empty one if it is absent or null. Anything else is refused."""
+    return _get(data, key, dict, where) or {}
 
 
 def get_text(data: Mapping[str, Any], key: str, *, where: str) -> str | None:
-    """Return a field that is text; None if it is absent or null.
+    """Return a field that is text; None if it is absent or null. Anything else is refused."""
+    found: str | None = _get(data, key, str, where)
+    return found
 
-    Raises:
-        CheckpointError: it is something else.
-    """
-    value = data.get(key)
-    if value is not None and not isinstance(value, str):
-        raise wrong_type(where, key, "text", value)
-    return value
+
+def get_texts(data: Mapping[str, Any], key: str, *, where: str) -> list[str]:
+    """Return a field that is a list of texts; an empty one if it is absent or null. Else it is refused."""
+    return list(_get(data, key, tuple[str, ...], where) or ())
 
 
 def get_count(data: Mapping[str, Any], key: str, *, maximum: int, where: str) -> int | None:
     """Return a field that counts something, from 1 to `maximum`; None if it is absent or null.
 
     Raises:
-        CheckpointError: it is something else; true is no 1, and "4" no 4.
+        CheckpointError: it is something else; true is not 1, and "4" not 4.
     """
     value = data.get(key)
     if value is not None and (type(value) is not int or not 1 <= value <= maximum):
@@ -91,26 +73,17 @@ def get_count(data: Mapping[str, Any], key: str, *, maximum: int, where: str) ->
     return value
 
 
-def get_texts(data: Mapping[str, Any], key: str, *, where: str) -> list[str]:
-    """Return a field that is a list of texts; an empty one if it is absent or null.
-
-    Raises:
-        CheckpointError: it is something else.
-    """
+def _get(data: Mapping[str, Any], key: str, hint: Any, where: str) -> Any:  # Any: a type annotation, JSON
     value = data.get(key)
-    if value is None:
-        return []
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise wrong_type(where, key, "a list of texts", value)
-    return value
+    try:
+        return None if value is None else check_value(hint, value, path=key)
+    except RecipeError as exc:
+        raise CheckpointError(f"{where}: {exc} {FETCH_AGAIN}") from exc
 
 
 def wrong_type(where: str, key: str, expected: str, value: object) -> CheckpointError:
     """Return the error for a field of another type."""
-    kind = WORDS.get(type(value), type(value).__name__)
-    return CheckpointError(
-        f"{where}: {key!r:.100}: expected {expected}, found {shown(value)} ({kind}). {FETCH_AGAIN}"
-    )
+    return CheckpointError(f"{where}: {wrong(key, expected, value)} {FETCH_AGAIN}")
 
 
 def _content(path: Path) -> bytes:

@@ -1,27 +1,32 @@
 """Read JSON, and check it against the types of a dataclass. Knows nothing of what the values mean.
 
 Strict means: no field twice, none unknown, none missing, no text where a number is expected, no number that
-is not finite, no nesting without end. Whoever reads says what to do about it.
+is not finite, no nesting without end. The reader says what to do about it. The text is read by `json`, as
+pydantic's own parser accepts a field twice.
 """
 
 import functools
 import json
 import math
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.plain_text import printable
+from vla_eval.strict.bounds import MAX_DEPTH
+from vla_eval.strict.bounds import Count as Count
+from vla_eval.strict.bounds import Distance as Distance
+from vla_eval.strict.bounds import Positive as Positive
+from vla_eval.strict.bounds import Rate as Rate
+from vla_eval.strict.bounds import Seconds as Seconds
 
 if TYPE_CHECKING:
     from pydantic_core import SchemaValidator
 
-MAX_DEPTH = 50  # what this program writes is at most 7 deep, and Python's own limit is 1,000 calls
 TOO_DEEP = f"nesting of more than {MAX_DEPTH} levels"
-MAX_COUNT = 2**63 - 1
 MAX_SHOWN = 80  # characters of what was found
 
 
@@ -46,24 +51,16 @@ class Source:
         return self.error(f"{self.where}: expected {self.what}, found {found} ({problem}). {self.remedy}")
 
 
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Marks a field's annotation with the range of its number: `Annotated[int, Range(0)]`."""
-
-    low: float
-    high: float | None = None
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:  # Any: pydantic's own types
-        """Return pydantic's description of the annotation, with the range."""
-        limits = {"ge": self.low} if self.high is None else {"ge": self.low, "le": self.high}
-        return {**handler(source), **limits}
-
-
-Count = Annotated[int, Range(0, MAX_COUNT)]
-Positive = Annotated[int, Range(1, MAX_COUNT)]
-Rate = Annotated[float, Range(0.0, 1.0)]
-Seconds = Annotated[float, Range(0.0)]
-Distance = Annotated[float, Range(0.0)]
+WORDS: Mapping[type, str] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    list: "a list",
+    tuple: "a list",
+    dict: "a mapping",
+    type(None): "nothing",
+}
 
 
 def read_json(text: str | bytes, source: Source, *, non_finite: bool = False) -> dict[str, Any]:  # Any: JSON
@@ -135,7 +132,7 @@ def read_file(path: Path, source: Source) -> bytes:
 
     Raises:
         FileNotFoundError: there is nothing of this name.
-        VlaEvalError: of `source.error`: it is no file, or cannot be read.
+        VlaEvalError: of `source.error`: it is not a file, or cannot be read.
     """
     try:
         if path.is_symlink() and not path.exists():
@@ -166,7 +163,7 @@ def loads(
         non_finite: see `read_json`.
 
     Raises:
-        ValueError: it is no JSON, or not strict; the message says what was found.
+        ValueError: it is not JSON, or not strict; the message says what was found.
     """
     text = content if isinstance(content, str) else content.decode("utf-8")
     try:
@@ -225,7 +222,7 @@ STRICT_TYPES = frozenset({"int", "float", "bool"})
 
 @functools.cache
 def _validator(cls: Any) -> "SchemaValidator":
-    """Return what checks the types of a dataclass.
+    """Return what checks the types of a dataclass: six times as fast as `decoding`, for files of records.
 
     pydantic's strict mode takes no mapping for a dataclass and no list for a tuple, which JSON has no other
     way to write. So it is the single values that are made strict here.
@@ -255,14 +252,9 @@ def _strict(node: Any) -> Any:  # Any: a part of pydantic's description
 
 
 _EXPECTED = {
-    "int_type": "expected a whole number",
-    "float_type": "expected a number",
-    "bool_type": "expected true or false",
-    "is_instance_of": "expected text",
-    "dataclass_type": "expected a mapping",
-    "dict_type": "expected a mapping",
-    "mapping_type": "expected a mapping",
-    "tuple_type": "expected a list",
+    **{f"{kind.__name__}_type": f"expected {WORDS[kind]}" for kind in (int, float, bool, dict, tuple)},
+    **dict.fromkeys(("dataclass_type", "mapping_type"), f"expected {WORDS[dict]}"),
+    "is_instance_of": f"expected {WORDS[str]}",
     "none_required": "expected null",
 }
 
@@ -277,6 +269,12 @@ def _first_error(exc: Any) -> tuple[str, str]:  # Any: pydantic_core.ValidationE
         return f"the field '{shorten(place)}'", "there is no such field"
     problem = _EXPECTED.get(kind, error["msg"].replace("Input should be", "expected"))
     return f"{shorten(place)} {shown(error['input'])}", problem
+
+
+def wrong(path: str, expected: str, value: object) -> str:
+    """Return what is wrong with a value: what was expected, what was found, of which kind."""
+    kind = WORDS.get(type(value), type(value).__name__)
+    return f"'{path:.100}': expected {expected}, found {shown(value)} ({kind})."
 
 
 def shown(value: object) -> str:

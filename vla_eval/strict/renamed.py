@@ -1,6 +1,6 @@
 """Keep old names of fields in YAML files and of flags working, with one warning that gives the new name.
 
-Knows nothing of what the fields mean. A dataclass names the old field beside the new one:
+Knows nothing of what the fields mean. A dataclass names the old field at the new one:
 `capture: CaptureConfig = field(default_factory=CaptureConfig, metadata=formerly("recording"))`.
 """
 

@@ -12,13 +12,13 @@ import yaml
 from yaml.reader import Reader
 
 from vla_eval.errors import MAX_SHOWN, RecipeError
+from vla_eval.strict.bounds import MAX_DEPTH
 
 _Event = Any  # Any: PyYAML's stubs do not say which fields an event has
 _Mark = Any
 
 MAX_CHARACTERS = 1_000_000  # of a file, and of all its texts once aliases stand for what they name
 MAX_VALUES = 50_000  # some hundred times the longest recipe
-MAX_DEPTH = 50
 MAX_DIGITS = 19  # of a 64-bit number
 INT_RANGE = range(-(2**63), 2**63)
 
@@ -61,7 +61,7 @@ def load_yaml(text: str, *, where: str) -> Any:  # Any: whatever the YAML holds
 
 
 class _RefusedError(Exception):
-    """YAML that is no plain data."""
+    """YAML that is not plain data."""
 
     def __init__(self, problem: str, mark: _Mark) -> None:
         super().__init__(problem)

@@ -39,7 +39,7 @@ class _Appearance:
         configs: list[CameraConfig] = super()._default_sensor_configs  # type: ignore[misc]  # the task's
         for config in configs:
             if config.uid == MOVED_CAMERA:
-                config.pose = Pose.create(self._moved(sapien.Pose(*_one(config.pose))))
+                config.pose = Pose.create(self._moved(config.pose.sp))
         return configs
 
     def _moved(self, pose: sapien.Pose) -> sapien.Pose:
@@ -90,11 +90,6 @@ def turned_hue(rgb: tuple[float, float, float], degrees: float) -> tuple[float, 
     """Return a colour of the same saturation and value whose hue is so much further; grey stays grey."""
     hue, saturation, value = colorsys.rgb_to_hsv(*rgb)
     return colorsys.hsv_to_rgb((hue + degrees / 360) % 1, saturation, value)
-
-
-def _one(pose: Pose) -> tuple[Any, Any]:
-    """Return position and quaternion of a pose of one environment."""
-    return pose.p[0].cpu().numpy(), pose.q[0].cpu().numpy()
 
 
 def _materials(actor: Any) -> Iterator[Any]:

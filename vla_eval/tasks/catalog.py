@@ -26,20 +26,19 @@ from vla_eval.tasks.spec import Suite, TaskSpec
 TASK_GROUP = "vla_eval.tasks"
 TASK_ID = re.compile(r"([A-Za-z]\w*/)?[A-Za-z]\w*(-\w+)*-v\d+", re.ASCII)
 N_MUGS = 3
-_REMEMBER_SUCCESS = "The tool centre point is within 5 cm of the right item and the arm is at rest."
 
 
-def _remember(task: str, entry: str, key: str, *, kwargs: dict[str, int], what: str) -> TaskSpec:
+def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> TaskSpec:
     return TaskSpec(
-        id=task,
+        id=f"{family}{number}-v0",
         version=1,
-        entry_point=f"vla_eval.tasks.remember:{entry}",
+        entry_point=f"vla_eval.tasks.remember:{family}Env",
         kwargs=kwargs,
         horizon_steps=60,
         memory="object",
-        instruction_key=key,
+        instruction_key=family,
         description=f"An item is shown, the table is empty for a while, then {what}",
-        success=_REMEMBER_SUCCESS,
+        success="The tool centre point is within 5 cm of the right item and the arm is at rest.",
         oracle="vla_eval.oracles.hover:CUBES",
         oracle_sees="poses of all items and which one is right; moves once the choice has appeared",
         candidates="items",
@@ -49,34 +48,22 @@ def _remember(task: str, entry: str, key: str, *, kwargs: dict[str, int], what: 
     )
 
 
+_ITEMS = {
+    "RememberColor": "cubes of different colours lie there: reach the one that has the colour shown.",
+    "RememberShape": "blue items of different shapes lie there: reach the one that has the shape shown.",
+}
 _REMEMBER = (
     *(
-        _remember(
-            f"RememberColor{n}-v0",
-            "RememberColorEnv",
-            "RememberColor",
-            kwargs={"n_items": n},
-            what=f"{n} cubes of different colours lie there: reach the one that has the colour shown.",
-        )
+        _remember(family, f"{n}", {"n_items": n}, f"{n} {what}")
+        for family, what in _ITEMS.items()
         for n in (3, 5, 9)
     ),
     *(
         _remember(
-            f"RememberShape{n}-v0",
-            "RememberShapeEnv",
-            "RememberShape",
-            kwargs={"n_items": n},
-            what=f"{n} blue items of different shapes lie there: reach the one that has the shape shown.",
-        )
-        for n in (3, 5, 9)
-    ),
-    *(
-        _remember(
-            f"RememberShapeAndColor{shapes}x{colors}-v0",
-            "RememberShapeAndColorEnv",
             "RememberShapeAndColor",
-            kwargs={"n_shapes": shapes, "n_colors": colors},
-            what=f"items of {shapes} shapes in {colors} colours lie there: reach the one that was shown.",
+            f"{shapes}x{colors}",
+            {"n_shapes": shapes, "n_colors": colors},
+            f"items of {shapes} shapes in {colors} colours lie there: reach the one that was shown.",
         )
         for shapes, colors in ((3, 2), (3, 3), (5, 3))
     ),

@@ -14,7 +14,7 @@ from mani_skill.utils.structs import Actor, Pose
 from vla_eval.errors import TaskArgumentError
 from vla_eval.task_state import PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
-from vla_eval.tasks.objects.bodies import to_vector
+from vla_eval.tasks.objects.bodies import length, to_vector
 from vla_eval.tasks.objects.layout import places_from_right
 
 NO_CHOICE = -1
@@ -122,9 +122,7 @@ class ChoiceEnv(MemoryTableEnv):
         return self._of_target(self._distances_m())
 
     def _distances_m(self) -> torch.Tensor:
-        offsets = self.touch_points_m() - self.tcp_position_m()[:, None, :]
-        distances: torch.Tensor = torch.linalg.norm(offsets, dim=2)
-        return distances
+        return length(self.touch_points_m() - self.tcp_position_m()[:, None, :])
 
     def _of_target(self, per_candidate: torch.Tensor) -> torch.Tensor:
         return self._of_candidate(per_candidate, self.target_index())

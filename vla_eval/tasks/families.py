@@ -5,8 +5,8 @@ of its rows; knows nothing of simulators.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.errors import RecipeError, TaskArgumentError
@@ -19,8 +19,7 @@ CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
 """Arguments that only tasks with candidates have."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Family:
+class Family(NamedTuple):
     """How a family is made.
 
     Attributes:
@@ -38,40 +37,22 @@ class Family:
 
 
 FAMILY_TABLE = (
-    Family(id="RememberColor", row="RememberColor3-v0", open_arguments=("n_items",), min_response_steps=50),
-    Family(id="RememberShape", row="RememberShape3-v0", open_arguments=("n_items",), min_response_steps=50),
-    Family(
-        id="RememberShapeAndColor",
-        row="RememberShapeAndColor3x2-v0",
-        open_arguments=("n_shapes", "n_colors"),
-        min_response_steps=50,
-    ),
-    Family(id="BunchOfColors", row="BunchOfColors3-v0", open_arguments=("n_shown",), min_response_steps=110),
-    Family(id="SeqOfColors", row="SeqOfColors3-v0", open_arguments=("n_shown",), min_response_steps=80),
-    Family(id="ChainOfColors", row="ChainOfColors3-v0", open_arguments=("n_shown",), min_response_steps=80),
+    Family("RememberColor", "RememberColor3-v0", ("n_items",), 50),
+    Family("RememberShape", "RememberShape3-v0", ("n_items",), 50),
+    Family("RememberShapeAndColor", "RememberShapeAndColor3x2-v0", ("n_shapes", "n_colors"), 50),
+    Family("BunchOfColors", "BunchOfColors3-v0", ("n_shown",), 110),
+    Family("SeqOfColors", "SeqOfColors3-v0", ("n_shown",), 80),
+    Family("ChainOfColors", "ChainOfColors3-v0", ("n_shown",), 80),
+    *(Family(f"ShellGame{mode}", f"ShellGame{mode}-v0", (), 85) for mode in ("Touch", "Push", "Pick")),
     *(
-        Family(id=f"ShellGame{mode}", row=f"ShellGame{mode}-v0", open_arguments=(), min_response_steps=85)
-        for mode in ("Touch", "Push", "Pick")
-    ),
-    *(
-        Family(
-            id=f"Intercept{mode}",
-            row=f"Intercept{mode}Medium-v0",
-            open_arguments=("velocity_range_m_s",),
-            min_response_steps=90,
-        )
+        Family(f"Intercept{mode}", f"Intercept{mode}Medium-v0", ("velocity_range_m_s",), 90)
         for mode in ("", "Grab")
     ),
     *(
-        Family(
-            id=f"Rotate{mode}",
-            row=f"Rotate{mode}Pos-v0",
-            open_arguments=("angle_range_rad", "signed"),
-            min_response_steps=90,
-        )
+        Family(f"Rotate{mode}", f"Rotate{mode}Pos-v0", ("angle_range_rad", "signed"), 90)
         for mode in ("Lenient", "Strict")
     ),
-    Family(id="TakeItBack", row="TakeItBack-v0", open_arguments=(), min_response_steps=180),
+    Family("TakeItBack", "TakeItBack-v0", (), 180),
 )
 
 

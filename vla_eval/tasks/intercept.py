@@ -11,7 +11,7 @@ from mani_skill.utils.structs import Pose
 
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, resting_body
+from vla_eval.tasks.objects.bodies import Body, length, resting_body
 from vla_eval.tasks.without_cue import check_positive
 
 GOAL_OFFSET_X_M = 0.2
@@ -27,11 +27,8 @@ class InterceptEnv(RollingBallEnv):
 
     Description: a red ball rolls along y past the robot; 20 cm beyond its lane lies a disc.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: goal 3, ball pose 7, initial velocity 3, linear and angular velocity 3 + 3,
-    tcp to ball 3, ball to goal 3).
+    Observation space: `state` adds goal 3, ball pose 7, initial velocity 3, linear and angular velocity
+    3 + 3, tcp to ball 3, ball to goal 3.
 
     Rewards: dense: 2 for approaching the hit point behind the ball; once there, 5 for the ball approaching
     the goal; 30 if solved.
@@ -89,17 +86,15 @@ class InterceptEnv(RollingBallEnv):
 
     def _hit_distance_m(self) -> torch.Tensor:
         away = -self._ball_to_goal_m()
-        unit = away / torch.linalg.norm(away, dim=1, keepdim=True)
-        hit_point = self.ball.pose.p + HIT_OFFSET_M * unit
-        distance: torch.Tensor = torch.linalg.norm(hit_point - self.tcp_position_m(), dim=1)
-        return distance
+        hit_point = self.ball.pose.p + HIT_OFFSET_M * (away / length(away)[:, None])
+        return length(hit_point - self.tcp_position_m())
 
     def _update_latches(self, step: torch.Tensor) -> None:
         self._hit_point_reached |= self._hit_distance_m() < HIT_REACHED_M
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Read success: the ball is over the disc at this step; changes nothing."""
-        distance = torch.linalg.norm(self._ball_to_goal_m()[:, :2], dim=1)
+        distance = length(self._ball_to_goal_m()[:, :2])
         return {
             "success": distance < self.goal_radius_m,
             "reached_status": self._hit_point_reached.clone(),
@@ -113,7 +108,7 @@ class InterceptEnv(RollingBallEnv):
     def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """Move behind the ball, then push the ball to the goal."""
         reached = self._hit_point_reached
-        to_goal = torch.linalg.norm(self._ball_to_goal_m()[:, :2], dim=1)
+        to_goal = length(self._ball_to_goal_m()[:, :2])
         return {
             "reaching": 2 * nearness(2.0, self._hit_distance_m()) * ~reached,
             "aiming": 5 * nearness(1.0, to_goal) * reached,

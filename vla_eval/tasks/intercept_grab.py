@@ -8,9 +8,8 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness
 
-GRIP_HALF_PLANE_M = (
-    0.04  # the ball lies between the fingers: within this in x and in y of the tool centre point,
-)
+# The ball lies between the fingers: within this in x and in y of the tool centre point,
+GRIP_HALF_PLANE_M = 0.04
 GRIP_HALF_HEIGHT_M = 0.03  # within this in z,
 GRIP_RADIUS_M = 0.04  # within this altogether,
 BALL_DIAMETER_WIDTH_M = 0.04  # and the fingers are at least this far apart.
@@ -24,11 +23,8 @@ class InterceptGrabEnv(RollingBallEnv):
 
     Description: a red ball rolls along y past the robot, which has to catch it between its fingers.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: ball pose 7, initial velocity 3, grasped 1, linear and angular velocity 3 + 3, tcp
-    to ball 3, gripper width 1, velocity of the ball relative to the tcp 3).
+    Observation space: `state` adds ball pose 7, initial velocity 3, grasped 1, linear and angular velocity
+    3 + 3, tcp to ball 3, gripper width 1, velocity of the ball relative to the tcp 3.
 
     Rewards: dense: 10 for approaching the ball; 10 and up to 135 more while it lies between the fingers; up
     to 30 within 2.5 cm of it; 100 while it is grasped; 300 if solved.

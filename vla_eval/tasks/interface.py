@@ -1,9 +1,9 @@
-"""What every task offers to a policy with the Panda: cameras, states, action, control rate.
+"""What every task offers to a policy with the Panda, and arguments that all take: durations, image size.
 
 Knows nothing of simulators: a server of policies has none.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def checked_image_size(size_px: object, *, task: str) -> int:
     """Return the argument `image_size`.
 
     Raises:
-        TaskArgumentError: it is no possible size.
+        TaskArgumentError: the size is impossible.
     """
     if isinstance(size_px, int) and MIN_IMAGE_SIZE_PX <= size_px <= MAX_IMAGE_SIZE_PX:
         return size_px
@@ -36,6 +36,24 @@ def checked_image_size(size_px: object, *, task: str) -> int:
         f"{task}: {IMAGE_SIZE}={size_px!r:.80}: expected a whole number of pixels, {MIN_IMAGE_SIZE_PX} to "
         f"{MAX_IMAGE_SIZE_PX}."
     )
+
+
+StepRange = int | Sequence[int]
+"""A duration in control steps, or a range to draw from per episode."""
+
+
+def step_range(name: str, value: StepRange) -> tuple[int, int]:
+    """Return (least, most) of a duration in control steps given as a number or as a pair.
+
+    Raises:
+        TaskArgumentError: not a whole number ≥ 0, nor a pair of such numbers in order.
+    """
+    pair = (value, value) if isinstance(value, int) else tuple(value)
+    if len(pair) != 2 or not all(isinstance(v, int) and v >= 0 for v in pair) or pair[0] > pair[1]:
+        raise TaskArgumentError(
+            f"{name}={value!r}: expected a number of control steps ≥ 0, or a pair (least, most) of them."
+        )
+    return int(pair[0]), int(pair[1])
 
 
 def cameras(size_px: int = IMAGE_SIZE_PX) -> tuple[CameraSpec, ...]:
@@ -88,7 +106,7 @@ def offered_by(task: TaskSpec, env_kwargs: Mapping[str, object]) -> EnvSpec:
     """Return what a task offers with these arguments, without making its environment.
 
     Raises:
-        TaskArgumentError: the image size is no possible one.
+        TaskArgumentError: the image size is impossible.
         UnknownNameError: there is no such control mode.
     """
     size_px = checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=task.id)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
-from mani_skill.utils.structs import Actor
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
@@ -59,7 +58,10 @@ class ItemChoiceEnv(ChoiceEnv):
         self._check_distractor()
         self._hides_items = self.is_swapped() and not self.gpu_sim_enabled
         uses_decoys = self._hides_items or self.distract_steps > 0
-        self.decoys = [self._build_decoy(item) for item in self.items] if uses_decoys else []
+        self.decoys = [
+            build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
+            for item in (self.items if uses_decoys else ())
+        ]
         self._distractor = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
 
     def _check_distractor(self) -> None:
@@ -72,9 +74,6 @@ class ItemChoiceEnv(ChoiceEnv):
             raise TaskArgumentError(
                 f"distract_steps={self.distract_steps}: every item is right or shown, so none is left for it."
             )
-
-    def _build_decoy(self, item: Item) -> Actor:
-        return build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
 
     def is_swapped(self) -> bool:
         """Return whether another cue than the drawn one is shown."""

@@ -28,8 +28,7 @@ from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm.arm_control import ArmControl
 from vla_eval.tasks.arm.arms import ARMS, Arm
 from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
-from vla_eval.tasks.durations import StepRange, step_range
-from vla_eval.tasks.interface import CAMERA_FOV_RAD, checked_image_size
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
 from vla_eval.tasks.objects.bodies import Body, to_vector
 
 QPOS_NOISE_RAD = 0.02
@@ -52,6 +51,11 @@ class CueSize(NamedTuple):
 
 class MemoryTableEnv(ArmControl):
     """A Panda with a wrist camera at a table, with the phases cue, delay and response.
+
+    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
+
+    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
+    `state` (the same without cameras, and what the task adds).
 
     Args:
         cue_steps: control steps during which the cue is shown; a pair is a range to draw from per episode.

@@ -30,10 +30,8 @@ class RememberEnv(ItemChoiceEnv):
 
     The families below define the items. Everything else is the same:
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: the oracle's numbers, and 3 per item, its position if it is the right one, else 0).
+    Observation space: `state` adds the oracle's numbers, and 3 per item, its position if it is the right
+    one, else 0.
 
     Rewards: dense: reach 1 + slow down 0.5 + stand still 0.5, or 3 if solved; see `docs/tasks.md`.
 

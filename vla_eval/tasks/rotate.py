@@ -29,11 +29,8 @@ class RotateEnv(WithoutCueEnv):
     Description: a blue peg lies on the table in a random orientation. It must be turned about the vertical
     by an angle that is part of each observation. The initial orientation has to be remembered.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, `extra/task_cue`: the
-    target angle, rad, counterclockwise seen from above; two cameras) or `state` (in addition to qpos, qvel,
-    tcp pose: remaining angle 1, peg pose 7).
+    Observation space: `rgb` adds `extra/task_cue`, the target angle, rad, counterclockwise seen from above;
+    `state` adds remaining angle 1, peg pose 7.
 
     Rewards: dense, lenient: 1 for approaching the peg's centre; near it up to 15 for the angle; 5 at the
     angle, 2 at rest there; 25 if solved. Strict: 0.5; near it up to 10 for the position and 35 for

@@ -53,11 +53,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
     that were shown must be touched, in the order shown if the family requires it. After the first touch of a
     wrong cube, or out of order, the episode can no longer succeed; touching a cube again changes nothing.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: vector to the next cube 3, sequence L, and per cube: position 3, touched 1, right 1,
-    next 1).
+    Observation space: `state` adds the vector to the next cube 3, sequence L, and per cube: position 3,
+    touched 1, right 1, next 1.
 
     Rewards: dense, from the response phase on: reach the next cube 1 + slow down 0.5 + 90 per share found
     - 10 per mistake, or 100 if solved; see `docs/tasks.md`.

@@ -14,7 +14,7 @@ from mani_skill.utils.structs import Pose
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
-from vla_eval.tasks.durations import StepRange
+from vla_eval.tasks.interface import StepRange
 from vla_eval.tasks.memory_env import CueSize, Place
 from vla_eval.tasks.objects import mug as mugs
 
@@ -32,8 +32,6 @@ class ShellGameEnv(ChoiceEnv):
 
     Description: a red ball lies at one of three places 20 cm apart (cue), then an upside-down mug
     stands on each of them, one over the ball (response, without a delay).
-
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
 
     Starting state: centre of the row uniform in ±10 cm; the ball's place uniform.
 
@@ -148,8 +146,7 @@ class ShellGameEnv(ChoiceEnv):
 class ShellGameTouchEnv(ShellGameEnv):
     """ShellGameTouch: reach the mug that stands over the ball; see `ShellGameEnv`.
 
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: pose of the right mug 7, of the ball 7, oracle 1).
+    Observation space: `state` adds the pose of the right mug 7, of the ball 7, oracle 1.
 
     Rewards: dense, from the response phase on: reach 1 + slow down 1 + stand still 1; 3 if solved.
 

@@ -11,7 +11,7 @@ import torch
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, yaw_rad
+from vla_eval.tasks.objects.bodies import Body, length, moving_body, resting_body, yaw_rad
 from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
 from vla_eval.tasks.without_cue import check_positive
 
@@ -57,8 +57,7 @@ class ShellGameMoveEnv(ShellGameEnv):
 
     def is_placed(self) -> torch.Tensor:
         """Return (B,) bool: the right mug is within the threshold of its goal."""
-        placed: torch.Tensor = torch.linalg.norm(self._target_to_goal_m(), dim=1) <= self.goal_threshold_m
-        return placed
+        return length(self._target_to_goal_m()) <= self.goal_threshold_m
 
     def _chosen_m(self) -> float:
         """Return the distance by which a mug must have been moved to count as chosen."""
@@ -94,8 +93,7 @@ class ShellGameMoveEnv(ShellGameEnv):
 class ShellGamePushEnv(ShellGameMoveEnv):
     """ShellGamePush: push the mug that stands over the ball forwards; see `ShellGameEnv`.
 
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: goal 3, pose of the right mug 7, of the ball 7, oracle 1).
+    Observation space: `state` adds goal 3, pose of the right mug 7, of the ball 7, oracle 1.
 
     Rewards: dense, from the response phase on: reach the mug 1, bring it to the goal 2 while the tool
     centre point is within 8 cm of it, slow down 0.2 and stand still 0.2 there; 4 if solved.
@@ -142,8 +140,7 @@ class ShellGamePushEnv(ShellGameMoveEnv):
 class ShellGamePickEnv(ShellGameMoveEnv):
     """ShellGamePick: lift the mug that stands over the ball; see `ShellGameEnv`.
 
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: goal 3, pose of the right mug 7, of the ball 7, oracle 1, grasped 1).
+    Observation space: `state` adds goal 3, pose of the right mug 7, of the ball 7, oracle 1, grasped 1.
 
     Rewards: dense, from the response phase on: reach the mug 3; with the tool centre point within 4 cm of
     its centre 2, bring it to the goal 30, slow down 5 and stand still 5 there; 75 if solved.

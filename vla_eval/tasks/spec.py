@@ -57,7 +57,7 @@ class TaskSpec:
         candidates: the kind of the N objects among which the policy chooses; None if there is no choice, and
             for an official task.
         candidate_counts: argument -> its default; their product is N. Empty if there is no choice, or it is
-            not known to controls. A name that is no argument of the task is a constant.
+            not known to controls. A name that is not an argument of the task is a constant.
         several_right: several candidates have to be touched; otherwise one is right.
         seen_in_one_frame: what the control of single frames goes by: a ball that rolls (with the argument
             `velocity_range_m_s`), or a cube dragged onto a disc whose colour is known.

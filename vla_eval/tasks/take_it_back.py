@@ -11,7 +11,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body
+from vla_eval.tasks.objects.bodies import Body, length, moving_body, resting_body
 from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 START_X_M = (-0.05, 0.05)
@@ -35,10 +35,7 @@ class TakeItBackEnv(WithoutCueEnv):
     Description: a green cube lies in front of the robot, behind it a red disc. Once the cube has been on
     the disc, the disc turns violet and the cube must go back to its first position, which is not marked.
 
-    Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
-
-    Observation space: ManiSkill's `rgb` (`agent/qpos`, `agent/qvel`, `extra/tcp_pose`, two cameras) or
-    `state` (in addition: goal 3, cube pose 7, first place 3, goal reached 1).
+    Observation space: `state` adds goal 3, cube pose 7, first place 3, goal reached 1.
 
     Rewards: dense: until the goal is reached, 2 for approaching the point behind the cube, and 5 for the
     cube approaching the goal while the arm is there; then 10 and 15 for the way back; 30 if solved.
@@ -142,8 +139,7 @@ class TakeItBackEnv(WithoutCueEnv):
         self._is_violet = torch.where(mask, violet, self._is_violet)
 
     def _cube_distance_m(self, place: torch.Tensor) -> torch.Tensor:
-        distance: torch.Tensor = torch.linalg.norm((self.cube.pose.p - place)[:, :2], dim=1)
-        return distance
+        return length((self.cube.pose.p - place)[:, :2])
 
     def _in_goal(self) -> torch.Tensor:
         return self._cube_distance_m(self._goal_position) < self.goal_radius_m

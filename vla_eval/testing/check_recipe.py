@@ -32,7 +32,7 @@ def check_recipe(
         policy: what `eval --policy` takes.
         task: the task whose cameras, states and actions it is given.
         report: called with each requirement that is met, as soon as that is known.
-        say: gets what differs from the policy's training and is no requirement, line by line.
+        say: gets what differs from the policy's training and is not a requirement, line by line.
 
     Returns:
         The requirements, all of which are met.

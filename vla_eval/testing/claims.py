@@ -7,13 +7,9 @@ from vla_eval.errors import ConformanceError
 
 
 def claim(kept: bool, promise: str, found: str = "", *, advice: str = "") -> None:
-    """Raise `ConformanceError` unless the requirement is met.
+    """Raise `ConformanceError` unless the requirement, said by `promise`, is kept.
 
-    Args:
-        kept: whether it is met.
-        promise: the requirement as a sentence.
-        found: what was found instead.
-        advice: how to meet it, as a sentence.
+    The message has what was found instead, and an advice how to meet it.
     """
     if not kept:
         raise ConformanceError(f"{promise}{f' Found: {found}.' if found else ''}{advice and f' {advice}'}")

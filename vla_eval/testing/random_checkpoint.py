@@ -23,7 +23,7 @@ from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE
 from vla_eval.models.families import family_of
 from vla_eval.models.family import imported
-from vla_eval.models.shared.weight_file import write_weights
+from vla_eval.models.weights.file import write_weights
 from vla_eval.training.dry_run import assumed_config
 from vla_eval.training.model import tokenizer_from
 

@@ -9,7 +9,7 @@ they are in memory once, when they are loaded.
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
@@ -105,8 +105,7 @@ def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Seque
         )
     config = read_config(folder, LoadOptions(device=options.device, dtype=options.dtype))
     estimated = _estimate(make_unfilled_policy(config), options.device, before, trained=None)
-    written = _Written(recipe=None, peaks={}, seconds={}, estimated=estimated)
-    return _measured(str(path), folder, config, options, written, before, batches)
+    return _measured(_Loading(str(path), folder, config, options), before, estimated, batches)
 
 
 def _rehearse(
@@ -122,52 +121,60 @@ def _rehearse(
     reset_peak()
     started = time.perf_counter()
     write_checkpoint(folder, config, policy, tokenizer)
-    written = _Written(
+    written = _Loading(
+        name,
+        folder,
+        config,
+        options,
         recipe=recipe,
         seconds={"write": time.perf_counter() - started},
         peaks={"write": peak_rss_bytes()},
-        estimated=estimated,
     )
     del policy
-    return _measured(name, folder, config, options, written, before, batches)
+    return _measured(written, before, estimated, batches)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Written:
-    recipe: FinetuneRecipe | None
-    peaks: dict[str, int]
-    seconds: dict[str, float]
-    estimated: Estimated
+@dataclass
+class _Loading:
+    """What is loaded, and what was measured up to now, by stage."""
+
+    name: str
+    folder: Path
+    config: Any
+    options: RehearsalOptions
+    recipe: FinetuneRecipe | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    peaks: dict[str, int] = field(default_factory=dict)
 
 
-def _measured(
-    name: str,
-    folder: Path,
-    config: Any,
-    options: RehearsalOptions,
-    written: _Written,
-    before: int,
-    batches: Sequence[int],
-) -> Rehearsed:
-    n_bytes = (folder / WEIGHTS_FILE).stat().st_size
-    limit = limit_bytes(n_bytes)
-    _check_memory(limit, options.device)
-    acted = _load_and_act(folder, config, options, written.recipe, batches)
+def _measured(one: _Loading, before: int, estimated: Estimated, batches: Sequence[int]) -> Rehearsed:
+    n_bytes = (one.folder / WEIGHTS_FILE).stat().st_size
+    limit, device = limit_bytes(n_bytes), one.options.device
+    _check_memory(limit, device)
+    model = _load_and_act(one)
+    on_device = peak_device_bytes(device)
+    parameters = sum(x.numel() for x in model.parameters())
+    trained = None
+    if one.recipe is not None:  # its adapters get no memory
+        adapted = with_adapters(model, one.recipe)
+        trained = sum(x.numel() for x in adapted.parameters() if x.requires_grad)
+        del adapted
+    del model
     return Rehearsed(
-        recipe=name,
-        kind=config.type,
-        dtype=str(getattr(config, "dtype", "float32")),
-        device=options.device,
-        parameters=acted.parameters,
-        trained=acted.trained,
+        recipe=one.name,
+        kind=one.config.type,
+        dtype=str(getattr(one.config, "dtype", "float32")),
+        device=device,
+        parameters=parameters,
+        trained=trained,
         bytes=n_bytes,
-        peak_rss_bytes={**written.peaks, **acted.peaks},
-        peak_device_bytes=acted.peak_device_bytes,
-        seconds={**written.seconds, **acted.seconds},
-        inferences_per_second=acted.inferences_per_second,
+        peak_rss_bytes=one.peaks,
+        peak_device_bytes=on_device,
+        seconds=one.seconds,
+        inferences_per_second=_rates(one.folder, device, batches) if batches else {},
         before_bytes=before,
         limit_bytes=limit,
-        estimated=written.estimated,
+        estimated=estimated,
     )
 
 
@@ -195,16 +202,6 @@ def _estimate(policy: Any, device: str, before: int, *, trained: int | None) -> 
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Acted:
-    parameters: int
-    trained: int | None
-    peaks: dict[str, int]
-    peak_device_bytes: int | None
-    seconds: dict[str, float]
-    inferences_per_second: dict[int, float]
-
-
 class _Timed:
     """A policy whose inferences are timed."""
 
@@ -222,57 +219,34 @@ class _Timed:
         return chunk
 
 
-def _load_and_act(
-    folder: Path,
-    config: Any,
-    options: RehearsalOptions,
-    recipe: FinetuneRecipe | None,
-    batches: Sequence[int],
-) -> _Acted:
-    """Load through the strict door of an evaluation, and run one episode on the fake simulator."""
+def _load_and_act(one: _Loading) -> Any:
+    """Load by an evaluation's strict door, run an episode on the fake simulator; return the model."""
     env = make_env(
         EnvSettings(
             task=TASK, kwargs={"horizon_steps": N_STEPS}, simulator="fake", cameras=tuple(CAMERA_KEYS)
         )
     )
-    n_action_steps = int(getattr(config, "n_action_steps", 1))
+    n_action_steps = int(getattr(one.config, "n_action_steps", 1))
     chunking = ChunkingSpec(n_action_steps=min(n_action_steps, N_STEPS // 2))
     context = PolicyContext(name="rehearsal", env=env.spec, chunking=chunking, n_candidates=3)
-    cameras = _cameras(config)
+    cameras, device = _cameras(one.config), one.options.device
     reset_peak()
-    reset_device_peak(options.device)
+    reset_device_peak(device)
     started = time.perf_counter()
-    dtype: Any = options.dtype
+    dtype: Any = one.options.dtype
     loaded = make_lerobot(
-        context, checkpoint=str(folder), device=options.device, dtype=dtype, cameras=cameras, batch=False
+        context, checkpoint=str(one.folder), device=device, dtype=dtype, cameras=cameras, batch=False
     )
-    seconds = {"load": time.perf_counter() - started}
-    peaks = {"load": peak_rss_bytes()}
+    one.seconds["load"], one.peaks["load"] = time.perf_counter() - started, peak_rss_bytes()
     reset_peak()
     timed: Any = _Timed(loaded)
     start = EpisodeStart(slot=0, task=TASK, seed=1, run=0, instruction="pick the cube", horizon_steps=N_STEPS)
     policy: Policy = timed
     (record,) = rollout(env, policy, [start], RolloutSettings(chunking=chunking))
     assert record.error is None  # else it was raised
-    peaks["act"], of_device = peak_rss_bytes(), peak_device_bytes(options.device)
-    seconds |= {"first_inference": timed.seconds[0], "second_inference": timed.seconds[1]}
-    model = loaded._loaded.policy
-    n_parameters = sum(x.numel() for x in model.parameters())
-    trained = None if recipe is None else _n_trained(model, recipe)
-    del loaded, timed, policy, model
-    return _Acted(
-        parameters=n_parameters,
-        trained=trained,
-        peaks=peaks,
-        peak_device_bytes=of_device,
-        seconds=seconds,
-        inferences_per_second=_rates(folder, options.device, batches) if batches else {},
-    )
-
-
-def _n_trained(model: Any, recipe: FinetuneRecipe) -> int:
-    """Return how many parameters of a loaded model the recipe trains; its adapters get no memory."""
-    return sum(x.numel() for x in with_adapters(model, recipe).parameters() if x.requires_grad)
+    one.peaks["act"] = peak_rss_bytes()
+    one.seconds |= {"first_inference": timed.seconds[0], "second_inference": timed.seconds[1]}
+    return loaded._loaded.policy
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What a rehearsal measured, beside what was estimated before. Knows no models."""
+"""What a rehearsal measured, and what was estimated before. Knows no models."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

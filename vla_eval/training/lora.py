@@ -9,7 +9,7 @@ from lerobot.policies.factory import get_policy_class
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.models.families import family_of
-from vla_eval.models.shared.trainable import check_lora
+from vla_eval.models.weights.trainable import check_lora
 
 
 def peft_config(recipe: FinetuneRecipe, policy: Any) -> PeftConfig | None:

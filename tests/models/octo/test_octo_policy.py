@@ -31,7 +31,7 @@ from vla_eval.models.octo.configuration_octo import TRAINED, MikasaOctoConfig
 from vla_eval.models.octo.conversion import octo_config
 from vla_eval.models.octo.language import PromptEmbeddings
 from vla_eval.models.octo.modeling_octo import MikasaOctoPolicy
-from vla_eval.models.shared.trainable import trainable
+from vla_eval.models.weights.trainable import trainable
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.storage.run_folder import read_run

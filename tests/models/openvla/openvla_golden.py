@@ -16,7 +16,7 @@ from vla_eval.models.openvla.sizes import N_BINS, NetworkOptions, NetworkSizes
 from vla_eval.models.openvla.vision import DINO_MLP_RATIO
 from vla_eval.models.openvla.weight_names import to_ours
 from vla_eval.models.shared.prompts import Prompts
-from vla_eval.models.shared.weights import put_weights
+from vla_eval.models.weights.exact import put_weights
 
 FOLDER = Path(__file__).parents[2] / "golden" / "openvla_oft"
 TOLERANCE = 2e-5  # absolute, float32 on CPU; from the README of the golden files

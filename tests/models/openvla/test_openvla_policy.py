@@ -18,7 +18,7 @@ from vla_eval.models.openvla.sizes import NetworkSizes
 from vla_eval.models.shared.language_processors import byte_tokenizer
 from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalization, Normalizer
-from vla_eval.models.shared.trainable import check_lora, trainable
+from vla_eval.models.weights.trainable import check_lora, trainable
 from vla_eval.training.dataset import training_dataset
 
 

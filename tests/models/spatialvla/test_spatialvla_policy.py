@@ -20,13 +20,13 @@ from vla_eval.errors import (
 )
 from vla_eval.models.shared.images import Size, resize_bicubic
 from vla_eval.models.shared.language_processors import byte_tokenizer
-from vla_eval.models.shared.trainable import check_lora, trainable
 from vla_eval.models.spatialvla.action_grid import uniform_grid
 from vla_eval.models.spatialvla.action_tokens import to_tokens
 from vla_eval.models.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
 from vla_eval.models.spatialvla.grid_refit import refitted
 from vla_eval.models.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.models.spatialvla.prompt import finished, prompt_text
+from vla_eval.models.weights.trainable import check_lora, trainable
 from vla_eval.training.dataset import training_dataset
 
 
@@ -109,7 +109,7 @@ class TestConfiguration:
             ({"inference_attention": "bidirectionl"}, "Did you mean 'bidirectional'"),
             ({"action_grid": "refited"}, "Did you mean 'refitted'"),
             ({"camera_fov_rad": 90.0}, r"radians in \(0, π\)"),
-            ({"pictures": []}, "`pictures` is empty"),
+            ({"pictures": []}, r"pictures is \[\], expected the fields"),
             ({"action_grid": "kept"}, "no base with a grid"),
         ],
     )

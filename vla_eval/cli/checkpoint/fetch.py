@@ -9,7 +9,7 @@ from vla_eval.models.families import bases
 
 FETCH = "fetch"
 DESCRIPTION = """Fetch a published checkpoint that recipes start from, check every file, and convert it where
-needed. It shows the licence, and the size beside the free disk, before it fetches. The same command again
+needed. It shows the licence, and the size and the free disk, before it fetches. The same command again
 resumes, or checks what is there. Names: """
 
 

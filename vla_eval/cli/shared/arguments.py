@@ -202,6 +202,18 @@ def read_config[T](
     return decode(cls, data, where="command line")
 
 
+def api_key_of(args: argparse.Namespace) -> str | None:
+    """Return the key that the environment variable of `--api-key-env` holds; None without the flag."""
+    if args.api_key_env is None:
+        return None
+    if key := os.environ.get(args.api_key_env):
+        return key
+    raise RecipeError(
+        f"--api-key-env {args.api_key_env}: expected a key in this variable, but the variable "
+        f"'{args.api_key_env}' is not set. Put the server's key into it."
+    )
+
+
 def add_old_flag(
     parser: argparse.ArgumentParser,
     old: str,

@@ -25,7 +25,7 @@ def backend_of(
         notes_kinds: whether results say what kind of machine they are from; else there must be one kind.
 
     Raises:
-        RecipeError: the flag's value is no cluster.
+        RecipeError: the flag's value is not a cluster.
         MissingDependencyError, ClusterError: see `cluster`.
     """
     if args.cluster is None:

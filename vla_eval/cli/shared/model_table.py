@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,34 +29,15 @@ from vla_eval.studies.study import (
 )
 from vla_eval.workers.backend import Backend
 
-FINETUNE_FLAGS = {
-    "dataset": "--dataset",
-    "steps": "--steps",
-    "batch_size": "--batch-size",
-    "run_seed": "--run-seed",
-    "base_checkpoint": "--base-checkpoint",
-    "held_out_every": "--held-out-every",
-    "held_out_episodes": "--held-out-episodes",
-    "overrides": "--set",
-}
-EVAL_FLAGS = {
-    "protocol": "--protocol",
-    "dry_run": "--dry-run",
-    "steps_per_second": "--steps-per-second",
-    "inference_seconds": "--inference-seconds",
-    "n_action_steps": "--n-action-steps",
-    "episodes": "--episodes",
-    "seed_start": "--seed-start",
-    "runs": "--runs",
-    "overrides": "--set",
-    "capture_video": "--capture-video",
-    "capture_rrd": "--capture-rrd",
-    "serve": "--serve",
-}
-"""Flags that a table does not take, by the name of their value.
-
-`--task` and `--policy` choose a part of it.
-"""
+FINETUNE_FLAGS = (
+    *("dataset", "steps", "batch_size", "run_seed", "base_checkpoint", "held_out_every"),
+    *("held_out_episodes", "overrides"),
+)
+EVAL_FLAGS = (
+    *("protocol", "dry_run", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
+    *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "serve"),
+)
+"""Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
 
 
 def finetune_table(args: argparse.Namespace) -> int:
@@ -189,9 +170,12 @@ def _part(args: argparse.Namespace) -> str:
     return "".join(f" {flag} {' '.join(names)}" for flag, names in flags if names)
 
 
-def _refuse(args: argparse.Namespace, flags: Mapping[str, str]) -> None:
-    values = {flag: getattr(args, name) for name, flag in flags.items()}
-    given = [flag for flag, value in values.items() if not (value is None or value is False or value == [])]
+def _refuse(args: argparse.Namespace, flags: Sequence[str]) -> None:
+    given = [
+        "--set" if name == "overrides" else f"--{name.replace('_', '-')}"
+        for name in flags
+        if not ((value := getattr(args, name)) is None or value is False or value == [])
+    ]
     if given:
         raise RecipeError(
             f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "

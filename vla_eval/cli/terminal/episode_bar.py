@@ -1,4 +1,7 @@
-"""Show how many episodes are done: a bar on a terminal, elsewhere a line from time to time."""
+"""Show how many episodes are done: a bar on a terminal, elsewhere a line from time to time.
+
+The bar is tqdm's; in a file, tqdm would write a bar per second, and rich nothing until the end.
+"""
 
 import sys
 import time

@@ -210,7 +210,7 @@ def _build(source: FrameSource, final: Path) -> None:
         raise DatasetError(
             f"{_decoded_size(source)}, but {free / MIB:.0f} MiB are free at {final.parent}: {_MORE_ROOM}."
         )
-    # Whoever made these was killed: we have the lock.
+    # The process that made these was killed: we have the lock.
     for stale in final.parent.glob(f"{final.name}.*.tmp"):
         shutil.rmtree(stale, ignore_errors=True)
     draft = final.with_name(f"{final.name}.{os.getpid()}.tmp")

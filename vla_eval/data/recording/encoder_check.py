@@ -17,10 +17,11 @@ OF_A_DEVICE = (
 ALIASES = {"av1": "libsvtav1"}  # lerobot's
 SIDE_PX, FPS = 128, 20  # of what tasks render
 N_COLOURS = 3
+N_FRAMES = 4  # x265 sometimes fails to end a video of one or two
 
 
 def check_encoder(settings: EncoderSettings) -> None:
-    """Encode one frame, unless the encoder is a device's; `RecipeError` if it takes no such settings."""
+    """Encode some frames, unless the encoder is a device's; `RecipeError` if it takes no such settings."""
     name = ALIASES.get(settings.vcodec, settings.vcodec)
     known = (*SOFTWARE, *OF_A_DEVICE)
     if name not in known:
@@ -43,7 +44,7 @@ def check_encoder(settings: EncoderSettings) -> None:
             "of these, or another encoder.vcodec. yuv444p keeps the colour of every pixel."
         )
     try:
-        _encode_one_frame(name, settings)
+        _encode_some_frames(name, settings)
     except av.FFmpegError as exc:
         raise RecipeError(
             f"encoder: '{name}' does not take pix_fmt {settings.pix_fmt} with crf {settings.crf} and g "
@@ -51,10 +52,11 @@ def check_encoder(settings: EncoderSettings) -> None:
         ) from exc
 
 
-def _encode_one_frame(name: str, settings: EncoderSettings) -> None:
+def _encode_some_frames(name: str, settings: EncoderSettings) -> None:
     options = {"g": str(settings.g), "crf": str(settings.crf)}
     with av.open(io.BytesIO(), "w", format="mp4") as container:
         stream: Any = container.add_stream(name, FPS, options=options)  # Any: a VideoStream
         stream.pix_fmt, stream.width, stream.height = settings.pix_fmt, SIDE_PX, SIDE_PX
-        container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
+        for _ in range(N_FRAMES):
+            container.mux(stream.encode(av.VideoFrame(SIDE_PX, SIDE_PX, "rgb24")))
         container.mux(stream.encode())

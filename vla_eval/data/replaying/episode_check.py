@@ -1,4 +1,4 @@
-"""Compare an episode that was done again with what a dataset says of it. Knows nothing of simulators.
+"""Compare an episode that was done again with its record in a dataset. Knows nothing of simulators.
 
 Every function returns sentences, one per mismatch; none: all is as it should be.
 """

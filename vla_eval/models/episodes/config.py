@@ -3,18 +3,31 @@
 A training sample is an episode. Knows no network.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar  # lerobot is untyped
+from typing import ClassVar  # lerobot is untyped
 
-from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.features import STATE_NAMES
 from vla_eval.models.shared.ported_config import PortedConfig
+from vla_eval.strict.bounds import check_bounds, require
 
 STATE = len(STATE_NAMES["eef"])  # position, two columns of a rotation matrix, gripper
 POSITION_SCALE = 5.0  # metres of the workspace to numbers of about 1
 SPACE = 3  # numbers of a position, and of the translation with which an action begins
 SENTENCES = ("none", "words")
 """`words`: which words are in it, see `sentence.SentenceEncoder`."""
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "window_steps": (1, math.inf),
+    **dict.fromkeys(("late_steps", "erase_warmup_episodes", "shift_px"), (0, math.inf)),
+    **dict.fromkeys(("decision_share", "exchange_share", "erase_share"), (0, 1)),
+}
+NEEDS = {
+    "erase_share": "decision_share",
+    "erase_warmup_episodes": "erase_share",
+    "waits_beyond_decision": "masks_beyond_decision",
+}
+"""Field -> the field without which it does nothing."""
 
 
 @dataclass
@@ -99,30 +112,13 @@ class EpisodeConfig(PortedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.window_steps is not None and self.window_steps < 1:
-            raise RecipeError(f"window_steps is {self.window_steps}, expected a number ≥ 1 or null")
+        self.check_choice("sentence", SENTENCES)
+        check_bounds(self, BOUNDS)
         for name in ("first_action_weight", "waiting_share"):
-            if not 0 < getattr(self, name) <= 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in (0, 1]")
-        if self.sentence not in SENTENCES:
-            raise unknown_name("sentence", self.sentence, SENTENCES, where=f"policy ({self.type})")
-        for name in ("decision_share", "exchange_share", "erase_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
-        if self.erase_share and not self.decision_share:
-            raise RecipeError("decision_share is 0, expected more: erase_share is of episodes that end there")
-        if self.erase_warmup_episodes < 0:
-            raise RecipeError(
-                f"erase_warmup_episodes is {self.erase_warmup_episodes}, expected a number of samples ≥ 0"
-            )
-        if self.erase_warmup_episodes and not self.erase_share:
-            raise RecipeError("erase_share is 0, expected more: erase_warmup_episodes is of what is erased")
-        if self.shift_px < 0:
-            raise RecipeError(f"shift_px is {self.shift_px}, expected a number of pixels ≥ 0")
-        if self.late_steps < 0:
-            raise RecipeError(f"late_steps is {self.late_steps}, expected a number ≥ 0")
-        if self.waits_beyond_decision and not self.masks_beyond_decision:
-            raise RecipeError("waits_beyond_decision is true, expected masks_beyond_decision to be true, too")
+            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "a number in (0, 1]")
+        for name, needed in NEEDS.items():
+            met = bool(getattr(self, needed)) or not getattr(self, name)
+            require(met, needed, getattr(self, needed), f"it to be set: {name} does nothing without it")
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
@@ -133,9 +129,7 @@ class EpisodeConfig(PortedConfig):
                 f"'{self.type}' needs the state 'eef' of {STATE} numbers, found "
                 f"{self.robot_state_feature.shape}: record with state: eef"
             )
-        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
-        if len(shapes) != 1:
-            raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
+        self.check_one_size()
 
     @property
     def reads_sentence(self) -> bool:
@@ -166,7 +160,3 @@ class EpisodeConfig(PortedConfig):
     def action_delta_indices(self) -> list[int]:
         """A chunk for each frame of the window."""
         return list(range(1 - self.n_window_steps, self.chunk_size))
-
-    def get_scheduler_preset(self) -> Any:
-        """Return lerobot's configuration of the schedule."""
-        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)

@@ -1,7 +1,7 @@
 """The memory of several episodes in one pass: every row is shown its own frames, one control step at a time.
 
 Rows have different numbers of new frames. Each step is a pass with all rows, and a row without a frame at
-that step keeps its memory: what a row remembers is the same bits whoever is in the other rows. Knows nothing
+that step keeps its memory: what a row remembers is the same bits whatever the other rows are. Knows nothing
 of slots, observations or actions.
 """
 
@@ -50,13 +50,8 @@ def recall(
 ) -> Memory:
     """Return the memory (B, …) after all unseen frames of the episodes in the rows.
 
-    Args:
-        policy: its `remember` may change the memory that it is given in place.
-        rows: the episode of each row; its memory is one that `memory_of` returned, or None.
-        preprocess: from frames (T, …) or (…), one per row, to the batch that the policy reads.
-
-    Raises:
-        SpecMismatchError: the policy's memory does not have a row for each episode.
+    `preprocess` makes the batch that the policy reads of frames (T, …) or (…), one per row. `remember` may
+    change the memory that it is given in place.
     """
     singly = remembers_singly(policy)
     first = policy.begin_memory(len(rows))

@@ -14,11 +14,7 @@ REWARD_PADDING_KEY = f"{REWARD_KEY}_is_pad"
 
 
 def rewards_in(batch: Mapping[str, Tensor], kind: RewardKind) -> Tensor:
-    """Return the rewards (B, T) at the steps that the policy's `reward_delta_indices` name, 0 in padding.
-
-    Raises:
-        ValueError: the batch has none, or they are not of the kind that the policy is trained on.
-    """
+    """Return the rewards (B, T) of a kind at the policy's `reward_delta_indices`, 0 in padding."""
     if REWARD_PADDING_KEY not in batch:
         raise ValueError(
             f"a batch without '{REWARD_KEY}' at several steps: the dataset has no rewards, or the policy's "

@@ -73,19 +73,16 @@ class Episode:
         return {**frames, **{f"{key}_is_pad": is_pad for key in frames}}
 
     def seed(self) -> int:
-        """Return the seed of the next inference; the same wherever and beside whatever it runs."""
+        """Return the seed of the next inference; the same wherever and with whatever it runs."""
         start = self.start
         rng = generator(start.seed, Stream.POLICY, zlib.crc32(start.task.encode()), start.run, self.step)
         return int(rng.integers(1 << N_SEED_BITS))
 
 
 def in_rows(episodes: Sequence[Episode], n_rows: int) -> list[Episode]:
-    """Return which episode each row of a pass computes.
+    """Return which episode each row of a pass computes; raise if there is no such row, or two want one.
 
     A row that nobody is due for repeats another one, so that the pass keeps its shape.
-
-    Raises:
-        InvalidActionError: a row is beyond the pass, or two episodes have the same one.
     """
     due: dict[int, Episode] = {}
     for episode in episodes:

@@ -59,10 +59,7 @@ def said_at_each_step(
 ) -> Tensor | None:
     """Return (B, T, outputs) of the sentences of B episodes, the same at each step.
 
-    None for a policy without an encoder, which reads none.
-
-    Raises:
-        MissingInstructionError: the batch has no sentences, or one has no word.
+    None for a policy without an encoder, which reads none; each sentence has to have a word.
     """
     if encoder is None:
         return None

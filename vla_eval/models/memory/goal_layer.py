@@ -24,7 +24,7 @@ place stands out, and minus how unlike its colour is to the one asked for."""
 PLACE_SCALE = 4.0  # the table's things lie within a part of an image of [-1, 1]: to numbers of about 1
 LEAST_HEIGHT_M = 0.02
 LEAST_ERROR_M2 = 1e-8  # a camera without error would be believed alone
-KEPT_PER_BATCH = 0.95  # of what was known of errors and evidence before
+KEPT_PER_BATCH = 0.95  # of the earlier estimates of errors and evidence
 TRUST_SCALE = 10.0  # so that an optimizer's steps of 0.002 stop listening within some hundred
 
 

@@ -35,9 +35,8 @@ class JointLayer(nn.Module):
     def forward(self, actions: Tensor, state: Tensor) -> Tensor:
         """Return actions (N, chunk, N_JOINTS + rest of an action).
 
-        Args:
-            actions: (N, chunk, SPACE + …) with the translation from the present place first.
-            state: (N, state) in SI units: the tool's position, two columns of its rotation matrix, ….
+        Those that are given begin with a translation from the present place; the state (N, state) begins with
+        the tool's position in metres and two columns of its rotation matrix.
         """
         place_m = state[:, None, :SPACE] + STEP_M * actions[..., :SPACE]
         turned = state[:, None, SPACE : SPACE + ROTATION].expand(-1, actions.shape[1], -1)

@@ -1,4 +1,4 @@
-"""Sizes of the positive control's network, and what is known of a place in an image. Without torch."""
+"""Sizes of the positive control's network, and the numbers of a place in an image. Without torch."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ from vla_eval.models.episodes.config import SPACE
 
 RGB, PLACE = 3, 2  # numbers of a colour, of a place in an image
 APART = 1  # one number: how much a place stands out
-KNOWN = APART + RGB + PLACE  # what is known of a place beside its learned features, in this order
+KNOWN = APART + RGB + PLACE  # known of a place in addition to its learned features, in this order
 SPOTS = 4  # spots along a place's edge
 HALVES = 2  # along its edge: of each quarter of a place one spot is described
 QUARTERS = HALVES**2

@@ -21,7 +21,7 @@ class Places(NamedTuple):
 
     Attributes:
         features: (N, P, channels) learned ones of each place.
-        spots: (N, P · QUARTERS, KNOWN) what is known of one spot of each quarter, place by place.
+        spots: (N, P · QUARTERS, KNOWN) the known numbers of one spot of each quarter, place by place.
     """
 
     features: Tensor
@@ -38,7 +38,7 @@ class Places(NamedTuple):
 
 
 class VisionEncoder(nn.Module):
-    """One camera's image to features of places; beside them what is known of one spot of each quarter.
+    """One camera's image to features of places, and the known numbers of one spot of each quarter.
 
     It is the spot, half of the quarter's edge wide, whose colour stands out most from the image's: a cube
     of 4 pixels keeps its colour in a place of 8, and so does the one beside it.
@@ -93,7 +93,7 @@ def standing_out(colors: Tensor) -> Tensor:
 
 
 class Keys(nn.Module):
-    """What of a place counts when it is looked for: learned numbers, and what is known of it."""
+    """What of a place counts when it is looked for: learned numbers, and the known ones."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()

@@ -204,10 +204,6 @@ class MikasaOctoConfig(PortedConfig):
         """A chunk for each frame of the window."""
         return list(range(1 - self.window, self.chunk_size))
 
-    def get_scheduler_preset(self) -> Any:
-        """Return lerobot's configuration of the schedule."""
-        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=0.0)
-
 
 PROMPT_TOKENS, FRAME_TOKENS = 16, 337  # docs/octo.md
 

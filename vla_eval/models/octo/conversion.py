@@ -17,11 +17,7 @@ from vla_eval.models.shared.original import Original, stated_gripper, with_featu
 
 
 def read_original(source: Path, options: OctoOptions) -> Original:
-    """Read the original's folder: parameters and `dataset_statistics.json`.
-
-    Raises:
-        CheckpointError: something is missing, or too much.
-    """
+    """Read the original's folder: parameters and `dataset_statistics.json`."""
     of_size = {} if options.size is None else bases()[f"octo_{options.size}"].fields
     named = {} if options.tokenizer is None else {"tokenizer_name": options.tokenizer}
     encoding = stated_gripper(source, options.gripper)

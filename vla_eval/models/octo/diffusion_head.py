@@ -68,7 +68,7 @@ def cosine_schedule(n_steps: int) -> Schedule:
 
 
 class ResidualBlock(nn.Module):
-    """A norm, four times the width, and back, beside a shortcut."""
+    """A norm, four times the width, and back, with a shortcut."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.weights import listed
+from vla_eval.models.weights.exact import listed
 
 TRUNK = "octo_transformer."
 HEAD = "heads_action.diffusion_model."

@@ -59,11 +59,7 @@ class PromptEmbeddings:
 
     @torch.no_grad()
     def __call__(self, encoder: nn.Module, tokens_BL: Tensor, mask_BL: Tensor) -> Tensor:
-        """Return (B, L, width) of tokens, whose mask is True where they are not padding.
-
-        Raises:
-            MissingInstructionError: a row has no token.
-        """
+        """Return (B, L, width) of tokens, whose mask is True where they are not padding; no row is empty."""
         if not bool(mask_BL.any(dim=1).all()):
             raise MissingInstructionError(
                 "an instruction has no tokens: it is empty. Give the task one in prompts/."

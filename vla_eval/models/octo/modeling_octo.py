@@ -26,7 +26,7 @@ from vla_eval.models.shared.images import (
     resize_lanczos3,
 )
 from vla_eval.models.shared.levels import MAX_LEVEL
-from vla_eval.models.shared.trainable import set_trainable
+from vla_eval.models.weights.trainable import set_trainable
 
 INDEX_KEY = "index"  # of a frame in the dataset
 

@@ -32,11 +32,7 @@ EXPORT_HINT = (
 
 
 def read_parameters(folder: Path) -> dict[str, Tensor]:
-    """Return the original's parameter tree, flat, from its folder, a step in it, or one file.
-
-    Raises:
-        CheckpointError: there is none, several, or one in a layout that is not read.
-    """
+    """Return the original's parameter tree, flat, from its folder, a step in it, or one file."""
     files = [folder] if folder.is_file() else _parameter_files(folder)
     if len(files) != 1:
         found = ", ".join(str(file) for file in files) or "none"
@@ -48,7 +44,7 @@ def read_parameters(folder: Path) -> dict[str, Tensor]:
     if file.suffix == ".safetensors":
         try:
             return dict(load_file(file))
-        except Exception as exc:  # safetensors raises its own class, which is no public name
+        except Exception as exc:  # safetensors raises a class of its own that is not public
             raise CheckpointError(f"{file}: cannot be read as safetensors ({exc}). Fetch it again.") from exc
     tree = unpack(file.read_bytes(), where=str(file))
     if not isinstance(tree, dict):
@@ -58,11 +54,7 @@ def read_parameters(folder: Path) -> dict[str, Tensor]:
 
 
 def read_statistics(folder: Path, *, dataset: str | None) -> dict[str, list[float]]:
-    """Return the statistics of actions of a dataset: name -> one number per dimension.
-
-    Raises:
-        CheckpointError: there are none, or several and none is named.
-    """
+    """Return the statistics of actions of a dataset, the only one or the named: name -> numbers."""
     data = read_json(folder / STATISTICS_FILE)
     if "action" not in data:
         if dataset is None or dataset not in data:
@@ -99,11 +91,7 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def unpack(data: bytes, *, where: str) -> Any:
-    """Return what msgpack holds, arrays as numpy's.
-
-    Raises:
-        CheckpointError: it is something else, damaged, or has arrays in several parts.
-    """
+    """Return what msgpack holds, arrays, which are whole, as numpy's."""
     try:
         value = msgpack.unpackb(data, ext_hook=_array, strict_map_key=False)
     except (ValueError, TypeError, AttributeError) as exc:  # of damage, types and shapes

@@ -2,62 +2,27 @@
 
 from typing import Any  # lerobot and transformers are untyped
 
-from lerobot.processor import (
-    DeviceProcessorStep,
-    PolicyProcessorPipeline,
-    TokenizerProcessorStep,
-    make_default_policy_processor_steps,
-    policy_action_to_transition,
-    transition_to_policy_action,
-)
+from lerobot.processor import TokenizerProcessorStep
 
 from vla_eval.errors import CheckpointError
 from vla_eval.models.octo.configuration_octo import BYTES_TOKENIZER, MikasaOctoConfig
-from vla_eval.models.shared.processor_steps import DecoderStep, EncoderStep
-
-PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
+from vla_eval.models.shared.language_processors import encoded_processors
 
 
 def make_mikasa_octo_pre_post_processors(
     config: MikasaOctoConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor; lerobot finds this function by its name.
-
-    Raises:
-        CheckpointError: there are no statistics that actions could be normalised by.
-    """
+    """Return pre- and postprocessor, which need statistics; lerobot finds this function by its name."""
     if not dataset_stats:
         raise CheckpointError(
             "Octo's actions are normalised by a dataset's statistics, and none are given. Load a "
             "checkpoint's processors, or fine-tune on a dataset."
         )
-    shared: dict[str, Any] = {**config.encoder_settings, "stats": dataset_stats}
-    steps = make_default_policy_processor_steps(config, dataset_stats)
-    before: Any = PolicyProcessorPipeline(
-        steps=[
-            steps.rename_observations,
-            steps.add_batch_dim,
-            _tokenizer_step(config),
-            DeviceProcessorStep(device=config.device),
-            EncoderStep(**shared),
-        ],
-        name=PREPROCESSOR,
-    )
-    after: Any = PolicyProcessorPipeline(
-        steps=[DecoderStep(**shared), DeviceProcessorStep(device="cpu")],
-        name=POSTPROCESSOR,
-        to_transition=policy_action_to_transition,
-        to_output=transition_to_policy_action,
-    )
-    return before, after
-
-
-def _tokenizer_step(config: MikasaOctoConfig) -> Any:
-    settings: dict[str, Any] = {"max_length": config.language_tokens, "padding": "max_length"}
+    named = config.tokenizer_name != BYTES_TOKENIZER
+    tokenizer = {"tokenizer_name": config.tokenizer_name} if named else {"tokenizer": _bytes_tokenizer()}
     # A lambda where `finetune.tokenizer` names a folder; lerobot's class otherwise.
-    if config.tokenizer_name == BYTES_TOKENIZER:
-        return TokenizerProcessorStep(tokenizer=_bytes_tokenizer(), **settings)
-    return TokenizerProcessorStep(tokenizer_name=config.tokenizer_name, **settings)
+    tokens = TokenizerProcessorStep(**tokenizer, max_length=config.language_tokens, padding="max_length")
+    return encoded_processors(config, [tokens], {**config.encoder_settings, "stats": dataset_stats})
 
 
 def _bytes_tokenizer() -> Any:

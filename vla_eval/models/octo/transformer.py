@@ -115,7 +115,7 @@ class Stem(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention and a feed-forward part, each behind a norm and beside a shortcut."""
+    """Attention and a feed-forward part, each behind a norm and with a shortcut."""
 
     def __init__(self, width: int, heads: int, mlp_width: int) -> None:
         super().__init__()

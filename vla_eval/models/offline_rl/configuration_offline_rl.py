@@ -1,20 +1,26 @@
 """lerobot's configuration of policies that learn from rewards; `docs/offline_rl.md` explains them."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_args  # lerobot is untyped
 
 from lerobot.configs import PreTrainedConfig
 
 from vla_eval.control_modes import ABSOLUTE_MODES, CONTROL_MODE, JOINT_DELTA_POS
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError
 from vla_eval.features import RewardKind
 from vla_eval.models.sequence.sizes import encoder_stages
 from vla_eval.models.shared.ported_config import PortedConfig
 from vla_eval.models.shared.stages import HEAD, Stage, Stages, image_shape
+from vla_eval.strict.bounds import check_bounds, require
 
 TYPE = "mikasa_offline_rl"
 REWARDS: tuple[str, ...] = get_args(RewardKind)
-UNIT_INTERVAL = ("dropout", "discount", "expectile", "target_rate")
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    **dict.fromkeys(("width", "hidden", "n_sampled_actions"), (1, math.inf)),
+    **dict.fromkeys(("dropout", "discount", "expectile", "target_rate"), (0, 1)),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +30,7 @@ class AlgorithmRow:
     Attributes:
         reads_rewards: it is more than imitation.
         draws_actions: the actor is a distribution, whose mean acts.
-        has_value: there is a network of values beside those of action values.
+        has_value: there is a network of values in addition to those of action values.
         has_targets: networks of action values follow slowly, for the right side of Bellman's equation.
     """
 
@@ -94,21 +100,14 @@ class MikasaOfflineRLConfig(PortedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.algorithm not in ALGORITHMS:
-            raise unknown_name("algorithm", self.algorithm, ALGORITHMS, where=f"policy ({TYPE})")
-        if self.reward is not None and self.reward not in REWARDS:
-            raise unknown_name("reward", self.reward, REWARDS, where=f"policy ({TYPE})")
+        self.check_choice("algorithm", ALGORITHMS)
+        if self.reward is not None:
+            self.check_choice("reward", REWARDS)
         if ALGORITHMS[self.algorithm].reads_rewards != (self.reward is not None):
             needed = "one of " + ", ".join(REWARDS) if self.reward is None else "null: it reads none"
             raise RecipeError(f"reward of '{self.algorithm}' is {self.reward}, expected {needed}.")
-        if self.chunk_size != 1:
-            raise RecipeError(f"chunk_size is {self.chunk_size}, expected 1: a critic judges single actions.")
-        for name in ("width", "hidden", "n_sampled_actions"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1")
-        for name in UNIT_INTERVAL:
-            if not 0 <= getattr(self, name) <= 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number in [0, 1]")
+        require(self.chunk_size == 1, "chunk_size", self.chunk_size, "1: a critic judges single actions")
+        check_bounds(self, BOUNDS)
 
     def fit_to_control_mode(self, mode: str) -> None:
         """Raise `RecipeError` unless the actions lie in [-1, 1], as those of the actor do."""
@@ -122,9 +121,7 @@ class MikasaOfflineRLConfig(PortedConfig):
         """Check the fields of the dataset."""
         if not self.image_features or self.action_feature is None:
             raise ValueError(f"'{TYPE}' needs images and action")
-        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
-        if len(shapes) != 1:
-            raise ValueError(f"'{TYPE}' needs images of one size, found {sorted(shapes)}")
+        self.check_one_size()
 
     @property
     def observation_delta_indices(self) -> list[int]:
@@ -140,10 +137,6 @@ class MikasaOfflineRLConfig(PortedConfig):
     def action_delta_indices(self) -> list[int]:
         """One action."""
         return [0]
-
-    def get_scheduler_preset(self) -> Any:
-        """Return lerobot's configuration of the schedule."""
-        return self.cosine(decay_steps=self.scheduler_decay_steps, decay_lr=self.scheduler_decay_lr)
 
 
 def network_stages(config: Any) -> Stages:

@@ -46,7 +46,7 @@ Objective = Callable[[OfflineRLNetwork, Transitions, MikasaOfflineRLConfig], Par
 def cql(network: OfflineRLNetwork, seen: Transitions, config: MikasaOfflineRLConfig) -> Parts:
     """Conservative Q-learning with a soft actor: Kumar et al. 2020, CQL(H) on SAC.
 
-    As in its code, entropy is no part of the right side of Bellman's equation, and its weight is learned for
+    As in its code, entropy is not part of the right side of Bellman's equation, and its weight is learned for
     an entropy of -A. The encoder learns from critics and imitation, not from what the critics tell the actor.
     """
     with torch.no_grad():

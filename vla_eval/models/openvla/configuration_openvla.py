@@ -125,7 +125,7 @@ class MikasaOpenVLAConfig(PromptedConfig):
         return with_changes(NetworkSizes, self.sizes)
 
     def network_options(self) -> NetworkOptions:
-        """Return what the network has beside its sizes; needs the dataset's fields."""
+        """Return what the network has in addition to its sizes; needs the dataset's fields."""
         proprio = int(self.robot_state_feature.shape[0]) if self.use_proprio else 0
         head: Any = self.head  # checked in `__post_init__`
         return NetworkOptions(

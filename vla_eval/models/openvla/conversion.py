@@ -45,11 +45,7 @@ KNOWN_IDS = (1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304, 5839, 29973,
 
 
 def read_original(source: Path, options: OpenVLAOptions) -> Original:
-    """Read a folder with `config.json`, safetensors and tokenizer of an OpenVLA.
-
-    Raises:
-        CheckpointError: something is missing, of another form, or not what the options say.
-    """
+    """Read a folder with `config.json`, safetensors and tokenizer of an OpenVLA."""
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
         _check_backbones(source, described)
@@ -71,11 +67,7 @@ def read_original(source: Path, options: OpenVLAOptions) -> Original:
 
 
 def read_weights(source: Path, options: OpenVLAOptions, sizes: NetworkSizes) -> dict[str, Tensor]:
-    """Return the weights of a published checkpoint under our names.
-
-    Raises:
-        CheckpointError: files are missing, or pickled ones are not allowed.
-    """
+    """Return the weights of a published checkpoint under our names; pickled ones only if they are allowed."""
     original = read_safetensors(source)
     for name, is_wanted in (
         ("action_head", options.head == "l1"),
@@ -89,11 +81,7 @@ def read_weights(source: Path, options: OpenVLAOptions, sizes: NetworkSizes) -> 
 def read_statistics(
     source: Path, described: Mapping[str, Any], config: MikasaOpenVLAConfig, unnorm_key: str | None
 ) -> Statistics | None:
-    """Return field -> statistics of the training data; None if there are several and none is chosen.
-
-    Raises:
-        CheckpointError: they are missing, or not of that name.
-    """
+    """Return field -> statistics of the training data; None if there are several and none is chosen."""
     file = source / STATISTICS_FILE
     known = read_json(file) if file.is_file() else get_mapping(described, "norm_stats", where=str(source))
     chosen = chosen_statistics(source, known, unnorm_key)
@@ -110,8 +98,7 @@ def read_normalizations(
 ) -> dict[str, Normalization]:
     """Return how fields are normalised: as ours, with the masks of the statistics.
 
-    Raises:
-        CheckpointError: a mask has another size, or the gripper is normalised in an encoding of its own.
+    A gripper in an encoding of its own is not normalised.
     """
     fields = {
         key: dataclasses.replace(spec, mask=read_mask(source, key, statistics[key], len(spec.mask)))
@@ -131,12 +118,10 @@ def read_normalizations(
 def settle_augmentation(source: Path, stated: bool | None) -> bool:
     """Return whether the model was trained with augmentation, and so sees the centre crop in evaluation.
 
-    No file says it, but the original's name of a run does, and it asks for the crop then. Source:
+    No file says it, but the original's name of a run does, and it asks for the crop then; else it has to be
+    stated. Source:
     https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/vla-scripts/finetune.py#L175
     and experiments/robot/libero/run_libero_eval.py#L137.
-
-    Raises:
-        CheckpointError: neither the name nor the caller says it, or they disagree.
     """
     is_named = AUGMENTED_RUN in source.resolve().name
     if stated is None and not is_named:

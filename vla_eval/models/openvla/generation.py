@@ -31,13 +31,9 @@ def generated_actions(network: OpenVLANetwork, inputs: Inputs) -> Tensor:
 
 
 def token_loss(network: OpenVLANetwork, inputs: Inputs, actions: Tensor, counts: Tensor) -> Tensor:
-    """Return the cross-entropy of the action tokens and of the stop token behind them.
+    """Return the cross-entropy of the tokens of normalised actions (B, K, A) and of the stop token.
 
-    Args:
-        network: with a token head.
-        inputs: see there.
-        actions: (B, K, A) normalised.
-        counts: (B, K) float, 0 for actions that are left out; the stop token counts as the last action.
+    `counts` (B, K) is 0 for actions that are left out; the stop token counts as the last action.
 
     Source: https://github.com/moojink/openvla-oft/blob/213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db/
     prismatic/vla/datasets/datasets.py#L32-L74: `predict_stop_token`, whichever way the tokens are predicted.

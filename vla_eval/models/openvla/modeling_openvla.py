@@ -26,7 +26,6 @@ from vla_eval.models.shared.images import (
 )
 from vla_eval.models.shared.levels import MAX_LEVEL
 from vla_eval.models.shared.precision import default_dtype
-from vla_eval.models.shared.prompts import Prompts
 
 
 class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
@@ -76,7 +75,8 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
 
     def _inputs(self, batch: dict[str, Tensor], *, changed: bool) -> Inputs:
         proprio = batch[STATE_KEY] if self.config.use_proprio else None
-        return Inputs(self._images(batch, changed=changed), self._prompts(batch), proprio)
+        prompts = finished(*self._prompt(batch), self.network.sizes)
+        return Inputs(self._images(batch, changed=changed), prompts, proprio)
 
     def _images(self, batch: dict[str, Tensor], *, changed: bool) -> Tensor:
         """Return (B, cameras, 3, edge, edge) in [0, 1], resized and either changed at random or cropped.
@@ -95,6 +95,3 @@ class MikasaOpenVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[mis
                 levels = centre_crop(levels, AUGMENTATION.centre_area, whole=truncated_levels)
             images.append(levels / MAX_LEVEL)
         return torch.stack(images, dim=1)
-
-    def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
-        return finished(*self._prompt(batch), self.network.sizes)

@@ -30,7 +30,7 @@ ROPE_THETA = 10_000.0
 
 
 class Inputs(NamedTuple):
-    """What is known of B samples.
+    """The inputs of B samples.
 
     Attributes:
         images: (B, cameras, 3, H, W) in [0, 1].
@@ -137,7 +137,7 @@ class OpenVLANetwork(nn.Module):
         return predicted
 
     def _text(self, prompts: Prompts, action_ids: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return ids (B, T + K · A + 1), which of them are actions, and which are no padding."""
+        """Return ids (B, T + K · A + 1), which of them are actions, and which are not padding."""
         sizes, n_tokens = self.sizes, self.options.n_action_tokens
         lengths = prompts.mask.sum(dim=1, keepdim=True)
         n_prompt, n_samples = prompts.ids.shape[1], len(prompts.ids)

@@ -63,7 +63,7 @@ class NetworkSizes(VisionSizes):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkOptions:
-    """What one model has beside its sizes.
+    """What one model has in addition to its sizes.
 
     Attributes:
         head: `l1`: all actions of the chunk at once, continuous (OFT). `parallel_tokens`: at once, as

@@ -1,4 +1,4 @@
-"""The fused vision encoder, DINOv2 with registers beside SigLIP, and the projector into Llama's width.
+"""The fused vision encoder, DINOv2 with registers and SigLIP, and the projector into Llama's width.
 
 Legend: B samples, C cameras, P patches of an image, D channels.
 

@@ -1,6 +1,7 @@
 """lerobot's configuration of the plain policies that remember; `docs/sequence_policies.md` explains them."""
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args  # lerobot is untyped
 
@@ -8,10 +9,11 @@ import numpy as np
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
 from vla_eval.models.episodes.config import EpisodeConfig
 from vla_eval.models.sequence.sizes import (
+    BELOW_ONE,
     CORES,
     ENCODERS,
     HEADS,
@@ -21,6 +23,7 @@ from vla_eval.models.sequence.sizes import (
     options_of,
 )
 from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, LANGUAGE, Stage, Stages, image_shape
+from vla_eval.strict.bounds import check_bounds
 
 TYPE = "mikasa_sequence"
 
@@ -67,20 +70,12 @@ class MikasaSequenceConfig(EpisodeConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known: dict[str, Collection[str]] = {
-            "core": CORES,
-            "encoder": ENCODERS,
-            "head": HEADS,
-            "tokens": TOKENS,
-        }
-        for name, names in known.items():
-            if getattr(self, name) not in names:
-                raise unknown_name(name, getattr(self, name), names, where=f"policy ({TYPE})")
-        for name in ("width", "layers", "heads", "context_steps"):
-            if getattr(self, name) < 1:
-                raise RecipeError(f"{name} is {getattr(self, name)}, expected a number ≥ 1")
-        if not 0 <= self.dropout < 1:
-            raise RecipeError(f"dropout is {self.dropout}, expected a number in [0, 1)")
+        self.check_choice("core", CORES)
+        self.check_choice("encoder", ENCODERS)
+        self.check_choice("head", HEADS)
+        self.check_choice("tokens", TOKENS)
+        counts = ("width", "layers", "heads", "context_steps")
+        check_bounds(self, {**dict.fromkeys(counts, (1, math.inf)), "dropout": (0, BELOW_ONE)})
         self._check_width()
         self._check_returns()
 

@@ -83,7 +83,7 @@ class CausalTransformer(Core):
     """torch's transformer layers, normalised before each part, over all steps so far.
 
     The memory is the tokens that were read, not what the layers made of them: reading all of them again at
-    each step costs little beside the images, and needs no code of ours in the layers. A layer sees the
+    each step costs little compared with the images, and needs no code of ours in the layers. A layer sees the
     last `context_steps` steps of the one below, so that the memory is so much longer where there are more.
     """
 

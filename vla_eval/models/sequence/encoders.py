@@ -125,14 +125,7 @@ class Keypoints(nn.Module):
 
 
 class Cameras(nn.ModuleList):
-    """The images of all cameras as one vector: an encoder for each, or one whose channels they all are.
-
-    Args:
-        name: of the encoder in `ENCODERS`.
-        n_cameras: number of cameras.
-        image_px: height and width of an image.
-        outputs: numbers that an encoder returns.
-    """
+    """The images of all cameras as one vector: an encoder for each, or one whose channels they all are."""
 
     def __init__(self, name: str, *, n_cameras: int, image_px: int, outputs: int) -> None:
         channels = RGB * n_cameras if ENCODERS[name].shared else RGB

@@ -51,7 +51,7 @@ class Gated(nn.Module):
 
 
 class Demonstrated(NamedTuple):
-    """What the tokens of a demonstration's steps are made of, beside the observations.
+    """What the tokens of a demonstration's steps are made of, in addition to the observations.
 
     Attributes:
         returns: (B, T) to go.

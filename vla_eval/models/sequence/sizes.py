@@ -99,7 +99,7 @@ class ElmurOptions:
         slots: of each layer's memory; a segment writes one.
         blend: share of what is new in a slot that is written again.
         slot_scale: standard deviation of what slots hold before they are written.
-        experts: one of which each token is sent to, beside the one for all.
+        experts: each token is sent to one of them, and to the one for all.
         inner_width: of an expert.
         attention_dropout: of attention's weights.
         memory_dropout: of what is written.

@@ -36,7 +36,7 @@ class Segments:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleMemory:
-    """What a training sample has beside its own frame.
+    """What a training sample has in addition to its own frame.
 
     Attributes:
         choice: of earlier frames; None: none are shown.

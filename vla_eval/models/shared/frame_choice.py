@@ -59,7 +59,7 @@ class FrameChoice:
         rule: a name of `RULES`.
         n_places: so many frames are shown at most.
         stride: of the rule `last`: control steps between them.
-        least_novelty: of the rule `keyframes`: a smaller change is no event; see `novelty`.
+        least_novelty: of the rule `keyframes`: a smaller change is not an event; see `novelty`.
     """
 
     rule: str

@@ -20,7 +20,7 @@ class Prefix(NamedTuple):
     Attributes:
         embeddings: (B, N, D), padded on the right.
         mask: (B, N, N) bool: which place (second N) each place attends to.
-        lengths: (B,) places that are no padding.
+        lengths: (B,) places that are not padding.
     """
 
     embeddings: Tensor

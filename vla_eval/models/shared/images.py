@@ -145,12 +145,9 @@ def _crop_weights(start: Tensor, length: Tensor, n_px: int) -> Tensor:
 
 @in_float32
 def centre_crop(images: Tensor, area: float, *, whole: Callable[[Tensor], Tensor] = _whole_levels) -> Tensor:
-    """Return the middle of the images, this share of their area, enlarged to their size, in whole levels.
+    """Return the middle of images (B, …, 3, H, W), enlarged to their size, in whole levels.
 
-    Args:
-        images: (B, …, 3, H, W) in [0, 255].
-        area: in (0, 1]; each side is its square root.
-        whole: makes whole levels; the nearest unless another is given.
+    `area`: share that is left, in (0, 1]; each side is its square root. `whole` makes whole levels.
     """
     if not 0 < area <= 1:
         raise RecipeError(f"crop area is {area}, expected a number in (0, 1].")

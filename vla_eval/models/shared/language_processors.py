@@ -1,6 +1,6 @@
 """Processors of a policy that reads a prompt: instruction, tokens, normalised targets in, actions out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any  # lerobot is untyped
 
@@ -55,15 +55,11 @@ def language_processors(
     *,
     fields: Mapping[str, Normalization] | None = None,
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor.
+    """Return pre- and postprocessor of a policy, with the step that makes its prompts.
 
-    Args:
-        config: of the policy, with `tokenizer_name`, `prompt_max_tokens` and `encoder_settings`.
-        prompt: what makes the prompts.
-        dataset_stats: field -> statistics; None: they come from a checkpoint.
-        fields: how fields are normalised with foreign statistics; None: as the configuration says.
+    Without statistics by field, they come from a checkpoint. `fields`: how they are normalised with foreign
+    statistics; None: as the configuration says.
     """
-    default = make_default_policy_processor_steps(config, None)
     named = config.tokenizer_name != BYTE_TOKENIZER
     tokenizer = {"tokenizer_name": config.tokenizer_name} if named else {"tokenizer": byte_tokenizer()}
     tokens = TokenizerProcessorStep(
@@ -74,20 +70,22 @@ def language_processors(
         truncation=False,
     )
     settings = config.encoder_settings
-    statistics = {**settings, "fields": fields or settings["fields"], "stats": dataset_stats}
+    settings = {**settings, "fields": fields or settings["fields"], "stats": dataset_stats}
+    return encoded_processors(config, [prompt, tokens], settings)
+
+
+def encoded_processors(config: Any, words: Sequence[Any], settings: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return pre- and postprocessor; `words`: steps of the instruction, `settings`: of our own."""
+    default = make_default_policy_processor_steps(config, None)
     processors: tuple[Any, Any] = make_policy_processor_pipelines(
         input_steps=[
             default.rename_observations,
             default.add_batch_dim,
-            prompt,
-            tokens,
+            *words,
             default.to_device,
-            EncoderStep(**statistics),
+            EncoderStep(**settings),
         ],
-        output_steps=[
-            DecoderStep(**statistics),
-            DeviceProcessorStep(device="cpu"),
-        ],
+        output_steps=[DecoderStep(**settings), DeviceProcessorStep(device="cpu")],
     )
     return processors
 

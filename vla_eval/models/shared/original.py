@@ -14,7 +14,7 @@ from torch import Tensor
 from vla_eval.errors import CheckpointError, did_you_mean
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, STATE_KEY
 from vla_eval.models.shared.gripper import ENCODINGS, GripperEncoding
-from vla_eval.models.shared.weight_file import WeightFile
+from vla_eval.models.weights.file import WeightFile
 from vla_eval.strict.json_text import shown
 
 CONFIG_FILE = "config.json"

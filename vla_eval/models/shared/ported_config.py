@@ -3,6 +3,7 @@
 Neither class is registered with lerobot: only a policy's own configuration has a name. Knows no network.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any  # lerobot is untyped
 
@@ -14,6 +15,7 @@ from vla_eval.features import ACTION_KEY
 from vla_eval.models.shared.gripper import Gripper
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.precision import DTYPES
+from vla_eval.strict.bounds import require
 
 
 @dataclass
@@ -42,10 +44,19 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise RecipeError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})."
-            )
+        n, most = self.n_action_steps, self.chunk_size
+        require(1 <= n <= most, "n_action_steps", n, f"1 to chunk_size ({most})")
+
+    def check_choice(self, name: str, known: Collection[str]) -> None:
+        """Raise `UnknownNameError` unless the field's value is one of these."""
+        if getattr(self, name) not in known:
+            raise unknown_name(name, getattr(self, name), known, where=f"policy ({self.type})")
+
+    def check_one_size(self) -> None:
+        """Raise unless all images have one size."""
+        shapes = {tuple(feature.shape) for feature in self.image_features.values()}
+        if len(shapes) != 1:
+            raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
 
     @property
     def reward_delta_indices(self) -> list[int] | None:
@@ -60,13 +71,13 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
             grad_clip_norm=self.optimizer_grad_clip_norm,
         )
 
-    def cosine(self, *, decay_steps: int, decay_lr: float) -> Any:
-        """Return lerobot's configuration of a cosine after the warm-up."""
+    def get_scheduler_preset(self) -> Any:
+        """Return lerobot's configuration of the schedule: a cosine after the warm-up, to 0 unless said."""
         return CosineDecayWithWarmupSchedulerConfig(
             peak_lr=self.optimizer_lr,
-            decay_lr=decay_lr,
+            decay_lr=getattr(self, "scheduler_decay_lr", 0.0),
             num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=decay_steps,
+            num_decay_steps=getattr(self, "scheduler_decay_steps", 0),
         )
 
 
@@ -102,11 +113,6 @@ class PromptedConfig(PortedConfig):
         self.check_choice("dtype", DTYPES)
         self.gripper_spec()
         self.drop_n_last_frames = 0 if self.do_mask_loss_for_padding else self.chunk_size - 1
-
-    def check_choice(self, name: str, known: tuple[str, ...]) -> None:
-        """Raise `UnknownNameError` unless the field's value is one of these."""
-        if getattr(self, name) not in known:
-            raise unknown_name(name, getattr(self, name), known, where=self.type)
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""

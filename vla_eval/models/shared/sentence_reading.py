@@ -41,7 +41,7 @@ class SentenceReading:
     kept: str
 
     def to_wire(self) -> dict[str, Any]:
-        """Return what a server says of it, without the sentence, which its client knows."""
+        """Return it as a server sends it: without the sentence, which its client knows."""
         return {"ids": list(self.ids), "n_tokens": self.n_tokens, "limit": self.limit, "kept": self.kept}
 
 

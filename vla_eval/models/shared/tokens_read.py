@@ -1,7 +1,7 @@
 """Listen to what tokenizers make of sentences, wherever a policy calls one: in its processor or its network.
 
-Whoever tokenizes answers by itself: transformers' tokenizers are listened to while they are called, and code
-with words of its own says so by `note`. Nothing here knows a family of policies.
+No caller has to report: transformers' tokenizers are listened to while they are called, and code with words
+of its own calls `note`. Nothing here knows a family of policies.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ _listeners: list[list[Heard]] = []
 
 
 def note(heard: Heard) -> None:
-    """Say what was read of a text, to whoever listens."""
+    """Tell the listeners, if any, what was read of a text."""
     for listener in _listeners:
         listener.append(heard)
 

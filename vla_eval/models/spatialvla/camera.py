@@ -34,10 +34,7 @@ def resized_intrinsics(matrix: Tensor, *, height_px: int, width_px: int, to_px: 
 def back_projected(depth: Tensor, matrices: Tensor, *, cell_px: float) -> Tensor:
     """Return points (B, rows, columns, 3) in the camera's frame, one at the middle of each cell.
 
-    Args:
-        depth: (B, rows, columns) metres along z.
-        matrices: (B, 3, 3) of the images that the cells tile.
-        cell_px: edge of a cell, in their pixels.
+    Depth (B, rows, columns) is metres along z; a cell of `cell_px` is one of the images of these matrices.
     """
     rows, columns = depth.shape[-2:]
     v = (torch.arange(rows, device=depth.device) + 0.5) * cell_px

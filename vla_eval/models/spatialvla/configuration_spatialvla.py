@@ -40,6 +40,7 @@ from vla_eval.models.spatialvla.sizes import (
     Attention,
     NetworkSizes,
 )
+from vla_eval.strict.bounds import require
 
 TYPE = "mikasa_spatialvla"
 GRIDS = ("refitted", "kept", "uniform")
@@ -54,7 +55,7 @@ _PLACES = r"position_embedding_3d\.position_embedding_head\.[03]"
 LORA_TARGETS = rf"network\.({_SIGLIP}|{_GEMMA}|{_PLACES}|projector)"
 """Regular expression of the modules that get an adapter; it has to match a whole name."""
 SPATIAL_EMBEDDINGS = "spatial_embed_tokens"
-"""Module that is trained in full beside the adapters, if it is asked for; the original leaves it as it is."""
+"""Module that is trained in full in addition to the adapters, if asked for; the original leaves it."""
 
 
 @LRSchedulerConfig.register_subclass("mikasa_linear_decay")
@@ -124,10 +125,9 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         self.check_choice("action_grid", GRIDS)
         self.check_choice("prefix_attention", ATTENTIONS)
         self.check_choice("inference_attention", ATTENTIONS)
-        if not 0 < self.camera_fov_rad < math.pi:
-            raise RecipeError(f"camera_fov_rad is {self.camera_fov_rad}, expected radians in (0, π).")
-        if not self.pictures:
-            raise RecipeError(f"'{TYPE}': `pictures` is empty, expected the fields that are read, in order.")
+        fov_rad = self.camera_fov_rad
+        require(0 < fov_rad < math.pi, "camera_fov_rad", fov_rad, "radians in (0, π)")
+        require(bool(self.pictures), "pictures", [], "the fields that are read, in order")
         self.network_sizes()
 
     def validate_features(self) -> None:
@@ -158,12 +158,7 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         return chosen
 
     def fit_to_actions(self, actions: Tensor, statistics: Mapping[str, Any]) -> None:
-        """Set the grid for a dataset; `grid` is then what a base had, if there is one.
-
-        Args:
-            actions: (N, 7) of all frames, as the environment takes them.
-            statistics: of the dataset's actions.
-        """
+        """Set the grid for the actions (N, 7) of all frames of a dataset; it was a base's, if any."""
         base, self.base_grid = self.grid, []
         if self.action_grid == "kept":
             if not base:

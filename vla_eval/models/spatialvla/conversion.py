@@ -41,11 +41,7 @@ SpatialVLA/SpatialVLA/blob/e48075326a92116adaaf1232cf01471f15f09a73/model/modeli
 
 
 def read_original(source: Path, options: SpatialVLAOptions) -> Original:
-    """Read a folder with `config.json`, `processor_config.json`, safetensors and tokenizer.
-
-    Raises:
-        CheckpointError: something is missing, of another form, or not what the options say.
-    """
+    """Read a folder with `config.json`, `processor_config.json`, safetensors and tokenizer."""
     described, processor = read_json(source / CONFIG_FILE), read_json(source / PROCESSOR_FILE)
     weights = read_safetensors(source)
     has_own_head = _settle_head(source, described, weights, options.head)
@@ -64,11 +60,7 @@ def read_original(source: Path, options: SpatialVLAOptions) -> Original:
 def read_statistics(
     source: Path, processor: Mapping[str, Any], config: MikasaSpatialVLAConfig, unnorm_key: str | None
 ) -> Statistics | None:
-    """Return field -> statistics of the training data; None if there are several and none is chosen.
-
-    Raises:
-        CheckpointError: they are not of that name, or normalised otherwise than ours.
-    """
+    """Return field -> statistics of the training data; None if there are several and none is chosen."""
     chosen = chosen_statistics(source, processor.get("statistics") or {}, unnorm_key)
     if chosen is None:
         return None

@@ -40,11 +40,7 @@ N_GRIPPER_BINS = 2
 
 
 def check_described(source: Path, sizes: NetworkSizes) -> None:
-    """Compare all that the files of a published checkpoint say with a network of these sizes.
-
-    Raises:
-        CheckpointError: a file is missing, or says something else or something that is not known here.
-    """
+    """Raise unless all that the files of a published checkpoint say is that of a network of these sizes."""
     config, processor = read_json(source / CONFIG_FILE), read_json(source / PROCESSOR_FILE)
     images = read_json(source / IMAGES_FILE)
     lines = _top(sizes).problems(config)
@@ -60,7 +56,8 @@ def check_described(source: Path, sizes: NetworkSizes) -> None:
     lines += _bins(sizes).problems(_flat_bins(processor.get("action_config")))
     lines += _images(sizes).problems(images)
     if (source / GENERATION_FILE).is_file():
-        lines += _generation(sizes).problems(read_json(source / GENERATION_FILE))
+        generation = Section(where=GENERATION_FILE, fields=_special_tokens(sizes))
+        lines += generation.problems(read_json(source / GENERATION_FILE))
     if lines:
         raise CheckpointError(f"{source}: not the published SpatialVLA:\n  " + "\n  ".join(lines))
 
@@ -222,7 +219,7 @@ def _bins(sizes: NetworkSizes) -> Section:
 
 
 def _flat_bins(described: object) -> object:
-    """Return `action_config` with the numbers of bins beside its other fields."""
+    """Return `action_config` with the numbers of bins among its other fields."""
     if not isinstance(described, Mapping):
         return described
     flat = {name: value for name, value in described.items() if name != "num_bins"}
@@ -249,10 +246,6 @@ def _images(sizes: NetworkSizes) -> Section:
             {"image_mean", "image_std", "do_convert_rgb", "image_processor_type", "processor_class"}
         ),
     )
-
-
-def _generation(sizes: NetworkSizes) -> Section:
-    return Section(where=GENERATION_FILE, fields=_special_tokens(sizes))
 
 
 def _special_tokens(sizes: NetworkSizes) -> dict[str, Field]:

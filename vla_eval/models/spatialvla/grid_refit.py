@@ -16,11 +16,7 @@ from vla_eval.models.spatialvla.action_grid import ROTATION, TRANSLATION, Action
 
 
 def refitted(table: Tensor, old: ActionGrid, new: ActionGrid) -> Tensor:
-    """Return the table (tokens, D) of the new grid, in the type of the old one.
-
-    Raises:
-        RecipeError: the grids have other numbers of bins.
-    """
+    """Return the table (tokens, D) of the new grid, of as many bins, in the type of the old one."""
     if old.n_bins != new.n_bins:
         raise RecipeError(
             f"an action grid of {old.n_bins} bins cannot be moved to one of {new.n_bins}: the tokens would "

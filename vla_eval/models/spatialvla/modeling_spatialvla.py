@@ -11,7 +11,6 @@ from vla_eval.models.shared.chunks import PromptedChunks
 from vla_eval.models.shared.images import Size, resize_bicubic
 from vla_eval.models.shared.levels import MAX_LEVEL
 from vla_eval.models.shared.precision import default_dtype
-from vla_eval.models.shared.prompts import Prompts
 from vla_eval.models.spatialvla.camera import intrinsics, resized_intrinsics
 from vla_eval.models.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
 from vla_eval.models.spatialvla.generation import generated_actions, token_loss
@@ -88,7 +87,4 @@ class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[
             images.append(resize_bicubic(levels, Size(edge, edge)) / MAX_LEVEL)
         shown = torch.stack(images, dim=1)
         cameras = torch.stack(matrices).to(shown.device).expand(len(shown), -1, -1, -1)
-        return Inputs(shown, cameras, self._prompts(batch))
-
-    def _prompts(self, batch: dict[str, Tensor]) -> Prompts:
-        return finished(*self._prompt(batch), self.network.sizes)
+        return Inputs(shown, cameras, finished(*self._prompt(batch), self.network.sizes))

@@ -36,7 +36,7 @@ FIRST_PLACE = 1
 
 
 class Inputs(NamedTuple):
-    """What is known of B samples.
+    """The inputs of B samples.
 
     Attributes:
         images: (B, C, 3, H, W) in [0, 1].
@@ -56,7 +56,7 @@ class Sequence(NamedTuple):
 
     Attributes:
         embeddings: (B, N, D).
-        lengths: (B,) places that are no padding.
+        lengths: (B,) places that are not padding.
         first_action: (B,) place of the first action token: behind the prefix.
     """
 
@@ -99,12 +99,7 @@ class SpatialVLANetwork(nn.Module):
         return torch.where(is_action[..., None], actions * math.sqrt(self.sizes.llm_width), words)
 
     def sequence(self, inputs: Inputs, action_ids: Tensor | None = None) -> Sequence:
-        """Return the sequence of each sample.
-
-        Args:
-            inputs: see there.
-            action_ids: (B, 3 · K) tokens of the actions, then stop follows; None: nothing follows.
-        """
+        """Return each sample's sequence: patches, prompt, and the tokens (B, 3 · K) of actions and stop."""
         patches = self.image_features(inputs)
         lengths, text = inputs.prompts.mask.sum(dim=1), inputs.prompts.ids
         n_more = 0

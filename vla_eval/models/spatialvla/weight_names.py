@@ -16,7 +16,7 @@ EMBEDDINGS, HEAD = "language_model.model.embed_tokens.weight", "language_model.l
 
 
 def to_ours(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the original's tensors under our names; an unknown name is left for whoever loads to refuse."""
+    """Return the original's tensors under our names; an unknown name stays, and the loader refuses it."""
     return {_renamed(name, BEGINNINGS): tensor for name, tensor in weights.items()}
 
 

@@ -33,7 +33,7 @@ class VlaMemoryConfig:
         memory_places: further images of each camera at most; 0: none.
         memory_rule: which frames they are, a name of `frame_choice.RULES`.
         memory_stride: of the rule `last`: control steps between them.
-        memory_novelty: of the rule `keyframes`: a smaller change of the image is no event.
+        memory_novelty: of the rule `keyframes`: a smaller change of the image is not an event.
         memory_cameras: of which cameras, by the dataset's names; the rule looks at the first.
         memory_tokens: that are carried from inference to inference; 0: none.
         token_stride: control steps between two writings of them, the first frame being one.
@@ -82,7 +82,7 @@ class VlaMemoryConfig:
 
     @property
     def sample_memory(self) -> SampleMemory | None:
-        """What a training sample has beside its own frame; None: nothing."""
+        """What a training sample has in addition to its own frame; None: nothing."""
         choice = self.frame_choice()
         segments = self._segments() if self.memory_tokens else None
         if choice is None and segments is None:

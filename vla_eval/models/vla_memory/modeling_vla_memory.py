@@ -35,6 +35,7 @@ class RemembersMixin:
     new_in_finetuning = ("memory_tokens.",)
     remembers_singly = True
     """`remember` takes one frame per episode, (B, …), as `predict_action_chunk` does."""
+    backbone_name = "paligemma_with_expert"
     config: Any
     model: Any
 
@@ -42,7 +43,7 @@ class RemembersMixin:
         super().__init__(config, **kwargs)  # type: ignore[call-arg]  # of lerobot's class
         if not config.memory_tokens:
             return
-        self.memory_tokens = MemoryTokens(config.memory_tokens, self.prefix_width())
+        self.memory_tokens = MemoryTokens(config.memory_tokens, self._width())
         extend(self.model, TakesTokens)
         extend(self.backbone(), CatchesPrefix)
         self.remember, self.begin_memory = self._remember, self._begin_memory
@@ -50,11 +51,7 @@ class RemembersMixin:
 
     def backbone(self) -> Any:
         """Return lerobot's pair of language model and action expert."""
-        raise NotImplementedError
-
-    def prefix_width(self) -> int:
-        """Return the width of the language model."""
-        raise NotImplementedError
+        return getattr(self.model, self.backbone_name)
 
     def one_denoising_step(self) -> contextlib.AbstractContextManager[dict[str, Any]]:
         """Return further arguments of an inference of which only the prefix is of interest."""
@@ -140,6 +137,11 @@ class RemembersMixin:
         finally:
             self.model.given = self.backbone().prefix = None
 
+    def _width(self) -> int:
+        """Return the width of the language model."""
+        pair = self.backbone()
+        return int(getattr(pair, "paligemma", pair).config.text_config.hidden_size)
+
     def _outputs(self) -> Tensor:
         prefix: Tensor = self.backbone().prefix
         return prefix[:, -self.config.memory_tokens :]
@@ -156,14 +158,6 @@ class RemembersMixin:
 
 class _MasksPlaces(RemembersMixin):
     """Of the π0 family, which knows no mask of a single sample's image."""
-
-    def backbone(self) -> Any:
-        """See above."""
-        return self.model.paligemma_with_expert
-
-    def prefix_width(self) -> int:
-        """See above."""
-        return int(self.backbone().paligemma.config.text_config.hidden_size)
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Return images and masks, as lerobot's does; a place without a frame is masked."""
@@ -195,14 +189,7 @@ class MikasaSmolVLAPolicy(RemembersMixin, SmolVLAPolicy):  # type: ignore[misc] 
 
     config_class: ClassVar[Any] = MikasaSmolVLAConfig
     name = "mikasa_smolvla"
-
-    def backbone(self) -> Any:
-        """See above."""
-        return self.model.vlm_with_expert
-
-    def prefix_width(self) -> int:
-        """See above."""
-        return int(self.backbone().config.text_config.hidden_size)
+    backbone_name = "vlm_with_expert"
 
     @contextlib.contextmanager
     def one_denoising_step(self) -> Iterator[dict[str, Any]]:
@@ -216,5 +203,5 @@ class MikasaSmolVLAPolicy(RemembersMixin, SmolVLAPolicy):  # type: ignore[misc] 
 
 
 def _segment(values: Any, segment: int) -> Any:
-    """Return a field of one segment, (B, …) of (B, T, …); what is no tensor is of the whole sample."""
+    """Return a field of one segment, (B, …) of (B, T, …); anything else is of the whole sample."""
     return values[:, segment] if isinstance(values, Tensor) and values.ndim > 1 else values

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
-from vla_eval.oracles.arm_model import FINGER_HIGH_M, FINGER_LOW_M
+from vla_eval.oracles.arm_model import gripper_command
 from vla_eval.policies.context import PolicyContext
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
@@ -21,9 +21,7 @@ from vla_eval.tasks.catalog import task_spec
 def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArray[np.float32]:
     """Return (n_actions, n_dims) that move nothing and keep the fingers `gripper_width_m` apart."""
     rows = np.zeros((n_actions, n_dims), dtype=np.float32)
-    finger_m = gripper_width_m / 2
-    command = (finger_m - FINGER_LOW_M) / (FINGER_HIGH_M - FINGER_LOW_M) * 2 - 1
-    rows[:, -1] = np.clip(command, -1, 1)
+    rows[:, -1] = gripper_command(gripper_width_m / 2)
     return rows
 
 

@@ -13,7 +13,7 @@ The last four see the true state of the world, but not the answer before the cho
 plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, cast
 
 import numpy as np
@@ -29,7 +29,7 @@ from vla_eval.policies.controls.candidate_controls import (
     VisitExpert,
     VisitPolicy,
 )
-from vla_eval.policies.controls.in_control_mode import in_any_control_mode
+from vla_eval.policies.controls.in_control_mode import TranslatedPolicy, in_any_control_mode
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 
@@ -106,40 +106,6 @@ def make_hold(context: PolicyContext) -> ScriptedPolicy:
     return HoldPolicy(context)
 
 
-@in_any_control_mode
-def make_oracle(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `oracle` for the task of the context."""
-    return _make_expert_policy(context, "oracle")
-
-
-@in_any_control_mode
-def make_cue_blind(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `cue_blind` control for the task of the context."""
-    return _make_expert_policy(context, "cue_blind")
-
-
-@in_any_control_mode
-def make_tour(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `tour` control.
-
-    Raises:
-        SpecMismatchError: the task has no candidates to tour.
-    """
-    check_has(context.n_candidates > 0, context, "touches one candidate after another", "has none")
-    return _make_expert_policy(context, "tour")
-
-
-@in_any_control_mode
-def make_cue_reader(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `cue_reader` control.
-
-    Raises:
-        SpecMismatchError: the task has no candidates, so that no cue names one.
-    """
-    check_has(context.n_candidates > 0, context, "reads which candidate the cue shows", "has none")
-    return _make_expert_policy(context, "cue_reader")
-
-
 def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
     expert = task_expert(context)
     if context.n_candidates == 0:
@@ -147,3 +113,23 @@ def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
     if task_spec(context.env.task).several_right:
         return VisitPolicy(context, cast(VisitExpert, expert), mode)
     return ChoicePolicy(context, cast(CandidateExpert, expert), mode)
+
+
+def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
+    """Return what makes a control of the expert; one that `does` something with candidates needs some."""
+
+    def make(context: PolicyContext) -> ScriptedPolicy:
+        check_has(not does or context.n_candidates > 0, context, does, "has none")
+        return _make_expert_policy(context, mode)
+
+    return in_any_control_mode(make)
+
+
+make_oracle = _maker("oracle")
+"""Makes the `oracle` for the task of the context."""
+make_cue_blind = _maker("cue_blind")
+"""Makes the `cue_blind` control for the task of the context."""
+make_tour = _maker("tour", "touches one candidate after another")
+"""Makes the `tour` control; raises `SpecMismatchError` if the task has no candidates to tour."""
+make_cue_reader = _maker("cue_reader", "reads which candidate the cue shows")
+"""Makes the `cue_reader` control; raises `SpecMismatchError` if no cue names a candidate."""

@@ -9,7 +9,7 @@
   wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
   answer: over the ball of a shell game, where it goes down on the mug that it finds nearest.
 - `one_frame`: meets a rolling ball with the oracle's controller, but keeps nothing between inferences, and
-  sees where the ball is, not how fast it rolls. It assumes the mean speed of the task; beside the ball,
+  sees where the ball is, not how fast it rolls. It assumes the mean speed of the task; next to the ball,
   which it followed to get there, the speed of its own arm. So any policy that reads the last frame and its
   joints' speeds could do the same. In TakeItBack it drags the cube back along the line from the middle of
   the disc through the cube: where the cube is on the disc keeps the answer.
@@ -125,7 +125,7 @@ def make_cue_touch(context: PolicyContext) -> ScriptedPolicy:
 
 
 BESIDE_M = 0.09
-"""The arm is beside the ball, seen from above: an arm that waits next to the lane is nearer than this only
+"""The arm is next to the ball, seen from above: an arm that waits next to the lane is nearer than this only
 while the ball passes."""
 
 

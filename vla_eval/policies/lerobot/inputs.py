@@ -6,7 +6,7 @@ frame's state and a test frame's. Everything that does not fit is an error befor
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast  # lerobot is untyped
+from typing import Any  # lerobot is untyped
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
 from vla_eval.features import (
-    CAMERA_KEYS,
     STATE_KEY,
     STATE_NAMES,
     StateKind,
@@ -86,7 +85,7 @@ def input_map(
     Raises:
         SpecMismatchError: a camera, its size, the state or the action does not fit.
     """
-    renamed = _rename_map(preprocessor)
+    renamed = _of_steps(preprocessor, "rename_map")
     expected = _expected_cameras(loaded_config, options.absent_cameras, policy)
     by_field = {renamed.get(field, field): (camera, field) for camera, field in options.cameras.items()}
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
@@ -137,7 +136,7 @@ def check_training(
     problems = _range_problems(preprocessor) + _lens_problems(config, inputs, env) + _gripper_problems(loaded)
     if facts is None:
         shapes = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
-        renamed = _rename_map(preprocessor)
+        renamed = _of_steps(preprocessor, "rename_map")
         for field, size in seen.items():
             trained = shapes[renamed.get(field, field)]
             if trained != size and renamed.get(field, field) == field:
@@ -176,7 +175,7 @@ def _gripper_problems(loaded: LoadedPolicy) -> list[str]:
 
 def _range_problems(preprocessor: Any) -> list[str]:
     problems = []
-    for key, statistics in _statistics(preprocessor).items():
+    for key, statistics in _of_steps(preprocessor, "stats").items():
         if not key.startswith("observation.image"):
             continue
         highest = max(
@@ -216,7 +215,7 @@ def _state_kind(config: Any, preprocessor: Any, wanted: StateKind | None, policy
     feature = config.robot_state_feature
     if feature is None:
         return None
-    statistics = _statistics(preprocessor).get(STATE_KEY, {})
+    statistics = _of_steps(preprocessor, "stats").get(STATE_KEY, {})
     # Fine-tuned from a base, a configuration keeps the base's padded size; statistics are the dataset's.
     n_dims = next(
         (int(np.asarray(value).size) for name, value in statistics.items() if name != "count"), None
@@ -246,22 +245,7 @@ def _check_action(config: Any, env: EnvSpec, policy: str) -> None:
         )
 
 
-def _rename_map(preprocessor: Any) -> dict[str, str]:
-    for step in preprocessor.steps:
-        renamed = getattr(step, "rename_map", None)
-        if renamed:
-            return dict(renamed)
-    return {}
-
-
-def _statistics(preprocessor: Any) -> dict[str, dict[str, Any]]:
-    for step in preprocessor.steps:
-        statistics = getattr(step, "stats", None)
-        if statistics:
-            return cast(dict[str, dict[str, Any]], statistics)
-    return {}
-
-
-def default_cameras() -> dict[str, str]:
-    """Return the camera map of our recordings."""
-    return dict(CAMERA_KEYS)
+def _of_steps(preprocessor: Any, name: str) -> dict[str, Any]:
+    """Return the first such attribute of the steps that is not empty."""
+    found = (getattr(step, name, None) for step in preprocessor.steps)
+    return next((dict(one) for one in found if one), {})

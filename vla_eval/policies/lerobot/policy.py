@@ -4,7 +4,7 @@ The policy's own queue of actions is never used: `predict_action_chunk` is asked
 the loop executes as much of the chunk as it wants. Its own queue of observations is not used either:
 the frames of an episode are kept here, per slot, at control rate, however long the chunk is.
 
-Three kinds of policies, told apart by their configuration:
+Three kinds of policies; the configuration decides:
 
 - `observation_delta_indices` is None, or has frames of the future, which only training has (FastWAM): it
   reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
@@ -45,7 +45,7 @@ from vla_eval.checkpoints.select_step import select_step
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
-from vla_eval.features import PROPRIO_STATES, StateKind
+from vla_eval.features import CAMERA_KEYS, PROPRIO_STATES, StateKind
 from vla_eval.models.episodes.memory import (
     memory_of,
     recall,
@@ -71,7 +71,6 @@ from vla_eval.policies.lerobot.inputs import (
     InputMap,
     InputOptions,
     check_training,
-    default_cameras,
     input_map,
 )
 from vla_eval.specs import PolicySpec
@@ -95,8 +94,8 @@ class LeRobotPolicy:
             policy can. Sums are then made in another order, so that actions agree with those of a pass
             of its own only up to rounding.
         n_slots: how many rows a pass has, due or not: with the same shape and the same place in it, an
-            episode's actions are the same bits whoever is beside it. Its place is `EpisodeStart.row`; what
-            is known of it is kept by its slot, and there may be more slots than rows.
+            episode's actions are the same bits whatever the other rows are. Its place is `EpisodeStart.row`;
+            its state is kept by its slot, and there may be more slots than rows.
     """
 
     def __init__(
@@ -298,7 +297,7 @@ def make_lerobot(
     )
     loaded = load_checkpoint(Path(checkpoint), options)
     asked = InputOptions(
-        cameras=default_cameras() if cameras is None else cameras, state=state, absent_cameras=absent_cameras
+        cameras=CAMERA_KEYS if cameras is None else cameras, state=state, absent_cameras=absent_cameras
     )
     with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
         facts = read_facts(loaded.folder)

@@ -19,11 +19,7 @@ class Connected(NamedTuple):
     client: PolicyClient
 
     def another(self, settings: RemoteSettings) -> PolicyClient:
-        """Return one more connection to the same server.
-
-        Raises:
-            RemotePolicyError: see `connect_client`.
-        """
+        """Return one more connection to the same server."""
         return _connect(self.url, settings, connect_seconds=0.0)
 
 

@@ -39,15 +39,7 @@ class RemotePolicy:
         settings: RemoteSettings,
         action: ActionSpec,
     ) -> None:
-        """Keep the connections.
-
-        Args:
-            spec: what the policy reads and returns.
-            clients: slot -> connection; the same one for all slots where the server can distinguish them.
-            fit: how observations become requests.
-            settings: the recipe.
-            action: what actions mean here.
-        """
+        """Keep the connections by slot; the same one for all where the server can distinguish them."""
         self._spec = spec
         self._clients = clients
         self._fit = fit
@@ -65,11 +57,7 @@ class RemotePolicy:
         return self._spec
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Begin an episode in the session of each slot.
-
-        Raises:
-            RemotePolicyError: the server is gone, silent, or replies with something else.
-        """
+        """Begin an episode in the session of each slot."""
         for start in episodes:
             self._instructions[start.slot] = start.instruction
             self._clients[start.slot].ask_reset(self._sessions[start.slot], start)
@@ -81,11 +69,7 @@ class RemotePolicy:
         return self.act_batch([window])[0]
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
-        """Ask for the chunks of several episodes; the order of the answers is that of the windows.
-
-        Raises:
-            RemotePolicyError: the server is gone, silent, or replies with something else.
-        """
+        """Ask for the chunks of several episodes; the order of the answers is that of the windows."""
         for window in windows:
             client, session = self._clients[window.slot], self._sessions[window.slot]
             *earlier, last = window.frames

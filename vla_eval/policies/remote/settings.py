@@ -110,11 +110,7 @@ class RemoteSettings:
 
     @property
     def api_key(self) -> str | None:
-        """The API key; None if there is none.
-
-        Raises:
-            RecipeError: the recipe names a variable that is not set.
-        """
+        """The API key; None if there is none. A variable that the recipe names has to be set."""
         key = os.environ.get(self.api_key_env or DEFAULT_KEY_ENV)
         if self.api_key_env is not None and not key:
             raise RecipeError(

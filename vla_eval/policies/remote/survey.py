@@ -21,7 +21,7 @@ MAX_SERVER_NAME = 80  # characters of a server's name that records repeat
 
 
 class SurveyedPolicy(NamedTuple):
-    """A policy at an address, and what its servers said of themselves."""
+    """A policy at an address, and the metadata of its servers."""
 
     recipe: Recipe[PolicyRecipe]
     server: ServerMetadata

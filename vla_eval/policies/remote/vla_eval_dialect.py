@@ -28,11 +28,7 @@ class VlaEvalClient:
     """A session on such a server."""
 
     def __init__(self, connection: Connection, settings: RemoteSettings) -> None:
-        """Greet the server.
-
-        Raises:
-            RemotePolicyError: it does not greet back, or speaks another version.
-        """
+        """Greet the server, which has to greet back in this version."""
         self._connection = connection
         self._cameras = {camera.key for camera in (settings.cameras or {}).values()}
         self._n_sent = 0
@@ -45,7 +41,7 @@ class VlaEvalClient:
 
     @property
     def metadata(self) -> ServerMetadata:
-        """What the server said of itself in its greeting."""
+        """The metadata in the server's greeting."""
         return self._metadata
 
     @property
@@ -74,11 +70,7 @@ class VlaEvalClient:
         self._send(OBSERVATION, {"images": images, **others})
 
     def take_infer(self, session: str) -> Any:
-        """Return the actions of the answer, unchecked.
-
-        Raises:
-            RemotePolicyError: see `Connection.receive`; or the answer is another message's, or an error.
-        """
+        """Return the actions of the answer, unchecked; an error is raised in their place."""
         payload = self._receive(ACTION)
         if "actions" not in payload:
             raise self._connection.refuse(f"expected 'actions', found {shown(sorted(payload))}")

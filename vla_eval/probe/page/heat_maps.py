@@ -26,10 +26,6 @@ def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
 
     They go next to the folder, which holds run folders alone.
 
-    Args:
-        table: the grid.
-        folder: OUT, where its run folders are.
-
     Raises:
         ReportError: a file cannot be written.
     """

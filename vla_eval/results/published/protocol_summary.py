@@ -53,12 +53,7 @@ def named_protocol(run: StoredRun) -> str | None:
 
 
 def summarize(protocol: Protocol, grouping: Grouping) -> tuple[ProtocolRow, ...]:
-    """Return the summary figures of a protocol for all policies that were run on any of its tasks.
-
-    Args:
-        protocol: whose figure.
-        grouping: all episodes of the table.
-    """
+    """Return the summary figures of a protocol for all policies that were run on any of its tasks."""
     by_label: dict[RowKey, dict[str, RowEpisodes]] = {}
     for key, group in grouping.groups.items():
         if key.task in protocol.tasks:

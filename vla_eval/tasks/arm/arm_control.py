@@ -14,7 +14,7 @@ from vla_eval.control_modes import ABSOLUTE_MODES, EE_DELTA_POS, EE_DELTA_POSE, 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.arm.arms import Arm
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
-from vla_eval.tasks.objects.bodies import yaw_rad
+from vla_eval.tasks.objects.bodies import length, yaw_rad
 
 
 class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
@@ -55,9 +55,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
 
     def arm_speed(self) -> torch.Tensor:
         """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
-        qvel = self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)]
-        speed: torch.Tensor = torch.linalg.norm(qvel, dim=1)
-        return speed
+        return length(self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)])
 
     def check_motion(self) -> None:
         """Raise `TaskArgumentError` if the scripted motion cannot be made in this control mode."""
@@ -70,8 +68,8 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     def hold_action(self) -> torch.Tensor:
         """Return the (B, A) action that moves neither arm nor fingers, with the present gripper width.
 
-        In a delta mode it is no motion; in `pd_joint_pos` the joints' present targets, in `pd_ee_pose` the
-        present pose.
+        In a delta mode all motions are 0; in `pd_joint_pos` it is the joints' present targets, in
+        `pd_ee_pose` the present pose.
 
         Raises:
             TaskArgumentError: the control mode has no action for that.

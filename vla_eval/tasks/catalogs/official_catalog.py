@@ -3,26 +3,86 @@
 `official_90.csv` has the 90 tasks: ids, horizons and sentences as the classes of the package register and
 declare them (MIT licence). The package's own table, `mikasa_robo_vla_envs.csv`, is not in its wheel. The
 split follows from the horizon and the memory type from the family, with the counts that its documentation
-states.
+states. The experts are those of this package's own tasks of the same kind; a family without a row among them
+has no scripted controls.
 
 Source: `mikasa_robo_suite/vla/memory_envs` and `rl/memory_envs` of the wheel mikasa-robo-suite 1.0.0,
 made from https://github.com/CognitiveAISystems/MIKASA-Robo, tag v1.0.0 (16634db).
 """
 
 import csv
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib.resources import files
 from typing import Any, cast
 
-from vla_eval.tasks.catalogs.official_controls import control_fields
-from vla_eval.tasks.spec import MemoryType, PhaseSource, TaskSpec
+from vla_eval.tasks.catalogs.spatial_catalog import BALL_SPEEDS_M_S, SPATIAL_TASKS
+from vla_eval.tasks.spec import MemoryType, PhaseSource, TaskSpec, TrueState
 
 NAMESPACE_90 = "mikasa_vla/"
 NAMESPACE_ORIGINAL = "mikasa_official/"
 TABLE = "official_90.csv"
 ENTRY_POINT = "vla_eval.envs.official:OfficialEnv"
 _AS_PACKAGE = "as the official package has it"
+
+
+_ITEMS_SEEN = "poses of all items and which one is right; moves once the choice has appeared"
+_MUGS_SEEN = "poses of all mugs and which one is right; moves once the mugs stand still"
+
+
+_CHOICES: dict[str, tuple[str, TrueState, str]] = {
+    # beginning of the name: expert, what it is given of the true state, the same in words
+    "Remember": ("vla_eval.oracles.hover:CUBES", "items", _ITEMS_SEEN),
+    "FindImposter": ("vla_eval.oracles.hover:CUBES", "items", _ITEMS_SEEN),
+    "ShellGamePush": ("vla_eval.oracles.push:MUGS", "mugs", _MUGS_SEEN),
+    "ShellGame": ("vla_eval.oracles.hover:MUGS", "mugs", _MUGS_SEEN),
+}
+_MOVING: dict[str, TrueState] = {"Intercept": "ball", "Rotate": "peg", "TakeItBack": "cube"}
+_OWN = {row.id.removesuffix("-v0"): row for row in SPATIAL_TASKS}
+_N_MUGS = 3
+
+
+def control_fields(name: str) -> dict[str, Any]:
+    """Return the fields of a catalogue row that its controls need; empty if there are none.
+
+    Args:
+        name: of the task, such as `RememberColor3-VLA-v0`.
+    """
+    task = name.partition("-")[0]
+    for prefix, controls in _CHOICES.items():
+        if task.startswith(prefix):
+            n = n_candidates(task)
+            return {**_control_row(*controls), "candidate_counts": {"n_items": n}, "chance_success": 1 / n}
+    for prefix, true_state in _MOVING.items():
+        if task.startswith(prefix):
+            own, speeds = _OWN[task], _speeds(task)
+            fields = _control_row(own.oracle, true_state, own.oracle_sees)
+            # Not of TakeItBack: the official state does not say which colour the disc has.
+            seen = {"seen_in_one_frame": own.seen_in_one_frame} if speeds else {}
+            return {**fields, **seen, "turns_wrist": own.turns_wrist, "kwargs": speeds}
+    return {}
+
+
+def n_candidates(task: str) -> int:
+    """Return among how many objects one has to choose: `RememberColor3` 3, `RememberShapeAndColor5x3` 15.
+
+    The official 3x2 has two shapes in three colours.
+    """
+    numbers = re.search(r"(\d+)(?:x(\d+))?$", task)
+    if numbers is None:
+        return _N_MUGS
+    return int(numbers[1]) * int(numbers[2] or 1)
+
+
+def _control_row(expert: str, true_state: TrueState, sees: str) -> dict[str, Any]:
+    return {"oracle": expert, "oracle_sees": sees, "true_state": true_state}
+
+
+def _speeds(task: str) -> dict[str, Any]:
+    """Return the range of the ball's initial speed, if there is one: the same as in this package's task."""
+    mode = task.removeprefix("InterceptGrab").removeprefix("Intercept")
+    return {"velocity_range_m_s": BALL_SPEEDS_M_S[mode]} if mode in BALL_SPEEDS_M_S else {}
 
 
 def _row(line: dict[str, str]) -> TaskSpec:

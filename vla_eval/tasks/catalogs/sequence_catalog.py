@@ -6,9 +6,8 @@ N_CUBES = 9
 HORIZON_STEPS = 120
 
 
-def _several(
-    family: str, n_shown: int, *, shown: str, memory: MemoryType, one_by_one: bool, in_order: bool
-) -> TaskSpec:
+def _several(family: str, memory: MemoryType, one_by_one: bool, in_order: bool, *, n_shown: int) -> TaskSpec:
+    shown = "one after another" if one_by_one else "together"
     order = "in the order shown" if in_order else "in any order"
     return TaskSpec(
         id=f"{family}{n_shown}-v0",
@@ -40,21 +39,10 @@ def _several(
     )
 
 
-SEQUENCE_TASKS = (
-    *(
-        _several("BunchOfColors", n, shown="together", memory="capacity", one_by_one=False, in_order=False)
-        for n in (3, 5, 7)
-    ),
-    *(
-        _several(
-            "SeqOfColors", n, shown="one after another", memory="capacity", one_by_one=True, in_order=False
-        )
-        for n in (3, 5, 7)
-    ),
-    *(
-        _several(
-            "ChainOfColors", n, shown="one after another", memory="sequential", one_by_one=True, in_order=True
-        )
-        for n in (3, 5, 7)
-    ),
+_FAMILIES: tuple[tuple[str, MemoryType, bool, bool], ...] = (
+    # name, kind of memory, shown one by one, touched in order
+    ("BunchOfColors", "capacity", False, False),
+    ("SeqOfColors", "capacity", True, False),
+    ("ChainOfColors", "sequential", True, True),
 )
+SEQUENCE_TASKS = tuple(_several(*family, n_shown=n) for family in _FAMILIES for n in (3, 5, 7))

@@ -25,6 +25,12 @@ class Body(NamedTuple):
         )
 
 
+def length(vectors: Any) -> torch.Tensor:  # Any: as for `to_vector`
+    """Return the Euclidean length of the last dimension."""
+    norm: torch.Tensor = torch.linalg.norm(vectors, dim=-1)
+    return norm
+
+
 def to_vector(tensor: Any) -> NDArray[np.float64]:  # Any: also what ManiSkill hands out, which is untyped
     """Return a tensor as new float64 numbers."""
     return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64).copy()

@@ -38,5 +38,5 @@ def item_names(task: str, n_items: int) -> tuple[str, ...]:
 
 
 def item_rgb(task: str, n_items: int, index: int) -> tuple[int, int, int] | None:
-    """Return the colour of an item that its name gives, 0 to 255; None if the name is no colour."""
+    """Return the colour of an item that its name gives, 0 to 255; None if the name is not a colour."""
     return COLOR_RGB.get(item_names(task, n_items)[index])

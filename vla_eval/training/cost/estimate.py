@@ -11,7 +11,7 @@ import torch
 from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.evaluation.model_table import SUSTAINED_TFLOPS
-from vla_eval.models.shared.empty_weights import empty_weights
+from vla_eval.models.weights.empty import empty_weights
 from vla_eval.training.cost.description import GIB, ModelDescription, describe_model
 from vla_eval.training.cost.sample_cost import SampleCost, sample_cost
 from vla_eval.training.lora import peft_config

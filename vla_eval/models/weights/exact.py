@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.weight_file import describe
+from vla_eval.models.weights.file import describe
 
 MAX_SHOWN = 8
 CHUNK = 1 << 24  # numbers that are looked at at once

@@ -42,7 +42,7 @@ class WeightFile(Mapping[str, Tensor]):
         try:
             with safe_open(path, framework="pt") as file:
                 self._described = {name: _described(file.get_slice(name)) for name in list(file.keys())}
-        except Exception as exc:  # safetensors raises its own class, which is no public name
+        except Exception as exc:  # safetensors raises a class of its own that is not public
             raise self._damaged(exc) from exc
 
     def described(self) -> Mapping[str, Tensor]:
@@ -91,16 +91,11 @@ def write_weights(
 ) -> None:
     """Write a safetensors file part by part, so that no tensor has to be in memory as a whole.
 
+    `described`: name -> a tensor of that shape and type, whose values are not read. `parts`: name -> its
+    numbers in order, in pieces of any size.
+
     Source of the format: https://github.com/huggingface/safetensors/blob/
     v0.8.0/README.md#format (length of the header, header as JSON, bytes of the tensors).
-
-    Args:
-        path: of the file.
-        described: name -> a tensor of that shape and type; its values are not read.
-        parts: name -> the tensor's numbers in order, in pieces of any size.
-
-    Raises:
-        CheckpointError: the pieces of a tensor have another type, or are more or fewer numbers.
     """
     names = {dtype: name for name, dtype in DTYPES.items()}
     header: dict[str, object] = {"__metadata__": {"format": "pt"}}

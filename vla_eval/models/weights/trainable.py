@@ -10,7 +10,7 @@ from typing import Any  # peft and lerobot are untyped
 from torch import nn
 
 from vla_eval.errors import TrainingError, did_you_mean
-from vla_eval.models.shared.weights import listed
+from vla_eval.models.weights.exact import listed
 
 ALL_LINEAR = "all-linear"
 _LORA = re.compile(r"^(?P<module>.+)\.lora_(?:A|B|embedding_A|embedding_B|magnitude_vector)\..+$")
@@ -18,18 +18,14 @@ _SAVED = re.compile(r"^(?P<module>.+)\.modules_to_save\.[^.]+\.(?P<rest>.+)$")
 
 
 def matching(names: Iterable[str], patterns: Sequence[str], *, what: str) -> tuple[str, ...]:
-    """Return the names that a pattern matches as a whole.
-
-    Raises:
-        TrainingError: a pattern is not a regular expression, or matches nothing; `what` is the field.
-    """
+    """Return the names that a pattern matches as a whole; each has to match one. `what` is the field."""
     known = tuple(names)
     found: dict[str, None] = {}
     for pattern in patterns:
         try:
             hits = [name for name in known if re.fullmatch(pattern, name)]
         except re.error as exc:
-            raise TrainingError(f"{what}: '{pattern}' is no regular expression: {exc}.") from exc
+            raise TrainingError(f"{what}: '{pattern}' is not a regular expression: {exc}.") from exc
         if not hits:
             raise TrainingError(
                 f"{what}: '{pattern}' matches none of {len(known)} names, such as "
@@ -66,14 +62,8 @@ def check_lora(model: Any, target: str, full_modules: Sequence[str] = ()) -> tup
 
     Args:
         model: peft's wrapper around the policy.
-        target: regular expression of the modules that have an adapter.
+        target: regular expression of the modules that have an adapter, whose names are returned.
         full_modules: last parts of the names of modules that are trained in full (`modules_to_save`).
-
-    Returns:
-        The names of the modules with an adapter.
-
-    Raises:
-        TrainingError: other parameters are trained, or some of these are not.
     """
     check_lora_target(target)
     inner = model.get_base_model() if hasattr(model, "get_base_model") else model
