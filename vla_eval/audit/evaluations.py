@@ -54,9 +54,7 @@ def kind_of(task: TaskSpec) -> Kind:
 def protocols_of(tasks: Sequence[str], wanted: Sequence[AuditProtocol]) -> tuple[AuditProtocol, ...]:
     """Return the protocols under which tasks are audited: those wanted, or the official tasks' only one.
 
-    Raises:
-        UnknownNameError: a task that is not in the catalogue.
-        RecipeError: tasks of this package and of the official one.
+    Tasks of this package together with official ones are refused.
     """
     official = {task: task_spec(task).is_official for task in tasks}
     if not any(official.values()):
@@ -80,14 +78,9 @@ def audit_configs(
 ) -> tuple[EvalConfig, ...]:
     """Return the evaluations that an audit consists of: one per protocol and kind of task.
 
-    Args:
-        tasks: task ids.
-        protocols: which to run. Tasks without a choice have no phases, so the strict rule equals the
-            paper's for them: they are run under `paper` only.
-        episodes: per task and control, on seeds 1, 2, … or, of official tasks, on those of their runner.
-        workers: processes, or one per core.
-        controls: only these; None: all that fit a task.
-        settings: for example `simulator`.
+    Tasks without a choice have no phases, so the strict rule equals the paper's for them: they are run under
+    `paper` only. The episodes are per task and control, on seeds 1, 2, … or, of official tasks, on those of
+    their runner. Only these controls, if given; `settings` are other fields, such as `simulator`.
 
     Raises:
         UnknownNameError: a task that is not in the catalogue, or a control that there is not.

@@ -18,12 +18,8 @@ def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: boo
     A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, if
     chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`). Doing nothing is a shortcut
     if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats every other control
-    (Fisher) and, where that is known, chance; otherwise there were too few episodes.
-
-    Args:
-        counts: control -> its counts.
-        chance: success rate of a perfect arm that ignores the cue.
-        scripted: whether the task has a scripted arm; without one, nothing but standing still is tried.
+    (Fisher) and, where that is known, chance; otherwise there were too few episodes. Without a scripted arm,
+    nothing but standing still is tried.
     """
     blind = counts.get("cue_blind")
     found = [

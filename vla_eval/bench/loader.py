@@ -1,8 +1,4 @@
-"""Measure how much faster samples come from decoded frames than from video: both loaders in one process.
-
-Every figure is of one run on one machine. The ratio is the one that matters: it hardly depends on the load
-of the machine.
-"""
+"""Measure how much faster samples come from decoded frames than from video, in one process."""
 
 import tempfile
 import time
@@ -27,16 +23,9 @@ SYNTHETIC_EPISODES, SYNTHETIC_FRAMES = 25, 20  # as long as RememberColor3's, a 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoaderReport:
-    """What one run measured.
+    """What one run measured: decoded frames against lerobot's video backend `decoder`, in samples per second.
 
-    Attributes:
-        dataset: the dataset's name.
-        n_frames, n_cameras: its size.
-        decoder: lerobot's video backend.
-        n_samples: samples drawn at random per repeat.
-        first_seconds: to open the decoded frames for the first time, decoding included.
-        again_seconds: to open it again.
-        lerobot_per_second, decoded_per_second: samples.
+    `first_seconds`: to open the decoded frames for the first time, decoding included; `again_seconds`: again.
     """
 
     dataset: str
@@ -58,12 +47,8 @@ class LoaderReport:
 def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> LoaderReport:
     """Measure random access with chunks of eight actions; the lowest of `repeats` times counts.
 
-    Decoded frames go to a folder that is deleted again, so that decoding is part of what is measured.
-
-    Args:
-        root: a dataset; None: a synthetic one.
-        n_samples: how many samples to draw per repeat.
-        repeats: how often both loaders are measured.
+    Decoded frames go to a folder that is deleted again, so that decoding is part of what is measured. Without
+    a dataset a synthetic one is measured.
 
     Raises:
         DatasetError: there is no dataset at `root`.

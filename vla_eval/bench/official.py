@@ -50,7 +50,6 @@ class Baseline:
     """One process that renders every step.
 
     Attributes:
-        name: what was run.
         n_steps: control steps after its first episode.
         seconds: for these.
         cpu_seconds: for these; None: not measured.
@@ -74,7 +73,6 @@ class EvaluationRow:
     """One evaluation at one chunk length.
 
     Attributes:
-        n_action_steps: K.
         n_steps, n_frames: control steps and rendered observations of all episodes.
         seconds: from the command to its end.
         first_seconds: from the command to the first record.
@@ -122,16 +120,10 @@ def run_official_bench(
     n_episodes: int,
     n_baseline_episodes: int,
 ) -> OfficialReport:
-    """Measure.
+    """Measure our evaluations, and a baseline, of which the first episode is only for its start-up.
 
-    Args:
-        task: its id; the official package has it as `…-VLA-v0`.
-        python: interpreter of the environment that the official package is installed in; None: our own eager
-            loop is the baseline.
-        chunk_lengths: values of K.
-        n_workers: of our evaluations.
-        n_episodes: of each of our evaluations.
-        n_baseline_episodes: of the baseline, of which the first is only for its start-up.
+    The official package, of which `python` is the environment's interpreter, has the task as `…-VLA-v0`.
+    Without one, our own eager loop is the baseline.
 
     Raises:
         MissingDependencyError: the interpreter is not there.

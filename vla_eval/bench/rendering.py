@@ -1,8 +1,4 @@
-"""Measure how much faster an episode runs when frames that the policy does not read are not rendered.
-
-Every figure comes from one run: the same episode, the same actions, rendered eagerly and lazily in turn
-in one process, so that the ratio does not depend on the load of the machine.
-"""
+"""Measure eager against lazy rendering: the same episode and actions, in turn in one process."""
 
 import time
 from collections.abc import Sequence
@@ -62,11 +58,7 @@ class BenchReport:
 def run_bench(
     task: str, *, chunk_lengths: Sequence[int], repeats: int, wrist_mesh: RenderSettings
 ) -> BenchReport:
-    """Measure; the lowest of `repeats` times counts, so that a disturbed repeat does not.
-
-    Raises:
-        ConformanceError: the lazy episode was not the eager one.
-    """
+    """Measure; the lowest of `repeats` times counts. `ConformanceError`: lazy and eager episodes differ."""
     env = make_env(EnvSettings(task=task, cameras=CAMERAS, render=wrist_mesh))
     blind = make_env(EnvSettings(task=task))
     try:

@@ -50,10 +50,7 @@ class SessionsRow:
     """So many sessions of one server, against so many copies.
 
     Attributes:
-        n_sessions: sessions, and rows of a pass.
-        served: the server.
         n_copies: processes with a copy each; no more than there are cores.
-        copies: the copies.
     """
 
     n_sessions: int
@@ -76,16 +73,12 @@ class ServingReport:
     """What one run measured.
 
     Attributes:
-        policy: what was served.
         n_parameters: of the small transformer; None for a policy that was named.
-        n_cores: of this machine.
         device: name of the GPU; None: there is none.
         load: processes that wanted a core before the first measurement, see `os.getloadavg`.
         n_latencies: inferences of which latencies are percentiles.
         direct: milliseconds of an inference in the process, of a policy that computes nothing.
         served: the same behind a socket.
-        rows: for each number of sessions.
-        rounding: for each precision.
     """
 
     policy: str
@@ -106,15 +99,10 @@ class ServingReport:
 
 
 def run_serving_bench(policy: str | None, *, sessions: Sequence[int], seconds: float) -> ServingReport:
-    """Measure.
+    """Measure each number of sessions, and each rate for these seconds.
 
-    Args:
-        policy: a recipe, its file or a checkpoint's folder; None: a small transformer with random weights.
-        sessions: numbers of sessions.
-        seconds: how long each rate is measured.
-
-    Raises:
-        RemotePolicyError: a server or a copy does not start.
+    The policy is a recipe, its file or a checkpoint's folder; None: a small transformer with random weights.
+    `RemotePolicyError`: a server or a copy does not start.
     """
     with tempfile.TemporaryDirectory() as scratch:
         folder, n_parameters = Path(scratch), None

@@ -39,12 +39,9 @@ SERVING = re.compile(r"at (ws://\S+)")
 
 
 class Asker:
-    """One episode of a policy, shown random images, one inference after the other.
+    """One episode of a policy, shown random images (by seed), one inference after the other.
 
-    Args:
-        policy: asked by nobody else at the same time, unless it is for the same thread.
-        seed: of the images.
-        row: of a pass.
+    The policy is asked by nobody else at the same time, unless it is for the same thread.
     """
 
     def __init__(self, policy: Policy, *, seed: int = 0, row: int = 0) -> None:
@@ -117,11 +114,7 @@ class Server:
 
 @contextmanager
 def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
-    """Serve a policy on a free port, and end the server afterwards.
-
-    Raises:
-        RemotePolicyError: it does not start.
-    """
+    """Serve a policy on a free port, end the server afterwards; `RemotePolicyError` if it does not start."""
     command = python_command("-m", "vla_eval.cli", "serve", "--policy", policy)
     command += ["--port", "0", "--max-batch", str(n_rows)]
     with tempfile.TemporaryFile("w+") as errors:
@@ -154,7 +147,6 @@ class Load:
     """What was measured of something that infers.
 
     Attributes:
-        per_second: inferences.
         resident_bytes: memory of its processes.
         device_bytes: memory of the GPU that they took; None: there is none.
     """
@@ -165,11 +157,7 @@ class Load:
 
 
 def measure_copies(policy: str, *, n_copies: int, seconds: float) -> Load:
-    """Let so many processes infer, each with its own copy of the policy and one thread, for some seconds.
-
-    Raises:
-        RemotePolicyError: a copy could not be made, or ended.
-    """
+    """Let so many processes infer, each with a copy and one thread; `RemotePolicyError` if one ends."""
     spawn = child_context()
     free_before = free_device_bytes()
     barrier, results = spawn.Barrier(n_copies), spawn.Queue()

@@ -18,9 +18,6 @@ class AppearanceSettings:
         table_rgb: the table has a plain top of this red, green and blue instead of wood; None: wood.
         hue_deg: the hue of every object of the task is so much further on the circle of hues. Red is 0,
             green 120, blue 240.
-
-    Raises:
-        RecipeError: a number out of its range.
     """
 
     light: Annotated[float, Bounds(0.0, 10.0)] = 1.0

@@ -43,13 +43,7 @@ class CaptureConfig:
 
 
 def may_be_wanted(which: Which, *, run: int, index: int) -> bool:
-    """Return whether an episode may have to be captured, before its outcome is known.
-
-    Args:
-        which: what is captured.
-        run: the episode's run.
-        index: which of the seeds of a run it has, from 0.
-    """
+    """Return whether the episode of a run with its seed of this index, from 0, may have to be captured."""
     return run == 0 and index < which if isinstance(which, int) else which != "none"
 
 

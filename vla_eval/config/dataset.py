@@ -59,14 +59,6 @@ class DatasetRecipe:
             raise RecipeError(f"tasks is {list(self.tasks)}, expected at least one, none of them twice.")
         check_bounds(self)
         check_seeds(self.seed_start, self.episodes + self.max_failed_seeds)
-        self._refuse_evaluation_seeds()
-
-    @property
-    def last_seed(self) -> int:
-        """The highest seed that may be tried before the recording fails."""
-        return self.seed_start + self.episodes + self.max_failed_seeds - 1
-
-    def _refuse_evaluation_seeds(self) -> None:
         first, last = EVALUATION_SEEDS[0], EVALUATION_SEEDS[-1]
         if self.seed_start <= last and self.last_seed >= first:
             raise RecipeError(
@@ -75,6 +67,11 @@ class DatasetRecipe:
                 f"{self.last_seed}, which overlap the evaluation's seeds {first} to {last}. A policy must "
                 f"not be tested on what it was shown: use a seed_start above {last}, such as 1000."
             )
+
+    @property
+    def last_seed(self) -> int:
+        """The highest seed that may be tried before the recording fails."""
+        return self.seed_start + self.episodes + self.max_failed_seeds - 1
 
 
 OPTION_FIELDS = ("name", "description", "workers", "timeouts")

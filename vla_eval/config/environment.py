@@ -1,7 +1,4 @@
-"""What an environment is made from, as data that can be compared and sent to a worker.
-
-Knows nothing of simulators; `vla_eval.envs.factory` makes the environment.
-"""
+"""What an environment is made from, as data for a worker; `vla_eval.envs.factory` makes it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -40,9 +37,6 @@ class EnvSettings:
         task: task id from the catalogue.
         kwargs: the user's task arguments; they go on top of the catalogue row's own.
         simulator: `maniskill`, or `fake` (arrays only, for tests and dry runs).
-        sim_backend: where the physics runs.
-        render: how images are rendered.
-        appearance: how the scene looks.
         cameras: the cameras that may be rendered; empty: no renderer is started.
         privileged: whether observations carry the true state of the world.
         human_camera_stride: every so many control steps, and at the reset, images include `human_camera`,

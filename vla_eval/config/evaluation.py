@@ -39,11 +39,7 @@ class TimeoutConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvalConfig:
-    """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys.
-
-    Raises:
-        RecipeError: a value out of its range, or something named twice.
-    """
+    """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys."""
 
     name: str
     tasks: tuple[str, ...]

@@ -30,9 +30,7 @@ class Recipe[T]:
 
     Attributes:
         name: the file's name without `.yaml`.
-        path: the file.
         sha256: digest of the file's bytes.
-        value: what it says.
     """
 
     name: str
@@ -75,15 +73,7 @@ def shipped_digests() -> dict[str, str]:
 
 
 def find_recipe(folder: Folder, name: str) -> Path:
-    """Return the file of a recipe.
-
-    Args:
-        folder: the kind of recipe.
-        name: a path, or the name of a recipe, with or without `.yaml`.
-
-    Raises:
-        UnknownNameError: there is no such file; the message names what there is.
-    """
+    """Return the file of a recipe, by its path or its name, or raise `UnknownNameError`."""
     as_path = Path(name)
     # os.path, unlike Path, returns False for what cannot be a path: too long, or with a NUL.
     if as_path.suffix in (".yaml", ".yml") and os.path.isfile(as_path):
@@ -101,19 +91,11 @@ def find_recipe(folder: Folder, name: str) -> Path:
 
 
 def load_recipe[T](
-    folder: Folder,
-    name: str,
-    cls: type[T],
-    *,
-    edit: Callable[[dict[str, Any]], None] | None = None,
+    folder: Folder, name: str, cls: type[T], *, edit: Callable[[dict[str, Any]], None] | None = None
 ) -> Recipe[T]:
-    """Find a recipe, read it strictly, and return it as an object of `cls`.
+    """Find a recipe, read it strictly, and return it as an object of the dataclass of its kind.
 
-    Args:
-        folder: the kind of recipe.
-        name: see `find_recipe`.
-        cls: the dataclass of that kind.
-        edit: changes what the file says, before it is checked (flags and overrides).
+    `edit` changes what the file says, before it is checked (flags and overrides).
 
     Raises:
         UnknownNameError: there is no such recipe.
@@ -127,12 +109,7 @@ def load_recipe[T](
 
 
 def recipe_fields(folder: Folder, name: str) -> frozenset[str]:
-    """Return which fields a recipe sets: they show which kind of recipe it is.
-
-    Raises:
-        UnknownNameError: there is no such recipe.
-        RecipeError: it cannot be read.
-    """
+    """Return which fields a recipe sets, which show its kind; errors as `load_recipe`."""
     return frozenset(_read(folder, name).data)
 
 
@@ -162,11 +139,7 @@ def _read(folder: Folder, name: str) -> _File:
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str], *, cls: type) -> None:
-    """Change `data` in place by `a.b=c` each; the value is read as YAML.
-
-    Raises:
-        RecipeError: no `=`, no YAML, or no such field.
-    """
+    """Change `data` in place by `a.b=c` each, c read as YAML; refuse no `=`, no YAML, or no such field."""
     for override in overrides:
         path, equals, text = override.partition("=")
         where = f"--set {override:.{MAX_SHOWN}}"

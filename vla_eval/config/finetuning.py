@@ -1,7 +1,4 @@
-"""How a policy is fine-tuned: the `finetune` section of `policies/*.yaml`, and one fine-tuning.
-
-Standard library only: `mikasa-vla list` reads recipes without waiting for torch.
-"""
+"""The `finetune` section of `policies/*.yaml`, and one fine-tuning. Standard library only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -67,8 +64,6 @@ class FinetuneRecipe:
         base_checkpoint: folder with the weights to start from; None: from scratch.
         tokenizer: folder of the tokenizer; None: the one that the policy names, from the local cache.
         rename_cameras: field of the dataset -> field of the base checkpoint.
-        lora: train adapters only.
-        steps: gradient steps.
         batch_size: samples per step and process.
         micro_batch_size: how many of them go through the network at once; None: all. Gradients are added up
             (gradient accumulation), so that the step is the same with less of the device's memory.
@@ -132,7 +127,6 @@ class HeldOutConfig:
         episodes, seed_start: on which seeds; none of those that tables or demonstrations are made from.
         task: task id; None: the dataset's.
         n_action_steps: actions executed per inference; None: the policy's own number.
-        env: arguments of the task.
         simulator, slots_per_worker, workers: see `EvalConfig`.
     """
 
@@ -157,11 +151,9 @@ class FinetuneConfig:
 
     Attributes:
         policy: name of a recipe in `policies/` that has a `finetune` section.
-        dataset: folder of a dataset.
         out: the run folder; None: `runs/POLICY-DATASET-SEED`.
         run_seed: of initial weights, order of samples and noise.
         finetune: fields of the recipe's `finetune` section, set to other values.
-        device: `auto`, `cpu`, `cuda`.
         held_out: evaluate checkpoints on held-out seeds during training; None: do not.
         allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
     """

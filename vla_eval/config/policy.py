@@ -25,9 +25,7 @@ class PolicyRecipe:
 
     Attributes:
         version: raised when a change of the recipe moves a success rate.
-        description: one sentence.
         adapter: a name from the registry (`mikasa-vla list policies`) or `module:attr`.
-        args: keyword arguments of the adapter.
         default_n_action_steps: actions executed per inference, where the evaluation names none.
         max_workers: how many workers `workers: auto` may start, since each loads the policy.
         needs_candidates: the policy makes no sense for a task without candidates; such a pair is left out.
@@ -48,10 +46,9 @@ class PolicyRecipe:
 
 
 def load_policy(name: str) -> Recipe[PolicyRecipe]:
-    """Return the recipe of a policy; of a former name, its row of `configs/ablations.yaml`, with a warning.
+    """Return the recipe of a policy; errors as `load_recipe`.
 
-    Raises:
-        UnknownNameError, RecipeError: see `load_recipe`.
+    A former name gives its row of `configs/ablations.yaml`, with a warning.
     """
     try:
         return load_recipe("policies", name, PolicyRecipe)

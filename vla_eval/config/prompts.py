@@ -15,7 +15,6 @@ class PromptRecipe:
 
     Attributes:
         version: raised when a sentence changes.
-        description: one sentence.
         source: where the sentences come from.
         instructions: instruction key of a task -> its sentence, then paraphrases of it.
     """
@@ -55,8 +54,7 @@ def instructions_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> 
 def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, ...]:
     """Return a task's sentences in a set: the sentence, then its paraphrases; else the task's own sentence.
 
-    Raises:
-        MissingInstructionError: the set has no sentence for this task, or an empty one.
+    One that is missing or empty raises `MissingInstructionError`.
     """
     sentences = prompts.value.instructions.get(spec.instruction_key, ())
     if not sentences and spec.instruction is not None:

@@ -23,9 +23,7 @@ class Protocol:
     """`protocols/*.yaml`. `docs/protocols.md` has the table of all fields.
 
     Attributes:
-        name: as in the file's name.
         version: raised whenever a figure under the protocol would change.
-        description: one line.
         source: where it is published.
         tasks: task id -> version of the task's rules here.
         episodes, seed_start: the seeds of each task and run.
@@ -88,22 +86,14 @@ class Protocol:
 
 
 def load_protocol(name: str) -> Recipe[Protocol]:
-    """Read a protocol.
-
-    Raises:
-        UnknownNameError, RecipeError: see `load_recipe`; or the file has another name than the protocol.
-    """
+    """Read a protocol; errors as `load_recipe`, or `RecipeError` if the file has another name than it."""
     recipe = load_recipe("protocols", name, Protocol)
     require(recipe.value.name == recipe.name, f"{recipe.path}: name", recipe.value.name, f"'{recipe.name}'")
     return recipe
 
 
 def fill_from_protocol(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-    """Set, in the data of an evaluation with `protocol`, the fields that it leaves out.
-
-    Raises:
-        UnknownNameError, RecipeError: see `load_protocol`.
-    """
+    """Set what the data of an evaluation with `protocol` leave out; errors as `load_protocol`."""
     name = data.get("protocol")
     if not isinstance(name, str):  # none, or a wrong type, which `decode` refuses
         return

@@ -8,11 +8,7 @@ PACKAGE_ROOT = Path(vla_eval.__file__).parent
 
 
 def search_folders(kind: str) -> tuple[Path, ...]:
-    """Return the folders in which files of a kind are looked for, in this order: the user's, the package's.
-
-    Args:
-        kind: name of the folder: `configs`, `policies`, `prompts`, `datasets`, `protocols` or `checkpoints`.
-    """
+    """Return the folders with files of a kind (`configs`, `datasets` …): the user's, the package's."""
     packaged = PACKAGE_ROOT / "recipes_data" / kind
     # An editable checkout has no recipes_data: these folders are next to the package.
     shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / kind

@@ -22,7 +22,6 @@ class Finding:
 
     Attributes:
         status: `fail` means that evaluations do not work; `warn`, that something may not.
-        found: what there is.
         advice: what to do, unless all is well.
     """
 
@@ -40,11 +39,7 @@ type Probe = Callable[[str], Mapping[str, Any]]  # Any: JSON
 
 
 def run_probe(name: str) -> Mapping[str, Any]:  # Any: JSON
-    """Call a function of `doctor.subprocess_checks` in another process.
-
-    Raises:
-        ProbeFailure: it failed, crashed or hung.
-    """
+    """Call a function of `doctor.subprocess_checks` in another process; `ProbeFailure` if it fails."""
     command = python_command("-m", "vla_eval.doctor.subprocess_checks", name)
     try:
         with own_need():

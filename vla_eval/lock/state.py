@@ -36,8 +36,6 @@ class State:
         everything: why all is let through; None: it is not.
         code: folders that Python files may be run from.
         foreign: folders of checkpoints and datasets, which may lie within those of `code`.
-        tools: programs that libraries may start.
-        hosts: names that may be looked up.
         writes: files and folders that may be written.
         finder: stands first in `sys.meta_path`.
         ours: of each thread, how many `own_need` are open.

@@ -75,12 +75,7 @@ def let_resolve(host: str) -> None:
 
 
 def let_connect(why: str, *programs: str) -> None:
-    """Let this process connect to anything, since the user has asked for something that does.
-
-    Args:
-        why: what was asked for.
-        programs: names of programs that it starts.
-    """
+    """Let this process connect to anything, and start these programs, since the user asked for it (`why`)."""
     if not STATE.is_on:
         return
     STATE.network = STATE.network or why

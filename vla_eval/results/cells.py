@@ -1,7 +1,4 @@
-"""Escape names and notes: no formula, no markup, no second line.
-
-Knows nothing of tables.
-"""
+"""Escape names and notes: no formula, no markup, no second line. Knows nothing of tables."""
 
 import html
 import re
@@ -63,11 +60,8 @@ def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_number: 
     styles = [' style="text-align:right"' if number else "" for number in is_number]
 
     def line(cells: Sequence[str], tag: str) -> str:
-        whole = (
-            f"<{tag}{style}>{html.escape(printable(cell))}</{tag}>"
-            for cell, style in zip(cells, styles, strict=True)
-        )
-        return f"<tr>{''.join(whole)}</tr>"
+        pairs = zip(styles, map(html.escape, map(printable, cells)), strict=True)
+        return f"<tr>{''.join(f'<{tag}{style}>{cell}</{tag}>' for style, cell in pairs)}</tr>"
 
     body = "\n".join(line(row, "td") for row in rows)
     return f"<table>\n<thead>{line(titles, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>"

@@ -48,7 +48,6 @@ class ChoiceReport:
     """The choices of a row's episodes with candidates.
 
     Attributes:
-        n_candidates: number of candidates.
         causes: cause -> number of episodes; contains every cause.
         confusion: by item and by place: (target, chosen or None) -> number of episodes. Empty if it was
             not recorded, or if several candidates are right.
@@ -66,11 +65,7 @@ class ChoiceReport:
 
 
 def report_choices(group: RowEpisodes) -> ChoiceReport | None:
-    """Sort a row's episodes by the outcome of the choice.
-
-    Returns:
-        None for a task without candidates, and if there is no result.
-    """
+    """Sort a row's episodes by the outcome of the choice; None without a result or candidates."""
     results = [record for record in group.results if record.n_candidates]
     if not results:
         return None
@@ -95,16 +90,10 @@ def report_choices(group: RowEpisodes) -> ChoiceReport | None:
 
 
 def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) -> Habit | None:
-    """Test whether wrong choices prefer one index.
+    """Test whether wrong choices prefer one index; right ones follow the target, wherever it is.
 
-    Only wrong choices are used: right ones follow the target, wherever it is.
-
-    Args:
-        counts: (target, chosen or None) -> number of episodes.
-        n_candidates: number of indices; with two there is only one wrong choice.
-
-    Returns:
-        The index with the smallest p value, or None if there is nothing to test.
+    `counts` is (target, chosen or None) -> number of episodes. The index with the smallest p value is
+    returned; None if there is nothing to test: with two indices there is only one wrong choice.
     """
     wrong = {pair: n for pair, n in counts.items() if pair[1] is not None and pair[0] != pair[1]}
     if n_candidates < 3 or not wrong:

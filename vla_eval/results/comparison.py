@@ -21,7 +21,6 @@ CEILING_POLICY = "oracle"
 RANDOM_POLICY = "random"
 TOUR_POLICY = "tour"
 
-
 IntervalKind = Literal["wilson", "t_over_runs"]
 ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
 
@@ -70,7 +69,6 @@ class Evidence:
     """What the statistics of one row are estimated from.
 
     Attributes:
-        episodes: its episodes.
         success: how often they succeed.
         chance, ceiling: success without memory, and of the oracle, in the setting of the row.
         comparisons: with each baseline of the table; None where there is no pair of episodes.
@@ -109,11 +107,7 @@ def success_of(group: RowEpisodes) -> Success:
 
 
 def compare[K](pairs: Mapping[K, tuple[RowEpisodes, RowEpisodes]]) -> dict[K, Comparison]:
-    """Compare rows with other rows on the same run and seed; the p values are corrected together.
-
-    Returns:
-        The comparisons of those that share episodes.
-    """
+    """Compare rows with others on the same run and seed; the p values are corrected together."""
     counts = {place: count_pairs(*pair) for place, pair in pairs.items()}
     tests = {place: test for place, found in counts.items() if (test := mcnemar_exact(found)) is not None}
     corrected = holm([test.p_value for test in tests.values()])
@@ -126,16 +120,10 @@ def compare[K](pairs: Mapping[K, tuple[RowEpisodes, RowEpisodes]]) -> dict[K, Co
 def compare_with_baselines(
     groups: Mapping[RowKey, RowEpisodes], baselines: Sequence[str]
 ) -> dict[RowKey, tuple[Comparison | None, ...]]:
-    """Compare every other policy with each baseline, on the same task, variant, run and seed.
+    """Compare all rows with those of each baseline policy, on the same task, variant, run and seed.
 
-    No pair of policies is tested twice: a baseline is not compared with those before it.
-
-    Args:
-        groups: all rows.
-        baselines: names of the policies to compare with.
-
-    Returns:
-        Row -> its comparison with each baseline, None where they share no episodes.
+    No pair of policies is tested twice: a baseline is not compared with those before it. Rows that share no
+    episodes have None.
     """
     found = compare(
         {
@@ -178,12 +166,9 @@ def chance_of(
     if blind.success_once is not None and blind.ci_low is not None and blind.ci_high is not None:
         interval = Interval(blind.ci_low, blind.ci_high)
         return Chance(rate=blind.success_once, source="cue_blind", interval=interval)
-    records = [
-        record
-        for other, group in groups.items()
-        if (other.task, other.variant) == (key.task, key.variant)
-        for record in group.results
-    ]
+    place = (key.task, key.variant)
+    alike = (group for other, group in groups.items() if (other.task, other.variant) == place)
+    records = [record for group in alike for record in group.results]
     by_luck = {record.chance_success for record in records if record.chance_success is not None}
     if len(by_luck) == 1:
         return Chance(rate=by_luck.pop(), source="1/N")

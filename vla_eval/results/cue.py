@@ -22,18 +22,11 @@ class CueFrames(NamedTuple):
 
 
 def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
-    """Return how many frames of the cue a row's policy got per episode.
+    """Return how many frames of the cue a row's policy got per episode, with these arguments of the task.
 
     The observation at step s shows the cue if s < cue_steps, counted from `cue_after_steps` on. A policy that
     reads the last frame gets those of the steps 0, K, 2K, … that are among these; one that reads every frame
-    gets all of them before it predicts.
-
-    Args:
-        group: the row; its records show whether the policy got every frame.
-        env: the arguments of the task.
-
-    Returns:
-        None for a task without a cue phase, and if nothing was rendered for the policy.
+    gets all of them before it predicts. None for a task without a cue phase, or if nothing was rendered.
     """
     spec = find_task(group.key.task)
     if spec is None or spec.candidates is None or not group.results:

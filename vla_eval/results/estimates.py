@@ -24,14 +24,7 @@ class Interval(NamedTuple):
 
 
 class PairCounts(NamedTuple):
-    """Outcomes of two policies on the same episodes.
-
-    Attributes:
-        both: both succeeded.
-        only_first: only the first succeeded.
-        only_second: only the second succeeded.
-        neither: none succeeded.
-    """
+    """Outcomes of two policies on the same episodes: in how many both, only one or neither succeeded."""
 
     both: int
     only_first: int
@@ -67,13 +60,7 @@ class RunsEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedTest:
-    """The difference of two policies on the same episodes: first minus second.
-
-    Attributes:
-        difference: difference of the success rates over the pairs.
-        interval: its 95 % interval.
-        p_value: two-sided exact McNemar test.
-    """
+    """First minus second policy on the same episodes: 95 % interval, p of the exact McNemar test."""
 
     difference: float
     interval: Interval
@@ -81,11 +68,7 @@ class PairedTest:
 
 
 def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
-    """Return the Wilson score interval of a proportion, at 95 %.
-
-    Args:
-        n_success: number of successes, 0 to `n_episodes`.
-        n_episodes: number of episodes; with 0 the interval is undefined.
+    """Return the Wilson score interval of a proportion, at 95 %; None without an episode.
 
     Source: Wilson 1927, JASA 22(158):209-212; recommended for small n by Brown, Cai & DasGupta 2001,
     Statistical Science 16(2):101-133. Computed by scipy.stats.binomtest.
@@ -97,13 +80,10 @@ def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
 
 
 def mean_interval(counts: Sequence[tuple[int, int]]) -> Interval:
-    """Return the interval of the mean of several independent proportions, at 95 %.
+    """Return the 95 % interval of the mean of independent proportions (successes, episodes), none empty.
 
     The squares of the distances from each rate to the end of its Wilson interval add up, as variances do.
     The proportions are those asked for and no sample of others: the interval is over episodes alone.
-
-    Args:
-        counts: successes and episodes of each, at least one episode.
 
     Source: Zou & Donner 2008, "Construction of confidence limits about effect measures: a general approach",
     Statistics in Medicine 27(10):1693-1702, for a sum of two, here of any number of rates.
@@ -116,10 +96,7 @@ def mean_interval(counts: Sequence[tuple[int, int]]) -> Interval:
 
 
 def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
-    """Return mean, SEM and 95 % t interval over independent runs.
-
-    Args:
-        run_means: success rate of each run, each in [0, 1]; with none the estimate is undefined.
+    """Return mean, SEM and 95 % t interval over the success rates of independent runs; None without any.
 
     Source: Student's t with n - 1 degrees of freedom over the run means; SEM as in the paper, section
     "Experiments Reproducing and Compute Resources". The interval is clipped to [0, 1].
@@ -139,13 +116,10 @@ def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
 
 
 def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
-    """Compare two policies on the same episodes.
+    """Compare two policies on the same episodes; None without a pair.
 
     Only the pairs in which they differ are informative: if neither policy were better, each of these would
     be the toss of a fair coin. Without any such pair p is 1.
-
-    Args:
-        counts: the pairs; without a pair the test is undefined.
 
     Source: McNemar 1947, Psychometrika 12:153-157, in its exact form: a two-sided binomial test of
     `only_first` among `only_first + only_second`. Computed by scipy.stats.binomtest.
@@ -155,21 +129,14 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     n_different = counts.only_first + counts.only_second
     p_value = float(stats.binomtest(counts.only_first, n_different).pvalue) if n_different else 1.0
     difference = (counts.only_first - counts.only_second) / counts.n_pairs
-    return PairedTest(
-        difference=difference,
-        interval=paired_interval(counts),
-        p_value=min(1.0, p_value),
-    )
+    return PairedTest(difference=difference, interval=paired_interval(counts), p_value=min(1.0, p_value))
 
 
 def paired_interval(counts: PairCounts) -> Interval:
-    """Return the interval of a difference of two rates over the same episodes, at 95 %.
+    """Return the interval of a difference of two rates over the same episodes, at least one, at 95 %.
 
     Wilson's interval of each rate, combined by the correlation of the outcomes. It is not derived from the
     exact test, so close to a difference of 0 the two may disagree.
-
-    Args:
-        counts: at least one pair.
 
     Source: Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions
     based on paired data", Statistics in Medicine 17(22):2635-2650, method 10.
@@ -177,8 +144,11 @@ def paired_interval(counts: PairCounts) -> Interval:
     n, n_first, n_second = counts.n_pairs, counts.both + counts.only_first, counts.both + counts.only_second
     first, second = _below_and_above(n_first, n), _below_and_above(n_second, n)
     phi = _correlation(counts)
-    low = _combined(first.below, second.above, phi)
-    high = _combined(first.above, second.below, phi)
+
+    def combined(one: float, other: float) -> float:
+        return math.sqrt(max(0.0, one**2 - 2 * phi * one * other + other**2))
+
+    low, high = combined(first.below, second.above), combined(first.above, second.below)
     difference = (n_first - n_second) / n
     return Interval(max(-1.0, difference - low), min(1.0, difference + high))
 
@@ -197,10 +167,6 @@ def _below_and_above(n_success: int, n_episodes: int) -> _Reach:
     return _Reach(rate - interval.low, interval.high - rate)
 
 
-def _combined(first: float, second: float, phi: float) -> float:
-    return math.sqrt(max(0.0, first**2 - 2 * phi * first * second + second**2))
-
-
 def _correlation(counts: PairCounts) -> float:
     """Return the correlation of paired outcomes, drawn towards 0 if it is positive; 0 if one never varies."""
     n_first, n_second = counts.both + counts.only_first, counts.both + counts.only_second
@@ -215,12 +181,7 @@ def _correlation(counts: PairCounts) -> float:
 
 
 def p_above(n_success: int, n_episodes: int, rate: float) -> float:
-    """Return the probability of at least this many successes at a given success rate.
-
-    Args:
-        n_success: number of successes, 0 to `n_episodes`.
-        n_episodes: number of episodes; with 0 the probability is 1.
-        rate: the success rate under the null hypothesis, in [0, 1].
+    """Return the probability of at least so many successes if the true rate is `rate`; 1 without an episode.
 
     Source: one-sided exact binomial test, computed by scipy.stats.binomtest.
     """
@@ -232,9 +193,7 @@ def p_above(n_success: int, n_episodes: int, rate: float) -> float:
 def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
     """Return the probability that the first is at least this far ahead if both are equally good.
 
-    Args:
-        first: successes and episodes.
-        second: successes and episodes, of other episodes than the first.
+    Each is successes and episodes; the episodes are not the same.
 
     Source: Fisher's one-sided exact test, computed by scipy.stats.fisher_exact.
     """
@@ -243,10 +202,7 @@ def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
-    """Return p values corrected for multiple comparisons, in the same order.
-
-    Args:
-        p_values: uncorrected p values of all comparisons that are reported together.
+    """Return the p values of all comparisons reported together, corrected, in the same order.
 
     Source: Holm 1979, Scandinavian Journal of Statistics 6(2):65-70: keeps the probability of any false
     positive among them below the level, whatever their dependence. Computed by statsmodels.
@@ -260,16 +216,9 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
 
 
 def chance_corrected(score: float | None, *, chance: float | None, ceiling: float | None) -> float | None:
-    """Return a score relative to chance (0) and ceiling (1); below chance it is negative.
+    """Return a success rate relative to chance (0) and the oracle's (1); below chance it is negative.
 
-    Args:
-        score: success rate.
-        chance: success rate without memory.
-        ceiling: success rate of the expert, which sees the full state.
-
-    Returns:
-        `(score - chance) / (ceiling - chance)`, or None if a value is missing or the ceiling is not above
-        chance.
+    None if a value is missing or the ceiling is not above chance.
 
     Source: the form of Cohen's kappa (1960, Educational and Psychological Measurement 20:37-46), with
     the measured ceiling instead of 1.

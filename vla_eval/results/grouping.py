@@ -1,8 +1,4 @@
-"""Sort the episodes of several run folders into the rows of one table.
-
-Episodes with different settings are never combined, and no episode is counted twice. Knows nothing of
-statistics.
-"""
+"""Sort episodes of run folders into the rows of one table: never across settings, none counted twice."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -59,7 +55,6 @@ class Run:
     """One independent run of a row.
 
     Attributes:
-        index: the run index of its records.
         copy: 0, or 1, 2 … if further run folders hold the same episodes with other trajectories or other
             weights.
         records: seed -> record.
@@ -120,7 +115,6 @@ class Grouping:
     """All rows, in the order of the table.
 
     Attributes:
-        groups: by key.
         n_doubles: run folder -> number of its episodes that an earlier folder already had.
         further: run folders that hold the episodes of another folder with other trajectories or weights.
         folders: by key: the run folders that hold episodes of the row.
@@ -147,7 +141,11 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
     further: dict[str, None] = {}
     folders: dict[RowKey, list[StoredRun]] = defaultdict(list)
     for stored, label_of in zip(runs, labels, strict=True):
-        for (key, index), records in _by_run(stored, label_of).items():
+        own: dict[tuple[RowKey, int], dict[int, EpisodeRecord]] = defaultdict(dict)
+        for record in stored.records:
+            key = RowKey(record.task, record.policy, record.n_action_steps, label_of[record.task])
+            own[key, record.run][record.seed] = record
+        for (key, index), records in own.items():
             copies = found[key][index]
             if stored not in folders[key]:
                 folders[key].append(stored)
@@ -164,17 +162,6 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
         further=tuple(further),
         folders={key: tuple(of_row) for key, of_row in folders.items()},
     )
-
-
-def _by_run(
-    stored: StoredRun, label_of: Mapping[str, str | None]
-) -> dict[tuple[RowKey, int], dict[int, EpisodeRecord]]:
-    """Return one folder's records: (row, run index) -> seed -> record."""
-    found: dict[tuple[RowKey, int], dict[int, EpisodeRecord]] = defaultdict(dict)
-    for record in stored.records:
-        key = RowKey(record.task, record.policy, record.n_action_steps, label_of[record.task])
-        found[key, record.run][record.seed] = record
-    return found
 
 
 def _weights(stored: StoredRun, policy: str, index: int) -> frozenset[str]:
@@ -246,11 +233,9 @@ def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
 
 
 def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
-    """Return for each run: task -> the settings that differ, None if none do.
+    """Return for each run: task -> the settings that differ between the runs, None if none do.
 
-    Args:
-        runs: all runs of the table; only values that differ between them are named, and of these only what
-            a run sets; it is `DEFAULT` where it sets none of them.
+    Only what a run sets is named; it is `DEFAULT` where it sets none of them.
     """
     settings = [_settings(run) for run in runs]
     names = sorted({name for values in settings for name in values})
@@ -296,25 +281,17 @@ def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     return tuple(bare(str(name)) for name in names)
 
 
-def _in_order(groups: Iterable[RowEpisodes], runs: Sequence[StoredRun]) -> list[RowEpisodes]:
-    tasks = _ranks(
-        *(config_names(run, "tasks") for run in runs), (r.task for run in runs for r in run.records)
-    )
-    policies = _ranks(
-        *(config_names(run, "policies") for run in runs), (r.policy for run in runs for r in run.records)
-    )
-    groups = list(groups)
-    variants = _ranks(group.key.variant or "" for group in groups)  # in the order of the run folders
-    return sorted(
-        groups,
-        key=lambda group: (
-            tasks[group.key.task],
-            policies[group.key.policy],
-            group.key.n_action_steps,
-            variants[group.key.variant or ""],
-        ),
-    )
+def _in_order(groups: Sequence[RowEpisodes], runs: Sequence[StoredRun]) -> list[RowEpisodes]:
+    records = [record for run in runs for record in run.records]
+    tasks = _ranks(*(config_names(run, "tasks") for run in runs), (r.task for r in records))
+    policies = _ranks(*(config_names(run, "policies") for run in runs), (r.policy for r in records))
+    variants = _ranks(group.key.variant for group in groups)  # in the order of the run folders
+
+    def place(key: RowKey) -> tuple[int, int, int, int]:
+        return tasks[key.task], policies[key.policy], key.n_action_steps, variants[key.variant]
+
+    return sorted(groups, key=lambda group: place(group.key))
 
 
-def _ranks(*names: Iterable[str]) -> dict[str, int]:
+def _ranks[N](*names: Iterable[N]) -> dict[N, int]:
     return {name: rank for rank, name in enumerate(dict.fromkeys(chain(*names)))}

@@ -39,14 +39,7 @@ def latex_table(
     *,
     ruled_by_first: bool = False,
 ) -> list[str]:
-    """Return the lines of a `tabular`, which needs booktabs.
-
-    Args:
-        titles: of the columns.
-        rows: as many cells each.
-        is_number: whether a column is aligned to the right.
-        ruled_by_first: draw a rule wherever the first cell changes.
-    """
+    """Return the lines of a `tabular`, which needs booktabs; with rules where the first cell changes."""
     lines = [f"\\begin{{tabular}}{{{''.join('r' if number else 'l' for number in is_number)}}}", "\\toprule"]
     lines += [latex_row(titles), "\\midrule"]
     for above, row in zip((None, *rows), rows, strict=False):
@@ -62,11 +55,8 @@ NEEDS = "% needs \\usepackage{booktabs,graphicx}"
 
 def fitted(lines: Sequence[str]) -> list[str]:
     r"""Return a table that is scaled down to `\linewidth` where it is wider; needs booktabs and graphicx."""
-    return [
-        "\\noindent\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%",
-        *lines,
-        "}",
-    ]
+    scale = "\\noindent\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"
+    return [scale, *lines, "}"]
 
 
 def footnotes(notes: Iterable[str]) -> list[str]:
@@ -89,7 +79,5 @@ def latex_first(cell: str) -> str:
 
 def latex_text(text: str) -> str:
     """Return text for LaTeX: its own characters escaped, names in backticks as code."""
-    parts = [
-        part.translate(_LATEX) for part in re.split("`([^`]*)`", printable(text))
-    ]  # every second one was code
+    parts = [part.translate(_LATEX) for part in re.split("`([^`]*)`", printable(text))]
     return "".join(f"\\texttt{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

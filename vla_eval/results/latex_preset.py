@@ -1,7 +1,4 @@
-"""Write a table as a paper has it: LaTeX, tasks as columns, policies as rows, the best policy in bold.
-
-Knows nothing of episodes.
-"""
+"""Write a table as a paper has it: LaTeX, tasks as columns, policies as rows, the best policy in bold."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -44,16 +41,13 @@ def paper_preset(table: Table) -> str:
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
-    slug = (
-        re.sub("[^a-z0-9]+", "-", "-".join(dict.fromkeys(table.runs.values())).lower()).strip("-")
-        or "results"
-    )
+    slug = re.sub("[^a-z0-9]+", "-", "-".join(dict.fromkeys(table.runs.values())).lower()).strip("-")
     lines = [
         "% needs \\usepackage{booktabs}",
         "\\begin{table}[t]",
         "\\centering",
         f"\\caption{{{_caption(table)}}}",
-        f"\\label{{tab:{slug}}}",
+        f"\\label{{tab:{slug or 'results'}}}",
         "\\smallskip",
         "\\small",
         f"\\setlength{{\\tabcolsep}}{{{COLUMN_SPACE_PT / 2:g}pt}}",
@@ -153,15 +147,15 @@ def _cell_width_pt(rows: Sequence[Row], tasks: Sequence[str]) -> float:
 
 def _caption(table: Table) -> str:
     rows = [row for row in table.rows if row[SUCCESS].success_once is not None]
-    parts = ["Success once with its 95\\,\\% interval"]
+    first = "Success once with its 95\\,\\% interval"
     counts = sorted({row[EPISODES].n_episodes for row in rows})
     if counts:
         spread = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        parts.append(f", {spread} episodes per cell")
+        first += f", {spread} episodes per cell"
     sizes = {row.n_action_steps for row in rows}
     if len(sizes) == 1:
-        parts.append(f", $K = {sizes.pop()}$")
-    sentences = ["".join(parts) + "."]
+        first += f", $K = {sizes.pop()}$"
+    sentences = [f"{first}."]
     if any(row[SUCCESS].sem is not None for row in rows):
         sentences.append("$\\pm$: standard error over the runs.")
     learned = {row.key.of_all_tasks for row in rows if row.policy not in CONTROLS}

@@ -46,7 +46,6 @@ class PrintedTable:
     """A table for reading, and its notes.
 
     Attributes:
-        columns: from the left.
         rows: as many cells each; without rows only the notes appear.
         notes: whole sentences.
         same: title and cell of each column that has the same cell in all rows, for a line above the table.

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from vla_eval.errors import ReportError, unknown_name
-from vla_eval.results import notes
 from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.comparison import (
     CHANCE_POLICY,
@@ -19,6 +18,7 @@ from vla_eval.results.comparison import (
 )
 from vla_eval.results.formats import FORMATS, Format
 from vla_eval.results.grouping import group_runs
+from vla_eval.results.notes import run_notes
 from vla_eval.results.published.protocol_summary import protocol_summaries
 from vla_eval.results.statistics import make_row, row_notes
 from vla_eval.results.success_table import Row, Table
@@ -33,13 +33,10 @@ DEFAULT_BASELINES = (CHANCE_POLICY, RANDOM_POLICY)
 def build_table(
     runs: Sequence[StoredRun], *, baseline: str | None = None, protocols: Sequence[str] = ()
 ) -> Table:
-    """Build one table of all episodes of the given runs.
+    """Build one table of all episodes of the given runs; a folder given twice counts once.
 
-    Args:
-        runs: what the run folders hold; a folder given twice counts once.
-        baseline: the policy with which all others are compared. By default `cue_blind` and `random`, as
-            far as they were run.
-        protocols: names of protocols whose summary figures are added to those that the runs name.
+    All policies are compared with `baseline`, by default with `cue_blind` and `random`, if they were run.
+    The summary figures of these protocols are added to those that the runs name.
 
     Raises:
         ReportError: there is no episode yet.
@@ -56,20 +53,14 @@ def build_table(
     baselines = (
         tuple(name for name in DEFAULT_BASELINES if name in policies) if baseline is None else (baseline,)
     )
-    groups = grouping.groups
-    compared = compare_with_baselines(groups, baselines)
-    evidence = gather_evidence(groups, compared).values()
+    compared = compare_with_baselines(grouping.groups, baselines)
+    evidence = gather_evidence(grouping.groups, compared).values()
     rows = tuple(map(make_row, evidence))
     summaries = protocol_summaries(runs, grouping, names=protocols)
     return Table(
         rows=rows,
         run_rows=tuple(row for of in evidence if of.success.n_runs > 1 for row in _run_rows(of)),
-        notes=(
-            *audit_notes(runs),
-            *row_notes(rows),
-            *notes.run_notes(runs, grouping),
-            *summaries.notes,
-        ),
+        notes=(*audit_notes(runs), *row_notes(rows), *run_notes(runs, grouping), *summaries.notes),
         baselines=baselines,
         n_comparisons=sum(one is not None for found in compared.values() for one in found),
         runs={str(run.path): run.description.name for run in runs},
@@ -79,9 +70,9 @@ def build_table(
 
 def _run_rows(of: Evidence) -> list[Row]:
     """Return a row for each run, compared with nothing, so that no test counts twice."""
-    alone = [(run, replace(of.episodes, runs=(run,))) for run in of.episodes.runs]
-    nothing = (None,) * len(of.comparisons)
-    return [
-        make_row(replace(of, episodes=own, success=success_of(own), comparisons=nothing), run=run)
-        for run, own in alone
-    ]
+    rows, nothing = [], (None,) * len(of.comparisons)
+    for run in of.episodes.runs:
+        own = replace(of.episodes, runs=(run,))
+        alone = replace(of, episodes=own, success=success_of(own), comparisons=nothing)
+        rows.append(make_row(alone, run=run))
+    return rows

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple  # Any: arguments of tasks
 
 from vla_eval.errors import ReportError
 from vla_eval.strict.json_text import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
@@ -70,7 +70,6 @@ class Counts:
     """The counts of one control on one task.
 
     Attributes:
-        n_episodes: episodes with a result; an error is not a result.
         success_once, success_at_end: in how many of them the success rule held at any step, at the last; None
             if episodes ended at their first success.
         first_choice: in how many the first candidate touched was right; None without candidates.
@@ -88,8 +87,7 @@ class Counts:
 class TaskAudit:
     """The counts of all controls on one task of this version under one protocol, and the verdict.
 
-    Attributes:
-        verdict: the shortcuts, which need no memory; or that none was found.
+    The verdict names the shortcuts, which need no memory; or says that none was found.
     """
 
     task: str
@@ -115,11 +113,7 @@ class _Shipped:
 
 @functools.cache
 def shipped_audits() -> Mapping[tuple[str, AuditProtocol], TaskAudit]:
-    """Return (task, protocol) -> the shipped audit of it.
-
-    Raises:
-        ReportError: a file is damaged.
-    """
+    """Return (task, protocol) -> the shipped audit of it, or raise `ReportError` if a file is damaged."""
     return {(one.task, one.protocol): one for file in (FILE, OFFICIAL_FILE) for one in _read(file)}
 
 
@@ -137,15 +131,8 @@ def _read(file: Path) -> tuple[TaskAudit, ...]:
     return as_dataclass(_Shipped, {"audits": rows}, source).audits
 
 
-def protocol_of(
-    env: Mapping[str, Any], *, is_official: bool = False
-) -> AuditProtocol | None:  # Any: arguments of tasks
-    """Return the rules that a run's task arguments select; None if they were not audited.
-
-    Args:
-        env: the arguments.
-        is_official: whether they are of a task of the official package.
-    """
+def protocol_of(env: Mapping[str, Any], *, is_official: bool = False) -> AuditProtocol | None:
+    """Return the rules that the arguments of a task select; None if they were not audited."""
     if is_official:
         return "official" if set(env) <= OFFICIAL_ARGUMENTS else None
     if not env:

@@ -7,23 +7,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from vla_eval.results import own_statistics as own
 from vla_eval.results.comparison import Evidence, Success
 from vla_eval.results.grouping import RowEpisodes, RowKey, Run
-from vla_eval.results.own_statistics import (
-    AT_END,
-    CHOICES,
-    EPISODES,
-    FIRST_CHOICE,
-    INFERENCES,
-    STEPS,
-    SUCCESS,
-)
 from vla_eval.results.printed_table import UNDEFINED, Column
 from vla_eval.results.relative_statistics import CEILING, CHANCE, CORRECTED, NO_BASELINES, PAIRED
 from vla_eval.results.success_table import Row, Statistic
 
 STATISTICS: tuple[Statistic[Any], ...] = (  # Any: each has values of its own type
-    *(EPISODES, SUCCESS, AT_END, FIRST_CHOICE, CHOICES, STEPS, INFERENCES),
+    *(own.EPISODES, own.SUCCESS, own.AT_END, own.FIRST_CHOICE, own.CHOICES, own.STEPS, own.INFERENCES),
     *(PAIRED, CHANCE, CEILING, CORRECTED),
 )
 """In the order of the columns of CSV and JSON."""

@@ -90,9 +90,7 @@ class ProtocolRow:
     """The summary figure of one policy at one K.
 
     Attributes:
-        protocol, version: which protocol.
         group: the part of its tasks that the figure is over; None: all.
-        policy, n_action_steps, variant: as in the success table.
         n_tasks, n_runs: over how many tasks and runs the figure is.
         mean: mean over the tasks of success once; over several runs the mean of the run means. None where
             something departs from the protocol.

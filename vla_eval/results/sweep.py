@@ -27,7 +27,6 @@ class SweepRow:
     """One row.
 
     Attributes:
-        evidence: its episodes, success, chance and ceiling.
         comparison: with its reference; None for the reference itself. Holm's correction is over the table.
         cue: frames of the cue that the policy got.
         n_to_settle: episodes that would detect the given difference, at the level corrected for the number
@@ -63,14 +62,10 @@ def compare_runs(
     reference: str | None = None,
     difference: float = DEFAULT_DIFFERENCE,
 ) -> Sweep:
-    """Compare rows that differ in one thing.
+    """Compare rows that differ in one setting, `by`.
 
-    Args:
-        runs: what the run folders hold.
-        by: the one setting in which the compared rows differ.
-        reference: the value to compare with: a number of action steps, or a policy. By default the
-            smallest number, or the first policy.
-        difference: the difference of success rates for which the number of episodes is planned.
+    `reference` is the value to compare with: a number of action steps, or a policy. By default the smallest
+    number, or the first policy. The number of episodes is planned for `difference`, of success rates.
 
     Raises:
         ReportError: there are no episodes, nothing to compare, or an impossible difference.

@@ -25,18 +25,14 @@ JSON_VERSION = 1
 def render_sweep(sweep: Sweep, fmt: Format, *, width: int | None = None) -> str:
     """Return the comparison as text, without the notes for CSV.
 
-    Args:
-        sweep: what was compared.
-        fmt: of the text.
-        width: of a terminal, which Markdown is to fit: what all rows share is said above the table, and
-            columns that do not fit are left out and named below it.
+    Markdown is to fit `width` characters, if given: what all rows share is said above the table, and columns
+    that do not fit are left out and named below it.
     """
     table = sweep_table(sweep)
     if fmt == "json":
         return _json(sweep, table.notes)
     if fmt == "csv":
-        rows = [dict(zip(table.titles, row, strict=True)) for row in table.rows]
-        return csv_text(table.titles, rows)
+        return csv_text(table.titles, [dict(zip(table.titles, row, strict=True)) for row in table.rows])
     if fmt == "markdown" and width is not None:
         return write_tables([_fitted(table.folded(), width)], fmt)
     if fmt == "latex":
@@ -127,7 +123,12 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
         Column("episodes", lambda row: str(len(row.evidence.episodes.results)), folds=True, rank=5),
         Column("success", lambda row: rate(row.evidence.success.success_once)),
         Column("95 % interval", _interval, is_number=False, rank=2),
-        Column("chance", _chance, folds=True, rank=8),
+        Column(
+            "chance",
+            lambda row: rate(chance.rate if (chance := row.evidence.chance) else None),
+            folds=True,
+            rank=8,
+        ),
         Column("ceiling", lambda row: rate(row.evidence.ceiling), folds=True, rank=9),
         Column("cue frames", lambda row: str(row.cue or UNDEFINED), is_number=False, rank=6),
         Column("reference", compared(lambda one: str(getattr(one.baseline, sweep.by))), False, rank=4),
@@ -145,7 +146,3 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
 def _interval(row: SweepRow) -> str:
     low, high = row.evidence.success.ci_low, row.evidence.success.ci_high
     return UNDEFINED if low is None or high is None else f"{low:.2f}-{high:.2f}"
-
-
-def _chance(row: SweepRow) -> str:
-    return rate(row.evidence.chance.rate if row.evidence.chance else None)

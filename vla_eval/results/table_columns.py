@@ -1,7 +1,4 @@
-"""Choose the columns of the printed table: what is constant goes into a line above, the rest fits a screen.
-
-Knows nothing of episodes or of formats.
-"""
+"""Choose the columns of the printed table: what is constant goes above it, the rest fits a screen."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,15 +15,10 @@ CELL_FRAME = len(" | ")  # of Markdown, per column; the table has one more chara
 def lay_out(
     table: Table, *, names: Sequence[str] = (), wide: bool = False, width: int | None = None
 ) -> PrintedTable:
-    """Choose the columns for reading.
+    """Choose the columns for reading: exactly these names, in this order; or those that fit `width`.
 
-    Args:
-        table: what `build_table` returned.
-        names: exactly these columns, in this order.
-        wide: all but the extra columns, however wide the table becomes and whatever is constant, and a row
-            for each of several runs.
-        width: characters that the columns have to fit into, if neither of the two is given; None:
-            `FITS_CHARACTERS`.
+    The default width is `FITS_CHARACTERS`. `wide`: all but the extra columns, however wide the table becomes
+    and whatever is constant, and a row for each of several runs.
 
     Raises:
         UnknownNameError: there is no such column.

@@ -68,7 +68,7 @@ def render_published(board: str, fmt: Format) -> str:
 def check_format(
     fmt: Format, *, columns: Sequence[str], wide: bool, preset: Preset | None, beside: bool
 ) -> None:
-    """Refuse what a format does not have; arguments as for `render`, `beside`: published results are added.
+    """Refuse what a format does not have, arguments as for `render`; `beside`: published results are added.
 
     Raises:
         ReportError: columns are selected for a format that has all of them, or a preset that it has not.

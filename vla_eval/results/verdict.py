@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 from vla_eval.results.comparison import CHANCE_POLICY, Comparison
@@ -14,20 +13,17 @@ from vla_eval.results.success_table import Row, Table
 
 Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
 
-VERBS: Mapping[Finding, str] = MappingProxyType(
-    {
-        "beats": "beats chance",
-        "not shown": "is not shown to beat chance",
-        "worse": "is worse than chance",
-    }
-)
+VERBS: Mapping[Finding, str] = {
+    "beats": "beats chance",
+    "not shown": "is not shown to beat chance",
+    "worse": "is worse than chance",
+}
 
 
 class Verdict(NamedTuple):
     """What a table shows of one task.
 
     Attributes:
-        task: its id.
         sentences: the best policy first; one for all n_action_steps of a policy at which the same was found.
         is_compared: whether any policy was compared with chance.
     """

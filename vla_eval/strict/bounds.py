@@ -67,12 +67,10 @@ def _bounds_of(cls: type) -> dict[str, Bounds]:
 def check_bounds(
     recipe: object, bounds: Mapping[str, tuple[float, float]] | None = None, *, prefix: str = ""
 ) -> None:
-    """Raise `RecipeError` unless the numbers in these attributes are within their bounds.
+    """Raise `RecipeError` unless the numbers in these attributes are within (least, most).
 
-    Args:
-        recipe: the object; attributes that are None or a word are passed over.
-        bounds: attribute -> (least, most); None: as the dataclass annotates its fields.
-        prefix: what stands before the attributes' names in the message: `finetune.`.
+    Attributes that are None or a word are passed over. The bounds are by default those that the dataclass
+    annotates its fields with. The prefix (`finetune.`) stands before the names in the message.
     """
     cls: Any = type(recipe)  # Any: mypy does not see that a class can be hashed
     for name, (least, most) in (_bounds_of(cls) if bounds is None else bounds).items():

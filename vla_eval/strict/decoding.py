@@ -21,12 +21,7 @@ from vla_eval.strict.yaml_data import load_yaml as load_yaml
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
-    """Return `data` as an object of the dataclass.
-
-    Args:
-        cls: a frozen dataclass.
-        data: what the YAML or JSON holds.
-        where: the file, for messages.
+    """Return plain data of YAML or JSON as an object of a frozen dataclass; messages name the file, `where`.
 
     Raises:
         RecipeError: unknown or missing field, wrong type, or a value that the dataclass refuses.
@@ -44,17 +39,10 @@ def check_value(hint: Any, value: object, *, path: str) -> Any:  # Any: a type a
 
 
 def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: str) -> None:
-    """Put a value at a dotted path of plain data; in a mapping all names are free.
+    """Put a plain value at a dotted path (`chunking.mode`) of plain data, in place.
 
-    Args:
-        cls: the dataclass that the data will be decoded as.
-        data: changed in place.
-        path: `chunking.mode`.
-        value: plain data.
-        where: the flag, for messages.
-
-    Raises:
-        RecipeError: there is no such field, or a part of the path has no fields.
+    In a mapping all names are free. `where` is the flag, for messages. A field that the dataclass has not, or
+    a part of the path that has no fields, is refused.
     """
     steps = _walk(cls, path, where=where)
     for step in steps[:-1]:
@@ -78,11 +66,7 @@ class _Step(NamedTuple):
 
 
 def _walk(cls: type, path: str, *, where: str) -> list[_Step]:
-    """Return the steps of a dotted path, by their current names; in a mapping all names are free.
-
-    Raises:
-        RecipeError: a dataclass on the way has no such field.
-    """
+    """Return the steps of a dotted path, by their current names; in a mapping all names are free."""
     current: Any = cls  # Any: a type annotation
     names = path.split(".")
     if len(names) > MAX_DEPTH:

@@ -18,28 +18,30 @@ FETCH_AGAIN = "Fetch the checkpoint again, from where you trust it."
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the mapping that a JSON file holds.
-
-    Raises:
-        CheckpointError: it is missing, no file, too large, or not such JSON.
-    """
-    return parse_json(_content(path), where=str(path))
+    """Return the mapping of a JSON file; `CheckpointError` if it is missing, too large, or no such JSON."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe would never end
+            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "something else"
+            raise CheckpointError(f"{path}: expected a JSON file, found {kind}. {FETCH_AGAIN}")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
+        raise CheckpointError(f"{path}: cannot be read as JSON ({exc}). {FETCH_AGAIN}") from exc
+    if len(content) > MAX_BYTES:
+        raise CheckpointError(
+            f"{path}: expected JSON of at most {MAX_BYTES >> 20} MiB, found more. {FETCH_AGAIN}"
+        )
+    return parse_json(content, where=str(path))
 
 
 def parse_json(content: bytes, *, where: str) -> dict[str, Any]:
-    """Return the mapping that JSON holds.
-
-    Args:
-        content: the bytes of a file.
-        where: the file, for messages.
-
-    Raises:
-        CheckpointError: it is not JSON, or holds something else.
-    """
+    """Return the mapping that the bytes of a JSON file hold, or raise `CheckpointError`."""
     try:
         data = loads(content)
     except ValueError as exc:  # json's and UTF-8's own are such errors
-        raise _damaged(where, str(exc)) from exc
+        found = f"expected plain UTF-8 JSON, found {exc}"
+        raise CheckpointError(f"{where}: cannot be read as JSON: {found}. {FETCH_AGAIN}") from exc
     if not isinstance(data, dict):
         raise CheckpointError(f"{where}: expected a mapping, found {shown(data)}. {FETCH_AGAIN}")
     return data
@@ -64,8 +66,7 @@ def get_texts(data: Mapping[str, Any], key: str, *, where: str) -> list[str]:
 def get_count(data: Mapping[str, Any], key: str, *, maximum: int, where: str) -> int | None:
     """Return a field that counts something, from 1 to `maximum`; None if it is absent or null.
 
-    Raises:
-        CheckpointError: it is something else; true is not 1, and "4" not 4.
+    Anything else is refused: true is not 1, and "4" not 4.
     """
     value = data.get(key)
     if value is not None and (type(value) is not int or not 1 <= value <= maximum):
@@ -84,26 +85,3 @@ def _get(data: Mapping[str, Any], key: str, hint: Any, where: str) -> Any:  # An
 def wrong_type(where: str, key: str, expected: str, value: object) -> CheckpointError:
     """Return the error for a field of another type."""
     return CheckpointError(f"{where}: {wrong(key, expected, value)} {FETCH_AGAIN}")
-
-
-def _content(path: Path) -> bytes:
-    try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):  # a pipe would never end
-            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "something else"
-            raise CheckpointError(f"{path}: expected a JSON file, found {kind}. {FETCH_AGAIN}")
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as exc:  # ValueError: a null byte in the name
-        raise CheckpointError(f"{path}: cannot be read as JSON ({exc}). {FETCH_AGAIN}") from exc
-    if len(content) > MAX_BYTES:
-        raise CheckpointError(
-            f"{path}: expected JSON of at most {MAX_BYTES >> 20} MiB, found more. {FETCH_AGAIN}"
-        )
-    return content
-
-
-def _damaged(where: str, found: str) -> CheckpointError:
-    return CheckpointError(
-        f"{where}: cannot be read as JSON: expected plain UTF-8 JSON, found {found}. {FETCH_AGAIN}"
-    )

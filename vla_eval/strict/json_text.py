@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast  # Any: JSON
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.plain_text import printable
@@ -38,7 +38,6 @@ class Source:
         where: file, and line where there are several.
         what: what is expected there, with its article: `an episode record`.
         remedy: what to do if it is something else; whole sentences.
-        error: the class of the error.
     """
 
     where: str
@@ -64,16 +63,7 @@ WORDS: Mapping[type, str] = {
 
 
 def read_json(text: str | bytes, source: Source, *, non_finite: bool = False) -> dict[str, Any]:  # Any: JSON
-    """Return one JSON object.
-
-    Args:
-        text: the JSON; bytes are UTF-8.
-        source: where it is from.
-        non_finite: whether numbers may be what Python writes as NaN and Infinity.
-
-    Raises:
-        VlaEvalError: of `source.error`: it is something else.
-    """
+    """Return one JSON object, or refuse; numbers may be Python's NaN and Infinity if `non_finite`."""
     try:
         data = loads(text, lone_surrogates=True, non_finite=non_finite)
     except ValueError as exc:  # json's and UTF-8's own are such errors
@@ -84,17 +74,7 @@ def read_json(text: str | bytes, source: Source, *, non_finite: bool = False) ->
 
 
 def read_version(data: dict[str, Any], name: str, known: int, source: Source) -> None:  # Any: JSON
-    """Take the format's version out of the data.
-
-    Args:
-        data: what `read_json` returned.
-        name: the field with the version.
-        known: the only version that this program reads.
-        source: where the data are from.
-
-    Raises:
-        VlaEvalError: of `source.error`: there is none, or another one.
-    """
+    """Take the format's version, a field of this name, out of the data, or refuse any but the `known` one."""
     if name not in data:
         raise source.refuse(f"no field '{name}'", "it is missing")
     version = data.pop(name)
@@ -110,13 +90,7 @@ def read_version(data: dict[str, Any], name: str, known: int, source: Source) ->
 def as_dataclass[T](cls: type[T], data: Any, source: Source) -> T:  # Any: JSON
     """Return JSON as an object of a dataclass whose annotations say what each field may be.
 
-    Args:
-        cls: the dataclass; its fields may be dataclasses, too.
-        data: what `read_json` returned, without its version.
-        source: where it is from.
-
-    Raises:
-        VlaEvalError: of `source.error`: a field is unknown, missing, or of another type.
+    Its fields may be dataclasses, too. An unknown or missing field, or one of another type, is refused.
     """
     import pydantic_core
 
@@ -152,18 +126,10 @@ def read_file(path: Path, source: Source) -> bytes:
 # ------------------------------------------------------------------------------------------ JSON
 
 
-def loads(
-    content: str | bytes, *, lone_surrogates: bool = False, non_finite: bool = False
-) -> Any:  # Any: JSON
-    """Return what JSON holds.
+def loads(content: str | bytes, *, lone_surrogates: bool = False, non_finite: bool = False) -> Any:
+    """Return what JSON holds, or raise `ValueError` with what was found if it is not JSON, or not strict.
 
-    Args:
-        content: the JSON; bytes are UTF-8.
-        lone_surrogates: whether text may hold what UTF-8 cannot: a file name of other bytes, in a traceback.
-        non_finite: see `read_json`.
-
-    Raises:
-        ValueError: it is not JSON, or not strict; the message says what was found.
+    Text may hold lone surrogates, if asked: what UTF-8 cannot, as a file name of other bytes in a traceback.
     """
     text = content if isinstance(content, str) else content.decode("utf-8")
     try:

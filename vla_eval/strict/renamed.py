@@ -23,23 +23,14 @@ def formerly(name: str) -> dict[str, str]:
 
 def current_names(cls: type) -> dict[str, str]:
     """Return old name -> current name of the renamed fields of a dataclass."""
-    return {
-        field.metadata[FORMERLY]: field.name
-        for field in dataclasses.fields(cls)
-        if FORMERLY in field.metadata
-    }
+    fields = (field for field in dataclasses.fields(cls) if FORMERLY in field.metadata)
+    return {field.metadata[FORMERLY]: field.name for field in fields}
 
 
 def use_current_names(cls: type, data: dict[str, Any], *, prefix: str) -> None:
-    """Give the renamed fields in the data of a dataclass their current names, in place.
+    """Give the renamed fields in the plain data of a dataclass their current names, in place.
 
-    Args:
-        cls: the dataclass.
-        data: field -> plain data.
-        prefix: what precedes the names in messages: `finetune.`, for example.
-
-    Raises:
-        RecipeError: a field is there under both names.
+    `prefix` precedes the names in messages. A field that is there under both names is refused.
     """
     for old, new in current_names(cls).items():
         if old not in data:
