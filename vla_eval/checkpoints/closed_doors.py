@@ -23,12 +23,9 @@ Guard = Callable[..., Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """A function that is not what it was while a checkpoint is open.
+    """A function or `Class.method` that is not what it was while a checkpoint is open, and its guard.
 
-    Attributes:
-        module: where it is defined; it is also replaced in every module that has imported it.
-        name: of the function, or `Class.method`.
-        guard: what is called instead.
+    It is also replaced in every module that has imported it.
     """
 
     module: str

@@ -24,12 +24,9 @@ COUNTS = ("chunk_size", "n_action_steps", "horizon", "n_obs_steps", "window_step
 
 
 def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
-    """Compare the types of what is given with those of the policy's fields, exactly.
+    """Compare the types of a file's fields, without `type`, with those of lerobot's class, exactly.
 
-    Args:
-        cls: lerobot's configuration class.
-        data: of the file, without `type`. Fields that the class does not have are left to lerobot.
-        where: the file, for messages.
+    Fields that the class does not have are left to lerobot.
     """
     hints = get_type_hints(cls)
     for field in dataclasses.fields(cls):

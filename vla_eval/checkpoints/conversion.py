@@ -26,12 +26,6 @@ TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 def convert(kind: str, source: Path, out: Path, options: Any) -> Path:
     """Write the LeRobot checkpoint `out` with every parameter of the original and no other; return it.
 
-    Args:
-        kind: the family's type.
-        source: folder of the published checkpoint.
-        out: a folder that is not there yet.
-        options: of the family's class of options.
-
     Raises:
         CheckpointError: something is missing, of another form, or not what the options say.
     """

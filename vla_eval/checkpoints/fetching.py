@@ -60,12 +60,7 @@ def fetch_base(
 ) -> Path:
     """Make the folder `out` of a base checkpoint; one that is there is only checked.
 
-    Args:
-        base: which.
-        out: the folder.
-        revision: branch, tag or commit of the repository with the weights; None: the pinned one.
-        api: the Hub's client, by default that of the user's login.
-        say: gets lines for a person.
+    `revision`: branch, tag or commit of the repository with the weights; None: the pinned one.
 
     Raises:
         CheckpointError: the Hub refuses or is not there, the disk is too small, or a file is damaged.

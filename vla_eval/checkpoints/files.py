@@ -81,10 +81,7 @@ class TrainingFacts:
 
 
 def find_checkpoint(path: Path) -> Path:
-    """Return the folder with the weights, given that folder, a checkpoint, or a fine-tuning run.
-
-    A name alone may be that of a folder in `checkpoints/`, the user's or the package's.
-    """
+    """Return the folder with the weights, of a checkpoint, a run, or a name in a folder `checkpoints/`."""
     places = [path]
     if path.name == str(path):
         places += [folder / path for folder in search_folders(SHIPPED_FOLDER)]
@@ -175,10 +172,7 @@ def adapter_base(folder: Path) -> Path | None:
 
 
 def adapter_bases(folder: Path, *, base_checkpoint: str | None = None) -> list[Path]:
-    """Return the checkpoints below a LoRA adapter that are there, nearest first; none for a whole model.
-
-    `base_checkpoint`: where its base lies; None: where it was in training. None may be its own base.
-    """
+    """Return the checkpoints below a LoRA adapter, nearest first; `base_checkpoint`: where its base lies."""
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         return []
     chain = [folder]

@@ -91,12 +91,7 @@ class LoadedPolicy:
 
 
 def load_checkpoint(path: Path, options: LoadOptions) -> LoadedPolicy:
-    """Load policy and processors of a checkpoint or a run folder.
-
-    Raises:
-        CheckpointError: anything is missing, damaged, or does not fit.
-        MissingDependencyError: the policy needs a package that is not installed.
-    """
+    """Load policy and processors of a checkpoint or a run folder, or say what is missing or does not fit."""
     folder = find_checkpoint(path)
     config = read_config(folder, options)
     with plain_errors(folder, config.type, "cannot be loaded"):
@@ -157,11 +152,7 @@ def with_local_files(data: dict[str, Any], folder: Path, *, tokenizer: str | Non
 
 
 def config_class(kind: str, *, where: str) -> Any:
-    """Return lerobot's configuration class of a type of policy; plugins (`lerobot_policy_*`) included.
-
-    Raises:
-        CheckpointError: there is no such type, or one that this loop cannot ask for chunks.
-    """
+    """Return lerobot's configuration class of a type; refuse one that this loop cannot ask for chunks."""
     register_families()
     _register_plugins(_search_path())
     known = list(PreTrainedConfig.get_known_choices())
@@ -193,13 +184,10 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 
 
 def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) -> Any:
-    """Return a policy with the weights that its constructor gives it; some constructors load a tokenizer.
-
-    `where` is its checkpoint, for messages; `kwargs` are further arguments of the constructor.
+    """Return a policy as its constructor makes it, with further arguments; some load a tokenizer.
 
     Raises:
         CheckpointError: the configuration does not fit, a file is missing, or code would have been run.
-        MissingDependencyError: the policy needs a package that is not installed.
     """
     try:
         with no_foreign_code(config.type):
@@ -220,10 +208,7 @@ def make_empty_policy(config: Any, *, where: Path | None = None, **kwargs: Any) 
 
 
 def load_weights(folder: Path, config: Any, options: LoadOptions, **kwargs: Any) -> Any:
-    """Return the policy with exactly the weights of a checkpoint, see `fill_policy`.
-
-    `kwargs` are further arguments of its constructor.
-    """
+    """Return the policy with exactly the weights of a checkpoint; `kwargs` are its constructor's."""
     return fill_policy(make_unfilled_policy(config, where=folder, **kwargs), folder, options).to(
         config.device
     )
@@ -236,13 +221,7 @@ def make_unfilled_policy(config: Any, **kwargs: Any) -> Any:
 
 
 def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: Sequence[str] = ()) -> Any:
-    """Put the weights of a checkpoint into a policy, or an adapter on top of them; return the policy.
-
-    `may_be_new`: beginnings of names of weights that the checkpoint need not have, see `put_weights`.
-
-    Raises:
-        CheckpointError: keys, shapes or types differ; the message lists them.
-    """
+    """Put a checkpoint's weights, or its adapter, into a policy and return it; see `put_weights`."""
     if (folder / ADAPTER_CONFIG_FILE).is_file():
         return _fill_adapter(policy, folder, options)
     weights = WeightFile(folder / WEIGHTS_FILE)
@@ -258,11 +237,7 @@ def fill_policy(policy: Any, folder: Path, options: LoadOptions, *, may_be_new: 
 
 
 def begin_from(policy: Any, base: Path) -> None:
-    """Let a policy change its base's weights, which were just loaded, into what its training begins from.
-
-    Raises:
-        CheckpointError: the base is an adapter, whose own base would be changed a second time.
-    """
+    """Let a policy prepare its base's weights for training; refuse an adapter, whose base was prepared."""
     begin = getattr(policy, "begin_from_base", None)
     if begin is None:
         return

@@ -14,10 +14,7 @@ from vla_eval.strict.json_fields import FETCH_AGAIN
 
 @contextlib.contextmanager
 def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
-    """Raise one `CheckpointError` for whatever lerobot, torch and transformers raise within.
-
-    It says that the policy of this type, of the checkpoint `where`, cannot do `what`.
-    """
+    """Raise one `CheckpointError` for whatever lerobot, torch and transformers raise within `what`."""
     try:
         yield
     except VlaEvalError:
@@ -32,15 +29,9 @@ def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
 
 
 def raise_plainly(exc: ImportError | OSError | RuntimeError, config: Any) -> NoReturn:
-    """Say which package or file is missing, if that ended the making of a policy or of its processors.
+    """Say which package or file is missing, if that made `exc`; raise `exc` again if it was something else.
 
-    Args:
-        exc: what lerobot or transformers raised; raised again if it was something else.
-        config: of the policy; or its type and fields.
-
-    Raises:
-        MissingDependencyError: a package is not installed.
-        CheckpointError: a file is neither there nor in the cache (transformers raises `OSError`).
+    `config` is the policy's, or its type and fields. transformers raises `OSError` for a missing file.
     """
     if isinstance(exc.__cause__, VlaEvalError):
         raise exc.__cause__

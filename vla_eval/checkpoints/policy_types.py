@@ -35,10 +35,7 @@ def chunk_size(config: Any) -> int:
 
 
 def noise_shape(config: Any) -> tuple[int, int] | None:
-    """Return the shape of one episode's noise for policies that take it from outside; None for others.
-
-    A policy of your own says it by `noise_shape` of its configuration.
-    """
+    """Return the shape of one episode's noise for policies that take it from outside; None for others."""
     own = getattr(config, "noise_shape", None)
     if own is not None:
         return (int(own[0]), int(own[1]))

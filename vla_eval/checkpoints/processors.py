@@ -29,13 +29,7 @@ TOKENIZER_STEP, ACTION_TOKENIZER_STEP = "tokenizer_processor", "action_tokenizer
 
 
 def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tuple[Any, Any]:
-    """Return pre- and post-processor as the checkpoint in a folder describes them.
-
-    `tokenizer`: its folder; None: the one in the checkpoint, else the one it names.
-
-    Raises:
-        CheckpointError: one is missing, or names code or a tokenizer that is not there.
-    """
+    """Return pre- and post-processor as a checkpoint describes them; `tokenizer`: instead of its own."""
     register_steps(type(config))
     before, after = (step_names(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE))
     overrides: dict[str, dict[str, Any]] = {}
@@ -65,10 +59,7 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
 
 
 def register_steps(cls: type) -> None:
-    """Import the module in which a policy registers its processors' steps, found as lerobot names it.
-
-    lerobot imports it for a training only: a new process that evaluates a checkpoint would not know them.
-    """
+    """Import a policy's processor steps; lerobot does so for a training only."""
     module = cls.__module__
     name = module.replace("configuration_", "processor_")
     if name != module and importlib.util.find_spec(name) is not None:
@@ -142,10 +133,7 @@ def save_vlm_files(config: Any, folder: Path) -> None:
 
 
 def check_statistics(folder: Path, preprocessor: Any, postprocessor: Any) -> None:
-    """Raise `CheckpointError` unless all that is normalised has its statistics.
-
-    lerobot passes on unchanged what it has no statistics of.
-    """
+    """Raise unless all that is normalised has statistics: lerobot passes on unchanged what has none."""
     missing = []
     for step in (*preprocessor.steps, *postprocessor.steps):
         if isinstance(step, EncoderStep | DecoderStep):

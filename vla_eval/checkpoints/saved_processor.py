@@ -167,10 +167,7 @@ def check_paths(step: SavedStep, config: Mapping[str, Any], folder: Path) -> Non
 
 
 def leads_out(value: str, folder: Path) -> bool:
-    """Whether a text, read as a path, leads out of a folder, by itself or by a link.
-
-    A text that is not a path, such as a name of the Hub, does not.
-    """
+    """Whether a text leads out of a folder as a path, by itself or by a link; a name of the Hub does not."""
     if "\0" in value or value.startswith("~") or ".." in Path(value).parts:
         return True
     place = Path(os.path.realpath(folder / value))  # unlike Path.resolve, of a loop of links, too

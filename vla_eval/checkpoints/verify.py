@@ -31,17 +31,9 @@ INSTRUCTION = "pick the cube"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
-    """What was found.
+    """What was found; shared parameters count once, `n_trained` are those that the configuration trains.
 
-    Attributes:
-        folder: with the weights.
-        kind: lerobot's name of the policy's type.
-        n_tensors: in the file, each taken over with its shape and type.
-        n_parameters: of the model; shared ones once.
-        n_trained: of these, what the configuration trains.
-        statistics: `field.statistic` of what normalises.
-        chunk: shape of the actions of one forward pass.
-        sha256: digest of the checkpoint, as an evaluation notes it.
+    `statistics` are `field.statistic`, `chunk` is the shape of one forward pass's actions, `sha256` as noted.
     """
 
     folder: Path

@@ -53,11 +53,7 @@ def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
 def load_policy_entry(text: str) -> PolicyEntry:
     """Return the policy that an entry of a configuration names.
 
-    Args:
-        text: see `load_policy_recipe`; or `NAME=A,B,C` with such a text for each run.
-
     Raises:
-        UnknownNameError, RecipeError, CheckpointError, RemotePolicyError: see `load_policy_recipe`.
         RecipeError: the checkpoints of one policy are not of the same kind, or one stands there twice.
         RemoteChangedError: two servers of one policy are not of the same one.
     """

@@ -15,10 +15,7 @@ SLOT = 0
 def check_env(make: Callable[[], SimEnv], *, n_steps: int = 8, renders: bool = True) -> None:
     """Raise `ConformanceError` unless the environments that `make` returns fulfil the contract.
 
-    Args:
-        make: returns a new environment of the same settings at each call.
-        n_steps: number of control steps of the check's episodes.
-        renders: whether the environment can render images; otherwise images are not checked.
+    `make` returns a new environment of the same settings at each call; images are checked if it `renders`.
     """
     env = make()
     try:

@@ -26,20 +26,13 @@ N_SLOTS = 2  # as many episodes as the check runs side by side
 def check_recipe(
     policy: str, *, task: str, report: Callable[[str], None], say: Callable[[str], None] = lambda _line: None
 ) -> list[str]:
-    """Check a policy by its name, its recipe's file or its checkpoint's folder.
+    """Check a policy by its name, its recipe's file or its checkpoint's folder; return what is met.
 
     Args:
         policy: what `eval --policy` takes.
         task: the task whose cameras, states and actions it is given.
         report: called with each requirement that is met, as soon as that is known.
         say: gets what differs from the policy's training and is not a requirement, line by line.
-
-    Returns:
-        The requirements, all of which are met.
-
-    Raises:
-        ConformanceError: a requirement is not met.
-        VlaEvalError: there is no such policy or task, or the policy cannot be made.
     """
     config = EvalConfig(
         name="check",

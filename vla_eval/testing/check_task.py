@@ -31,13 +31,7 @@ def check_task(
 
     The environment fulfils its contract (`check_env`). Doing nothing never succeeds, unless the row says so.
     The oracle succeeds in at least nine of ten episodes and touches the right candidate first. The phases
-    come in order.
-
-    Args:
-        task: task id.
-        kwargs: task arguments.
-        n_episodes: number of episodes per control.
-        simulator: `maniskill` or `fake`.
+    come in order. `simulator` is `maniskill` or `fake`.
     """
     settings = EnvSettings(task=task, kwargs=kwargs or {}, privileged=True, simulator=simulator)
     check_env(lambda: make_env(settings), renders=False)

@@ -7,10 +7,7 @@ from vla_eval.errors import ConformanceError
 
 
 def claim(kept: bool, promise: str, found: str = "", *, advice: str = "") -> None:
-    """Raise `ConformanceError` unless the requirement, said by `promise`, is kept.
-
-    The message has what was found instead, and an advice how to meet it.
-    """
+    """Raise `ConformanceError`, with what was found and an advice, unless the promise is kept."""
     if not kept:
         raise ConformanceError(f"{promise}{f' Found: {found}.' if found else ''}{advice and f' {advice}'}")
 

@@ -6,10 +6,7 @@ import torch
 
 
 def reset_device_peak(device: str) -> None:
-    """Free what nothing uses any more, and let the peak begin from what is left; on a CPU, do nothing.
-
-    Without it, a small model that is measured after a large one reports the large one's memory.
-    """
+    """Free what is not used, and let the peak begin anew; a model measured before would be in it."""
     if torch.device(device).type == "cuda":
         gc.collect()  # a policy and its processors refer to each other
         torch.cuda.empty_cache()

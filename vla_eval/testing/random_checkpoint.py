@@ -35,11 +35,7 @@ PART = 1 << 24  # numbers that are made at once
 def stand_in_config(
     recipe: FinetuneRecipe, folder: Path, *, dtype: str | None, tiny: bool
 ) -> tuple[Any, Path | None]:
-    """Return the policy's configuration, and the folder of a tokenizer where its processors need one.
-
-    Nothing is downloaded: `stand_ins` writes what it names to a folder. Without `dtype`, the precision is the
-    recipe's; `tiny` builds families that have one in their tiny form.
-    """
+    """Return a policy's configuration, with stand-ins for what it names, and a tokenizer's folder or None."""
     family = family_of(recipe.type)
     changes: dict[str, Any] = {
         name: {**value, **recipe.policy.get(name, {})} if isinstance(value, Mapping) else value
@@ -58,10 +54,7 @@ def stand_in_config(
 
 @contextlib.contextmanager
 def published_sizes() -> Iterator[Callable[[FinetuneRecipe], Any]]:
-    """Give a function that returns a recipe's configuration at its published sizes, without base or network.
-
-    The files of its stand-ins are there within the context.
-    """
+    """Yield a function from a recipe to its configuration at published size, without base or network."""
     with tempfile.TemporaryDirectory() as folder:
         yield lambda recipe: stand_in_config(
             recipe, Path(tempfile.mkdtemp(dir=folder)), dtype=None, tiny=False
@@ -102,10 +95,7 @@ def write_checkpoint(folder: Path, config: Any, policy: Any, tokenizer: Path | N
 
 
 def random_parts(described: Mapping[str, Tensor], name: str) -> Iterator[Tensor]:
-    """Yield a tensor's numbers in order, for `write_weights`: random, of a standard deviation of 0.02.
-
-    `described`: name -> a tensor of the shape and type; one that has memory is yielded as it is.
-    """
+    """Yield a tensor's numbers in order: random, of a deviation of 0.02, or its own if it has memory."""
     tensor = described[name]
     if not tensor.is_meta:  # a buffer, whose values the constructor has computed
         yield tensor.detach()
@@ -132,11 +122,7 @@ def plain_statistics(config: Any) -> dict[str, dict[str, Any]]:
 
 @contextlib.contextmanager
 def built_tiny(kind: str, *, tiny: bool) -> Iterator[None]:
-    """Let lerobot build a type in its tiny form within the context, if that is asked for.
-
-    Raises:
-        CheckpointError: a tiny form is asked for, and the type has none but by recipes of its own.
-    """
+    """Let lerobot build a type in its tiny form within the context, if asked; raise if it has none."""
     family = family_of(kind)
     if not tiny:
         yield

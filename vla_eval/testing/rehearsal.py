@@ -51,14 +51,7 @@ GB = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RehearsalOptions:
-    """How to rehearse.
-
-    Attributes:
-        folder: where a recipe's checkpoint is written; it is removed afterwards.
-        dtype: `float32` or `bfloat16`, for policies with such a setting; None: the recipe's or as saved.
-        device: `cpu`, `cuda` …
-        tiny: build the π0 family and SmolVLA in their tiny form, for tests.
-    """
+    """How to rehearse: the folder is removed afterwards, `dtype` None is the recipe's or as saved."""
 
     folder: Path
     dtype: str | None = None
@@ -67,14 +60,7 @@ class RehearsalOptions:
 
 
 def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
-    """Rehearse a recipe that has a section `finetune`.
-
-    `batches`: also measure inferences per second of so many episodes in one forward pass.
-
-    Raises:
-        CheckpointError: the folder exists, or memory is too small.
-        RecipeError: the recipe has nothing to train.
-    """
+    """Rehearse a recipe with something to train, and time passes of `batches` episodes; its folder is new."""
     if options.folder.exists():
         raise CheckpointError(f"{options.folder} exists already. Name another folder with --out.")
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none")).value
@@ -89,13 +75,7 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
 
 
 def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
-    """Load a checkpoint or a run that is there, and let it act; its weights are those of its files.
-
-    Of the options, `device` and `dtype` are used; `batches`: see `rehearse`.
-
-    Raises:
-        CheckpointError: it is incomplete, or memory is too small.
-    """
+    """Load a checkpoint or a run, and let it act; `device` and `dtype` are used of the options."""
     reset_peak()
     before, folder = peak_rss_bytes(), find_checkpoint(path)
     if (folder / ADAPTER_CONFIG_FILE).is_file():

@@ -9,12 +9,7 @@ EXTRA_SHARE, EXTRA_BYTES = 1.15, 2e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimated:
-    """What the shapes of a model say, before its weights are made.
-
-    Attributes:
-        parameters, trained, bytes, peak_rss_bytes, peak_device_bytes: as in `Rehearsed`. What is not known is
-            None, or not among the stages of `peak_rss_bytes`.
-    """
+    """What a model's shapes say before it is made; what is not known is None or not among the stages."""
 
     parameters: int
     trained: int | None
@@ -25,20 +20,13 @@ class Estimated:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rehearsed:
-    """What was measured.
+    """What was measured; memory and seconds are by stage.
 
     Attributes:
         recipe, kind, dtype, device: what was rehearsed; a folder's path where it was a checkpoint.
-        parameters: of the model, as it was loaded.
         trained: what the recipe trains of it, adapters included; None for a checkpoint.
-        bytes: of the file of weights.
-        peak_rss_bytes: most memory of the process, by stage: `write` (a recipe's only), `load`, `act`.
-        peak_device_bytes: most memory on the GPU; None on a CPU.
-        seconds: by stage: `write` (a recipe's only), `load`, `first_inference`, `second_inference`.
-        inferences_per_second: episodes in a forward pass -> inferences; empty if it was not asked for.
         before_bytes: memory of the process before anything was made: torch, transformers, lerobot.
         limit_bytes: 1.15 × the weights + 2 GB, which loading and acting must keep.
-        estimated: see there.
     """
 
     recipe: str

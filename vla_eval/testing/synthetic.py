@@ -36,10 +36,7 @@ def write_synthetic_dataset(
     seed: int = 0,
     instructions: Sequence[str] = INSTRUCTIONS,
 ) -> Path:
-    """Write a `LeRobotDataset` of synthetic episodes of `n_frames` to `n_frames` + 2 frames; return `root`.
-
-    `state` is which proprioception `observation.state` is; the instructions alternate.
-    """
+    """Write a `LeRobotDataset` of episodes of `n_frames` to `n_frames` + 2 frames; return `root`."""
     features = dataset_features(state)
     dataset = new_dataset(root, features, encoder=EncoderSettings(), max_frames=n_frames + 2)
     for episode in range(n_episodes):

@@ -89,19 +89,13 @@ def tiny_resnet() -> Iterator[None]:
 
 
 def write_tiny_tokenizer(folder: Path, *, n_tokens: int | None = None) -> Path:
-    """Train a tokenizer on three sentences, save it, and return its folder.
-
-    `n_tokens`: size of its vocabulary, if it is not to be tiny: no text is made of the tokens beyond.
-    """
+    """Train a tokenizer on three sentences, save it, and return its folder; `n_tokens`: if not tiny."""
     _tokenizer({}, n_tokens=n_tokens).save_pretrained(str(folder))
     return folder
 
 
 def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_token: int = -60) -> Path:
-    """Make an action tokenizer in which each byte is a token, save it, and return its folder.
-
-    `min_token`: the coefficient whose character is 0.
-    """
+    """Make an action tokenizer in which each byte is a token, save it, and return its folder."""
     from vla_eval.checkpoints.fast_tokens import FastActionTokenizer
 
     folder.mkdir()
@@ -111,10 +105,7 @@ def write_tiny_fast_tokenizer(folder: Path, *, n_tokens: int | None = None, min_
 
 
 def write_tiny_smolvlm(folder: Path, *, sizes: Mapping[str, Mapping[str, Any]] | None = None) -> Path:
-    """Save configuration and processor of a tiny SmolVLM; SmolVLA needs no patches of lerobot.
-
-    `sizes`: of the parts `vision`, `text` and `whole`, if it is not to be tiny; the tokenizer is.
-    """
+    """Save a tiny SmolVLM's configuration and processor; `sizes` of `vision`, `text`, `whole` may differ."""
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
     from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
@@ -172,10 +163,7 @@ def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
 
 
 def _with_more_tokens(tokenizer: Any, n_tokens: int) -> Any:
-    """Return the model of a tokenizer with so many tokens in its vocabulary.
-
-    Not by `add_tokens`: a search over 250,000 added tokens takes minutes to build.
-    """
+    """Return a tokenizer's model of that many tokens; `add_tokens` takes minutes for 250,000."""
     from tokenizers import models
 
     model = json.loads(tokenizer.to_str())["model"]

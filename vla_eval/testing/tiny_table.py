@@ -34,15 +34,7 @@ SHORT = {
 
 
 def tiny_table(table: ModelTable, out: Path) -> tuple[ModelTable, dict[str, str]]:
-    """Return the table with a tiny model in each row, and the adapters of rows that are not lerobot's.
-
-    Args:
-        table: the real one; rows, tasks and controls are kept.
-        out: folder of the table; the recipes of the tiny models are written there.
-
-    Raises:
-        RecipeError: a row is of a type that has no tiny form.
-    """
+    """Return the table with a tiny model in each row, and the adapters of rows that are not lerobot's."""
     rows, adapters = [], {}
     for row in table.rows:
         recipe, adapter = _tiny_recipe(row, out / "tiny")

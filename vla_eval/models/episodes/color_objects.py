@@ -35,13 +35,7 @@ MOST_SEEN = 2**15  # images: both cameras of 500 episodes of 32 steps, at most 2
 
 
 class Thing(NamedTuple):
-    """A piece of an image.
-
-    Attributes:
-        box: the part (rows, columns) of the image in which it is, with a pixel around it.
-        mask: the thing's pixels in the box.
-        color: (3,) where it is brightest, in levels.
-    """
+    """A piece of an image: its `box` (rows, columns) with a pixel around, its pixels, its `color` (3,)."""
 
     box: tuple[slice, slice]
     mask: Mask
@@ -77,10 +71,7 @@ class Empty:
 
 
 class SeenThings:
-    """Finds things, and keeps what it found: a demonstration is sampled again and again.
-
-    Of more than `most` images, the one that was not asked for the longest is forgotten.
-    """
+    """Finds things, and keeps what it found for `most` images, those last asked for: samples repeat."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -146,10 +137,7 @@ def _hues(image: Bytes) -> NDArray[np.int64]:
 
 
 def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (H, W) which thing a pixel belongs to, from 1 on; 0: to none.
-
-    Pixels between two things, which have the hue of neither, belong to the nearer one.
-    """
+    """Return (H, W) which thing a pixel belongs to, from 1; 0: none. What lies between goes to the nearer."""
     planes = unusual & (hues == np.unique(hues[unusual])[:, None, None])
     parts, _ = ndimage.label(planes, IN_ITS_PLANE)
     is_core = np.bincount(parts.ravel()) >= LEAST_PX

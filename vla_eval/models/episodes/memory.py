@@ -70,18 +70,12 @@ def recall(
 
 
 def memory_of(memory: Memory, row: int) -> Memory:
-    """Return what is remembered of one episode, each tensor without its first axis.
-
-    A copy: the memory of a row must not keep that of all others.
-    """
+    """Return a copy of what is remembered of one episode: it must not keep the memory of all others."""
     return _like(memory, [part[row].clone() for part in memory])
 
 
 def _chosen(has_frame: Tensor, after: Tensor, before: Tensor) -> Tensor:
-    """Return the rows of `after` that had a frame, and those of `before` that had none; never a mixture.
-
-    Always contiguous: a layout that depends on who has a frame would choose other kernels, and other bits.
-    """
+    """Return rows of `after` with a frame, else of `before`; contiguous, or other kernels would compute."""
     per_row = has_frame.to(after.device).reshape(-1, *[1] * (after.ndim - 1))
     return torch.where(per_row, after, before).contiguous()
 

@@ -19,11 +19,7 @@ from vla_eval.models.episodes.sentence import TASK_KEY
 
 
 class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped
-    """A policy that predicts chunks from a frame and what it remembers.
-
-    With memory it has the methods `remember` and `begin_memory`; the harness shows it every frame. Without,
-    it is shown the frame at which it is asked.
-    """
+    """A policy that predicts chunks from a frame and, if it has `remember`, from the frames before."""
 
     config_class: ClassVar[Any] = EpisodeConfig
     name: ClassVar[str] = "mikasa_episodes"  # lerobot asks every class for a name; each policy has its own
@@ -45,10 +41,7 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
         return episodes_of(batch, config, training=self.training, same_action=same_action, may_stay=may_stay)
 
     def set_memory(self, begin: Any, *, remembers: bool) -> None:
-        """Give the policy the methods by which the harness knows that it remembers, if it does.
-
-        `begin`: of the network: returns the memory of so many episodes before their first frame.
-        """
+        """Give the policy the methods of one that remembers; `begin` makes the memory of so many episodes."""
         self._remembers = remembers
         if remembers:
             self.remember, self.begin_memory = self._remember, begin

@@ -32,10 +32,7 @@ def rewards_in(batch: Mapping[str, Tensor], kind: RewardKind) -> Tensor:
 
 
 def returns_to_go(rewards: Tensor, *, discount: float = 1.0) -> Tensor:
-    """Return (B, T): at each step, the discounted sum of its reward (B, T) and those after it.
-
-    Chen et al. 2021, "Decision Transformer", section 3.
-    """
+    """Return discounted sums of rewards (B, T) from each step on (Chen et al. 2021, section 3)."""
     steps = torch.arange(rewards.shape[1], device=rewards.device)
     lag = steps[None, :] - steps[:, None]
     weights = torch.where(lag >= 0, discount ** lag.clamp(min=0).float(), 0.0)

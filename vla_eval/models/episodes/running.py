@@ -80,10 +80,7 @@ class Episode:
 
 
 def in_rows(episodes: Sequence[Episode], n_rows: int) -> list[Episode]:
-    """Return which episode each row of a pass computes; raise if there is no such row, or two want one.
-
-    A row that nobody is due for repeats another one, so that the pass keeps its shape.
-    """
+    """Return which episode each row computes, some repeated; raise if two want a row, or it is not there."""
     due: dict[int, Episode] = {}
     for episode in episodes:
         row, slot = episode.start.row, episode.start.slot

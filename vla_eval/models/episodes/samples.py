@@ -129,12 +129,7 @@ def episodes_of(
 
 
 def count_motions(actions: Tensor, real: Tensor) -> Tensor:
-    """Return (B,): how often the arm begins to move, from rest or from where it has slowed down.
-
-    Args:
-        actions: (B, T, action), the first three of them a translation of the tool.
-        real: (B, T) False for padding, at which nothing moves.
-    """
+    """Return (B,): how often the arm begins to move in actions (B, T, …), from rest or slowed down."""
     sizes = actions[..., :SPACE].norm(dim=-1) * real
     rises = sizes.diff(dim=1, prepend=torch.zeros_like(sizes[:, :1]))
     n_motions: Tensor = (rises > MOTION_BEGINS).sum(dim=1)
@@ -149,11 +144,9 @@ def _first(steps: Tensor, is_there: Tensor) -> Tensor:
 
 
 def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
-    """Return (B, T) the steps that are shown, in order, and how much each of them counts; padding nothing.
+    """Return (B, T) the steps that are shown, in order, and their weights; padding has none.
 
-    A decision among the steps `kept` (B, steps) is shown up to `late_steps` times again, and counts as much
-    as one that is shown once: else the motion behind it, of which there is one frame each, would be learned
-    less.
+    A decision is shown up to `late_steps` times again with the weight of one: there is one frame of each.
     """
     times = kept.long()
     if late_steps:
@@ -167,10 +160,7 @@ def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tenso
 
 
 def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
-    """Return chunks (B, T, chunk, action) that continue with the last action before a decision.
-
-    `before` (B, T, chunk): whether an action is before the next decision; the first of a chunk always is.
-    """
+    """Return chunks (B, T, chunk, action) that repeat the last action `before` a decision after it."""
     last = (before.sum(dim=-1, keepdim=True) - 1)[..., None].expand(-1, -1, 1, actions.shape[-1])
     return torch.where(before[..., None], actions, actions.gather(2, last))
 
@@ -199,10 +189,7 @@ def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_epi
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
-    """Return by how much goals (B, T, 3), by their weights (B, T), miss the right ones (B, 3).
-
-    Squared, in units of what the mean of the batch's would miss.
-    """
+    """Return the squared error of goals (B, T, 3), weighted (B, T), in units of the batch's variance."""
     missed = (goal_m - right_m[:, None]).square().mean(dim=-1)
     return weighted_mean(missed, weights) / goal_variance(right_m)
 
@@ -213,10 +200,7 @@ def goal_variance(right_m: Tensor) -> Tensor:
 
 
 def _change(actions: Tensor, real: Tensor) -> Tensor:
-    """Return (B, T): by how much at most an action (B, T, action) differs from the one before.
-
-    The first of an episode has none before it: 1, a full change.
-    """
+    """Return (B, T): by how much an action differs at most from the one before; 1 for an episode's first."""
     change = torch.ones_like(actions[..., 0])
     difference = (actions[:, 1:] - actions[:, :-1]).abs().amax(dim=-1)
     change[:, 1:] = torch.where(real[:, :-1], difference, torch.ones_like(difference))
@@ -244,10 +228,7 @@ def _before_the_next(begins: Tensor, chunk_size: int) -> Tensor:
 
 
 def _until_a_decision(begins: Tensor, share: float) -> Tensor:
-    """Return (B, T): False after a decision, in the share of episodes (B, T) that end at one.
-
-    An episode without any decision does not end early.
-    """
+    """Return (B, T): False after a decision, in the given share of the episodes that have one."""
     draws = torch.rand(begins.shape, device=begins.device).masked_fill(~begins, -1.0)
     last = draws.argmax(dim=1)
     ends = begins.any(dim=1) & (torch.rand(len(begins), device=begins.device) < share)

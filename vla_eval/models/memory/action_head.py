@@ -32,10 +32,7 @@ def three_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class ActionHead(nn.Module):
-    """Decides when to go, the rest of the action, and how large the error of each action will be.
-
-    With `free`, a part of the translation (an action's first three numbers) does not depend on the goal.
-    """
+    """Decides when to go, the action, and its expected error; `free`: translation needs no goal."""
 
     upright: Tensor
 
@@ -66,10 +63,7 @@ class ActionHead(nn.Module):
         return torch.cat([translation, others], dim=-1), doubts
 
     def _along_each_axis(self, way_m: Tensor) -> Tensor:
-        """(N, 3) to (N, 3, WAY_SEEN): the way along the axis, up and aside, and which kind of axis it is.
-
-        The two horizontal axes share their weights: what is learned of one holds for the other.
-        """
+        """(N, 3) to (N, 3, WAY_SEEN): way along the axis, up, aside, kind of axis; x and y share weights."""
         way = way_m / WAY_SCALE_M
         up, aside = way[:, 2:], way[:, :2].norm(dim=1, keepdim=True)
         shared = torch.cat([up, aside], dim=1)[:, None].expand(-1, SPACE, -1)

@@ -125,10 +125,7 @@ class GoalLayer(nn.Module):
 
     @torch.no_grad()
     def note_errors(self, missed_m: Tensor, evidence: Tensor, state: Tensor) -> None:
-        """Keep in mind how far off each camera was at N steps, and by which evidence, see `Goals`.
-
-        `missed_m` (N, cameras, 3): goals of each camera alone, minus what they should have been.
-        """
+        """Note by which evidence each camera's goals missed, (N, cameras, 3), at N steps, see `Goals`."""
         squared = missed_m.square().sum(dim=-1) / self._squared_length(state)
         for usual, now in (
             (self.usual_error, squared.median(dim=0).values.clamp(min=LEAST_ERROR_M2)),
@@ -148,10 +145,7 @@ def by_camera(pointed: Tensor, shares: Tensor) -> Tensor:
 
 
 def _from_the_tool(rays: Tensor, state: Tensor) -> Tensor:
-    """Return where rays (N, heads, 6) meet the table, (N, heads, 3) in metres.
-
-    A ray is an offset from the tool and what is added to it per unit of height, both as the tool is turned.
-    """
+    """Return (N, heads, 3) m where rays meet the table: an offset from the tool, another per unit height."""
     height = POSITION_SCALE * state[:, None, SPACE - 1 : SPACE]
     from_tool = (rays[..., :SPACE] + height * rays[..., SPACE:]) / POSITION_SCALE
     first, second = state[:, SPACE : 2 * SPACE], state[:, 2 * SPACE : 3 * SPACE]

@@ -96,10 +96,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
     def predict_action_chunk(
         self, batch: dict[str, Tensor], memory: Memory | None = None, **kwargs: Any
     ) -> Tensor:
-        """Return (B, chunk, action) for one frame per episode, (B, …); `memory` has that frame in it already.
-
-        The twin takes no memory: it sees the frame and nothing else.
-        """
+        """Return (B, chunk, action) for one frame per episode, which `memory`, if any, has already."""
         self.eval()
         self.check_shown(memory)
         images, state = stacked_images(batch, self.config), batch[STATE_KEY]

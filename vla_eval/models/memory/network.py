@@ -141,11 +141,7 @@ class MemoryNetwork(nn.Module):
         return Memory(things, nothing, like.expand(n_episodes, -1))
 
     def see(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Sight:
-        """Return what is seen at each step in images (N, cameras, 3, H, W) in [0, 1].
-
-        What an instruction says, (N, hidden) by `sentence`, is in the summary: so it has a part in what is
-        kept, in what is asked of the images, and in the action.
-        """
+        """Return what is seen in images (N, cameras, 3, H, W) in [0, 1]; what is said is in the summary."""
         return self._sight([eye(images[:, index]) for index, eye in enumerate(self.eyes)], state, said)
 
     @in_float32
@@ -184,10 +180,7 @@ class MemoryNetwork(nn.Module):
 
     @in_float32
     def act(self, sight: Sight, memory: Memory, state: Tensor) -> Answer:
-        """Return actions (N, chunk, action), doubts (N, chunk) and goal (N, 3) for N steps.
-
-        `memory` has these steps written into it; the state (N, state) begins with the tool's position.
-        """
+        """Return the answer for N steps, which `memory` has already; a state begins with the tool's place."""
         sizes = self.sizes
         # Of the learned numbers alone: a thing is looked for as it was seen, in its colour and at its place.
         asked = self.asks(memory.rest).reshape(len(state), sizes.cameras, sizes.heads, -1)

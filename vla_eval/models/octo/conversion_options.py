@@ -9,13 +9,7 @@ from vla_eval.models.shared.options import gripper_option, option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OctoOptions:
-    """What the files do not say; flags explain themselves.
-
-    Attributes:
-        size: of the published ones, see the bases of the family's row; None: as `fields` say.
-        tokenizer: None: the one that the configuration names, from the cache.
-        fields: of `MikasaOctoConfig` that differ from those of the size.
-    """
+    """What the files do not say; flags explain themselves."""
 
     size: str | None = option(
         None, "--size", choices=("small", "base"), required=True, help="which Octo it is"

@@ -104,10 +104,7 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def forward(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
-        """Return the noise (…, F) that it believes to be in noisy actions (…, F).
-
-        `condition` is the readout (…, width), `time` (…, 1) the diffusion step, 0 to T - 1.
-        """
+        """Return the noise (…, F) in noisy actions (…, F), by the readout (…, width) and the step (…, 1)."""
         angles = 2 * math.pi * time.to(noisy.dtype) @ self.frequencies.T
         waves = torch.cat([angles.cos(), angles.sin()], dim=-1)
         embedded = self.time_fc2(functional.silu(self.time_fc1(waves)))
@@ -149,13 +146,7 @@ class DiffusionHead(nn.Module):
 
 
 class Targets(NamedTuple):
-    """What is to be predicted.
-
-    Attributes:
-        actions: (B, W, chunk, action), normalised.
-        action_mask: the same shape, True where an action counts.
-        step_mask: (B, W), True for steps of the episode.
-    """
+    """Normalised actions (B, W, chunk, action), which of them count, and which steps are the episode's."""
 
     actions: Tensor
     action_mask: Tensor

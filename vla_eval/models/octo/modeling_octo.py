@@ -102,10 +102,7 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return (B, action) for lerobot's own loop, which shows every frame and resets between episodes.
-
-        Each frame becomes history, also those at which no chunk is predicted.
-        """
+        """Return (B, action) for lerobot's own loop, which shows every frame; each becomes history."""
         self._shown.append({key: batch[key] for key in self.config.cameras.values()})
         if not self._queue:
             n_missing = self.config.window - len(self._shown)

@@ -22,15 +22,7 @@ from vla_eval.models.offline_rl.network import OfflineRLNetwork
 
 
 class Transitions(NamedTuple):
-    """A batch of B transitions.
-
-    Attributes:
-        now: (B, D) what the encoder returns of a frame.
-        later: (B, D) of the next frame, without a gradient.
-        actions: (B, A) recorded.
-        rewards: (B,).
-        ends: (B,) 1 where nothing follows.
-    """
+    """B transitions: encodings (B, D) now and later (no gradient), actions (B, A), rewards, 1 at an end."""
 
     now: Tensor
     later: Tensor
@@ -71,10 +63,7 @@ def cql(network: OfflineRLNetwork, seen: Transitions, config: MikasaOfflineRLCon
 
 
 def _sampled(network: OfflineRLNetwork, seen: Transitions, n: int) -> tuple[Tensor, Tensor]:
-    """Return values (Q, B, 3 n) and log densities (B, 3 n) of drawn actions.
-
-    They are uniform, of the actor at this frame, and of the actor at the next one.
-    """
+    """Return values (Q, B, 3 n) and log densities of draws: uniform, the actor's now, its later ones."""
     with torch.no_grad():
         of_actor = [network.draw(encoded, n) for encoded in (seen.now, seen.later)]
         uniform = 2 * torch.rand_like(of_actor[0].actions) - 1

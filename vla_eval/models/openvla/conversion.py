@@ -96,10 +96,7 @@ def read_statistics(
 def read_normalizations(
     source: Path, statistics: Statistics, config: MikasaOpenVLAConfig
 ) -> dict[str, Normalization]:
-    """Return how fields are normalised: as ours, with the masks of the statistics.
-
-    A gripper in an encoding of its own is not normalised.
-    """
+    """Return how fields are normalised: as ours, with the statistics' masks; a converted gripper is not."""
     fields = {
         key: dataclasses.replace(spec, mask=read_mask(source, key, statistics[key], len(spec.mask)))
         for key, spec in config.normalizations().items()

@@ -10,15 +10,7 @@ from vla_eval.models.shared.options import YES_NO, gripper_option, option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenVLAOptions:
-    """What the files do not say; flags explain themselves.
-
-    Attributes:
-        unnorm_key: None: the only statistics that there are, or none at all.
-        image_augmentation: None: as the folder's name says.
-        camera_px: edge of the images as a camera gives them.
-        sizes: sizes that differ from the published ones.
-        dtype: of the result.
-    """
+    """What the files do not say; flags explain themselves."""
 
     head: str = option("tokens", "--head", choices=get_args(Head), help="tokens: a plain OpenVLA")
     chunk_size: int = option(1, "--chunk", type=int, metavar="K", help="actions of a chunk (1)")

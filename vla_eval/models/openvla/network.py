@@ -30,13 +30,7 @@ ROPE_THETA = 10_000.0
 
 
 class Inputs(NamedTuple):
-    """The inputs of B samples.
-
-    Attributes:
-        images: (B, cameras, 3, H, W) in [0, 1].
-        prompts: see there.
-        proprio: (B, proprio) normalised; None for a model without.
-    """
+    """Images (B, cameras, 3, H, W) in [0, 1], prompts, and normalised proprioception if it is read."""
 
     images: Tensor
     prompts: Prompts
@@ -44,13 +38,7 @@ class Inputs(NamedTuple):
 
 
 class Sequence(NamedTuple):
-    """What Llama reads.
-
-    Attributes:
-        embeddings: (B, N, D).
-        mask: (B, N) bool, False for padding.
-        first_action: (B,) position of the first action token.
-    """
+    """Embeddings (B, N, D) and mask (B, N) that Llama reads, and the first action token's position (B,)."""
 
     embeddings: Tensor
     mask: Tensor
@@ -116,10 +104,7 @@ class OpenVLANetwork(nn.Module):
         return logits
 
     def hidden(self, sequence: Sequence, *, causal: bool = False) -> Tensor:
-        """Return Llama's last hidden states (B, N, D).
-
-        Causal: a token attends to no later one; else to all that are not padding.
-        """
+        """Return Llama's last hidden states (B, N, D); `causal`: no token attends to a later one."""
         n = sequence.mask.shape[1]
         mask = sequence.mask[:, None, :].expand(-1, n, -1)
         if causal:

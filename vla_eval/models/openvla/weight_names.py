@@ -50,10 +50,7 @@ def unused(name: str, sizes: NetworkSizes) -> bool:
 
 
 def to_ours(weights: Mapping[str, Tensor], sizes: NetworkSizes) -> dict[str, Tensor]:
-    """Return the original's tensors under our names and in our layouts; the depths say which are not used.
-
-    A name that is not known is kept as it is: loading the result refuses it.
-    """
+    """Return tensors in our names and layouts; an unknown name stays as it is, for the loader to refuse."""
     ours: dict[str, Tensor] = {}
     for name, tensor in weights.items():
         if unused(name, sizes):

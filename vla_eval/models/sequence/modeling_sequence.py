@@ -26,12 +26,7 @@ from vla_eval.models.shared.precision import in_float32
 
 
 class Predicted(NamedTuple):
-    """What the network predicts at each step.
-
-    Attributes:
-        actions: (B, T, chunk, action).
-        goal_m: (B, T, 3) where the demonstration's tool centre point ends.
-    """
+    """Actions (B, T, chunk, action), and where the demonstration's tool centre point ends, (B, T, 3)."""
 
     actions: Tensor
     goal_m: Tensor
@@ -51,12 +46,7 @@ class Gated(nn.Module):
 
 
 class Demonstrated(NamedTuple):
-    """What the tokens of a demonstration's steps are made of, in addition to the observations.
-
-    Attributes:
-        returns: (B, T) to go.
-        actions: (B, T, action) executed at these steps.
-    """
+    """Returns to go (B, T) and executed actions (B, T, action), which tokens are made of."""
 
     returns: Tensor
     actions: Tensor
@@ -102,10 +92,7 @@ class SequenceNetwork(nn.Module):
         return (*self.core.begin(n_episodes), nothing)
 
     def tokens(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Tensor:
-        """Return (B, T, width) of what is seen in images (B, T, cameras, 3, H, W), in [0, 1] or bytes.
-
-        `said`: (B, T, width) by `sentence`; None where no instruction is read.
-        """
+        """Return (B, T, width) of images (B, T, cameras, 3, H, W), in [0, 1] or bytes, and of the rest."""
         return self._told(self.encoders(images), state, said)
 
     # Under autocast the encoders alone are in half precision: they are nearly all of the work.
@@ -116,10 +103,7 @@ class SequenceNetwork(nn.Module):
 
     @in_float32
     def answers(self, tokens: Tensor, demonstrated: Demonstrated | None) -> Tensor:
-        """Return the core's answers (B, T, width) to the observations' tokens of whole demonstrations.
-
-        `demonstrated`: what the other tokens are made of, if there are others.
-        """
+        """Return answers (B, T, width) to observations' tokens; other tokens are made of `demonstrated`."""
         begun = self.core.begin(len(tokens))
         if demonstrated is None:
             alone: Tensor = self.core(tokens, begun)[0]
@@ -221,10 +205,7 @@ class MikasaSequencePolicy(EpisodePolicy):
     def predict_action_chunk(
         self, batch: dict[str, Tensor], memory: CoreMemory | None = None, **kwargs: Any
     ) -> Tensor:
-        """Return (B, chunk, action) for one frame per episode, (B, …); `memory` has that frame in it already.
-
-        A policy without a memory takes none.
-        """
+        """Return (B, chunk, action) for one frame per episode, which `memory`, if any, has already."""
         self.eval()
         self.check_shown(memory)
         images, state = stacked_images(batch, self.config)[:, None], batch[STATE_KEY][:, None]

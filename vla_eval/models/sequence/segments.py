@@ -29,10 +29,7 @@ class Segmented(Core):
 
     @abc.abstractmethod
     def read_segment(self, tokens: Tensor, kept: CoreMemory) -> tuple[Tensor, CoreMemory]:
-        """Return the answers to a segment (B, S, W), each from no later token, and what is kept after it.
-
-        What is kept is only used if the segment was full.
-        """
+        """Return the answers to a segment (B, S, W), each from no later token, and what a full one leaves."""
 
     def begin(self, n_episodes: int) -> CoreMemory:
         """Return room for the tokens of a segment, how many there are, (B,), and what is kept."""

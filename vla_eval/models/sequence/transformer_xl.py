@@ -53,10 +53,7 @@ class GruGate(nn.Module):
 
 
 class Layer(nn.Module):
-    """A layer of the source: its attention adds its input, and so does the layer; both sums are normalised.
-
-    With `gated`, the order is that of GTrXL: norm, sublayer, ReLU, gate.
-    """
+    """A layer of the source: sums are normalised; `gated`: GTrXL's order, norm, sublayer, ReLU, gate."""
 
     def __init__(self, *, width: int, heads: int, dropout: float, options: TransformerXLOptions) -> None:
         super().__init__()

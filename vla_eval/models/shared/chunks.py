@@ -56,11 +56,7 @@ class PromptedChunks:
         return (batch[name].float() * MAX_LEVEL).round()
 
     def _counts(self, is_pad: Tensor | None, actions: Tensor) -> Tensor:
-        """Return (B, chunk) float: 0 for actions beyond an episode's end.
-
-        Raises:
-            TrainingError: there are such actions, and the configuration does not leave them out.
-        """
+        """Return (B, chunk) float, 0 beyond an episode's end; raise if these may not be left out."""
         if is_pad is None:
             return torch.ones(actions.shape[:2], device=actions.device)
         if not self.config.do_mask_loss_for_padding and bool(is_pad.any()):

@@ -66,10 +66,7 @@ def place_fields(cameras: Iterable[str], n_places: int) -> tuple[str, ...]:
 
 
 def in_places(camera: str, images: Sequence[Tensor | None], like: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Yield the fields of a camera's images (3, H, W), in the order of the places, and of their masks.
-
-    `camera` is the field of the newest image, `like` an image of the same shape and type.
-    """
+    """Yield fields of a camera's images (3, H, W), shaped as `like`, and of their masks, place by place."""
     for place, image in enumerate(images, start=1):
         name = place_field(camera, place)
         yield name, torch.zeros_like(like) if image is None else image

@@ -25,12 +25,7 @@ Blocks = tuple[Values, ...]
 
 
 class Event(NamedTuple):
-    """A change of the scene.
-
-    Attributes:
-        number: of the last frame before it.
-        novelty: see `novelty`; the greatest in the burst.
-    """
+    """A change of the scene: the last frame before it, and the greatest `novelty` of its burst."""
 
     number: int
     novelty: float
@@ -38,13 +33,7 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Seen:
-    """What a rule keeps of an episode, whatever its length.
-
-    Attributes:
-        n_frames: so far; the newest one has the number `n_frames` - 1.
-        blocks: of the newest one; None if the rule does not look at images.
-        events: that are kept, oldest first.
-    """
+    """What a rule keeps of `n_frames` so far: blocks of the newest if it looks, and events, oldest first."""
 
     n_frames: int = 0
     blocks: Blocks | None = None
@@ -87,10 +76,7 @@ class FrameChoice:
         return RULES[self.rule].after(self, seen, image)
 
     def shown(self, seen: Seen) -> tuple[int | None, ...]:
-        """Return for each place the number of the frame that is shown beside the newest; None: there is none.
-
-        `last`: place 1 is the nearest in time. `keyframes`: place 1 is the oldest.
-        """
+        """Return the frame shown at each place: the nearest first by `last`, the oldest by `keyframes`."""
         numbers = RULES[self.rule].shown(self, seen)
         return (*numbers, *[None] * (self.n_places - len(numbers)))
 

@@ -15,13 +15,7 @@ from transformers import DynamicCache
 
 
 class Prefix(NamedTuple):
-    """What is read before the first token is predicted.
-
-    Attributes:
-        embeddings: (B, N, D), padded on the right.
-        mask: (B, N, N) bool: which place (second N) each place attends to.
-        lengths: (B,) places that are not padding.
-    """
+    """Embeddings (B, N, D), right-padded, which (B, N, N) places attend to which, and lengths (B,)."""
 
     embeddings: Tensor
     mask: Tensor
@@ -58,10 +52,7 @@ class LanguageModel(Protocol):
 def greedy_tokens(
     model: LanguageModel, prefix: Prefix, n_tokens: int, *, never: tuple[int, ...] = ()
 ) -> Decoded:
-    """Return the likeliest token, the likeliest after that, and so on, `n_tokens` of them.
-
-    `never`: tokens that are not chosen, however likely; the logits that are returned keep them.
-    """
+    """Return the likeliest tokens one after the other; those in `never` only have logits."""
     lengths, n = prefix.lengths, prefix.embeddings.shape[1]
     cache = DynamicCache()
     places = torch.arange(n, device=lengths.device)[None]

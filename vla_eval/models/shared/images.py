@@ -124,10 +124,7 @@ class Boxes(NamedTuple):
 
 @in_float32
 def crop_and_resize(images: Tensor, boxes: Boxes) -> Tensor:
-    """Return the crops (B, …, 3, H, W) of boxes, one for each of the B, enlarged to the images' own size.
-
-    Bilinear, corners aligned.
-    """
+    """Return crops (B, …, 3, H, W) of one box for each of the B, enlarged bilinearly, corners aligned."""
     n, (height, width) = len(images), images.shape[-2:]
     rows = _crop_weights(boxes.top, boxes.height, height)
     columns = _crop_weights(boxes.left, boxes.width, width)

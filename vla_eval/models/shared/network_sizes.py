@@ -10,12 +10,7 @@ from vla_eval.errors import RecipeError, check_names
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisionSizes:
-    """Sizes of images and of SigLIP (so400m/14 as published), which OpenVLA and SpatialVLA both have.
-
-    Attributes:
-        image_px, patch_px: edge of an image and of a patch.
-        siglip_width, siglip_depth, siglip_heads, siglip_mlp: SigLIP.
-    """
+    """Sizes of images and of SigLIP (so400m/14 as published), which OpenVLA and SpatialVLA both have."""
 
     image_px: int = 224
     patch_px: int = 14

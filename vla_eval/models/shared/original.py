@@ -43,10 +43,7 @@ class Original:
 
 
 def with_features(config: Any, cameras: Mapping[str, tuple[int, int]], *, state: int = 0) -> Any:
-    """Give a configuration the fields of our datasets; return it.
-
-    `cameras`: field -> (height_px, width_px). `state`: numbers of proprioception; 0: it reads none.
-    """
+    """Return a configuration with our datasets' fields: cameras' (height_px, width_px), `state` numbers."""
     fields = {
         name: PolicyFeature(type=FeatureType.VISUAL, shape=(3, *size)) for name, size in cameras.items()
     }

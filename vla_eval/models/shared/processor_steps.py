@@ -25,13 +25,7 @@ from vla_eval.strict.decoding import decode
 
 @dataclass
 class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
-    """Specification and statistics of the fields that are normalised.
-
-    Attributes:
-        fields: field -> how it is normalised.
-        gripper: how the action's gripper is encoded.
-        stats: field -> statistic -> one number per dimension; None: they come with `load_state_dict`.
-    """
+    """Specification and statistics of normalised fields; statistics may come with `load_state_dict`."""
 
     fields: dict[str, Normalization]
     gripper: Gripper = field(default_factory=Gripper)

@@ -8,12 +8,7 @@ from vla_eval.errors import MissingInstructionError
 
 
 class Prompts(NamedTuple):
-    """Prompts of B samples, from the beginning of the text to the last token before the actions.
-
-    Attributes:
-        ids: (B, T) int64, padded on the right.
-        mask: (B, T) bool, False for padding.
-    """
+    """Prompts of B samples, without actions: ids (B, T), right-padded; the mask is False for padding."""
 
     ids: Tensor
     mask: Tensor

@@ -80,10 +80,7 @@ class SentenceWatch:
         self._said: set[frozenset[str]] = set()
 
     def lines(self, reading: SentenceReading, task: str) -> list[str]:
-        """Return what is to be reported of a sentence of a task and has not been.
-
-        A task that is not known has an empty id: then each sentence is a task of its own.
-        """
+        """Return what is new of a sentence; with an empty id, each sentence is a task of its own."""
         said = []
         alike = self._alike.setdefault(reading.ids, [])
         if reading.sentence not in self._tasks:

@@ -10,10 +10,7 @@ LAYER_NORM_EPS = 1e-6
 
 
 def siglip(sizes: VisionSizes, *, n_blocks: int, activation: str) -> Any:
-    """Return the encoder with random weights, without its pooling head.
-
-    `n_blocks` is its depth, `activation` transformers' name of the blocks' activation.
-    """
+    """Return the encoder of that depth with random weights, without its pooling head."""
     config: Any = SiglipVisionConfig
     model: Any = SiglipVisionModel(
         config(

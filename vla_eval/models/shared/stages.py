@@ -16,13 +16,7 @@ VISION, LANGUAGE, EXPERT, HEAD = range(4)
 
 
 class Stage(NamedTuple):
-    """A part of a network.
-
-    Attributes:
-        pattern: of the names of its modules.
-        tokens: of a sample that pass through it; 0: it is not used.
-        order: parts of lower order are computed before it.
-    """
+    """Modules whose names match, the tokens of a sample that pass through (0: none), and their order."""
 
     pattern: str
     tokens: int

@@ -21,10 +21,7 @@ GRIPPER_THRESHOLD = 0.5  # open from here on
 
 
 def to_tokens(actions: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
-    """Return the tokens (…, 3) int64 of normalised actions (…, 7); what is beyond [-1, 1] is cut.
-
-    An action is x, y, z, roll, pitch, yaw, gripper (0 to 1).
-    """
+    """Return tokens (…, 3) int64 of normalised actions (…, 7), cut to [-1, 1]; a gripper is from 0 to 1."""
     assert actions.shape[-1] == N_ACTION
     bounded = actions.double().clamp(-1, 1)
     values = torch.cat([to_spherical(bounded[..., TRANSLATION]), bounded[..., ROTATION]], dim=-1)
@@ -37,10 +34,7 @@ def to_tokens(actions: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
 
 
 def from_tokens(tokens: Tensor, grid: ActionGrid, sizes: NetworkSizes) -> Tensor:
-    """Return normalised actions (…, 7), float64: the middles of the bins, translations cut to [-1, 1].
-
-    A token (…, 3) that is none of its column's is taken for the column's nearest.
-    """
+    """Return actions (…, 7), float64: middles of bins; a token of another column becomes the nearest."""
     limits = torch.tensor([sizes.n_translations, sizes.n_rotations, 2], device=tokens.device) - 1
     places = tokens - first_tokens(sizes, tokens.device)
     translation, rotation, gripper = torch.minimum(places.clamp(min=0), limits).unbind(dim=-1)

@@ -13,10 +13,7 @@ from vla_eval.models.shared.precision import in_float32
 
 
 def intrinsics(*, height_px: int, width_px: int, fov_rad: float) -> Tensor:
-    """Return the matrix (3, 3), float32, of a pinhole camera with square pixels and a centred axis.
-
-    `fov_rad`: vertical field of view, as ManiSkill declares it.
-    """
+    """Return the matrix (3, 3) of a centred pinhole camera with ManiSkill's vertical field of view."""
     if not 0 < fov_rad < math.pi:
         raise RecipeError(f"camera_fov_rad is {fov_rad}, expected radians in (0, π).")
     focal_px = height_px / 2 / math.tan(fov_rad / 2)

@@ -8,16 +8,7 @@ from vla_eval.models.shared.options import option
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpatialVLAOptions:
-    """What the files do not say; flags explain themselves.
-
-    Attributes:
-        unnorm_key: None: the only statistics that there are, or none at all.
-        head: None: as the files say, and an error if they contradict each other.
-        cameras: fields of the images that the policy expects; `pictures` says which of them are read.
-        camera_px: edge of the images as a camera gives them.
-        sizes: sizes that differ from the published ones.
-        dtype: of the result.
-    """
+    """What the files do not say; flags explain themselves."""
 
     unnorm_key: str | None = option(
         None, "--unnorm-key", metavar="NAME", help="whose statistics, where there are several"

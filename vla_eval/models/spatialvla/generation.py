@@ -22,10 +22,7 @@ def token_loss(
     counts: Tensor,
     attention: Attention,
 ) -> Tensor:
-    """Return the mean cross-entropy of the tokens of actions (B, K, 7), gripper 0 to 1, and of stop.
-
-    `counts` (B, K) is 0 for actions that are left out; stop counts as the last action does.
-    """
+    """Return the mean cross-entropy of the tokens of actions (B, K, 7) and stop; `counts` 0 leaves out."""
     ids = to_tokens(actions, grid, network.sizes).flatten(1)
     sequence = network.sequence(inputs, ids)
     # A token is predicted at the place before it.
@@ -38,10 +35,7 @@ def token_loss(
 def generated_tokens(
     network: SpatialVLANetwork, inputs: Inputs, *, chunk: int, attention: Attention
 ) -> Decoded:
-    """Return the tokens (B, 3 · chunk) of a chunk; stop is never predicted, whatever is likeliest.
-
-    Prompts of several lengths go together; padding is attended to in no case.
-    """
+    """Return a chunk's tokens (B, 3 · chunk); stop is never predicted, padding never attended to."""
     if attention == "bidirectional_with_padding":
         attention = "bidirectional"
     sequence = network.sequence(inputs)

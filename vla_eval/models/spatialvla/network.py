@@ -52,13 +52,7 @@ class Inputs(NamedTuple):
 
 
 class Sequence(NamedTuple):
-    """What Gemma reads.
-
-    Attributes:
-        embeddings: (B, N, D).
-        lengths: (B,) places that are not padding.
-        first_action: (B,) place of the first action token: behind the prefix.
-    """
+    """Embeddings (B, N, D) that Gemma reads, their numbers (B,), and the place of the first action token."""
 
     embeddings: Tensor
     lengths: Tensor
@@ -115,11 +109,7 @@ class SpatialVLANetwork(nn.Module):
         return Sequence(embeddings, first + n_more, first)
 
     def mask(self, sequence: Sequence, attention: Attention) -> Tensor:
-        """Return (B, N, N) bool: which place (second N) each place attends to.
-
-        Padding attends to something, too, so that no row is empty; nothing attends to it, unless `attention`
-        is `bidirectional_with_padding`.
-        """
+        """Return (B, N, N): which place attends to which; to padding only `bidirectional_with_padding`."""
         n = sequence.embeddings.shape[1]
         places = torch.arange(n, device=sequence.lengths.device)
         is_real = places < sequence.lengths[:, None]

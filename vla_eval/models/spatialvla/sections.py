@@ -42,12 +42,7 @@ OF_NO_EFFECT = frozenset(
 
 
 class Field(NamedTuple):
-    """What one field has to say.
-
-    Attributes:
-        ours: the value that we implement.
-        default: what the original takes where the field is missing; None: it has to be there.
-    """
+    """What a field has to say: our value, and the original's default; without one it has to be there."""
 
     ours: object
     default: object = None
@@ -55,13 +50,7 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """What one section of a file may say.
-
-    Attributes:
-        where: the file, and the section in it.
-        fields: those that are compared.
-        elsewhere: fields that are read elsewhere (`convert`), or without effect for the reason beside them.
-    """
+    """What a section of a file may say: fields compared, and those read elsewhere or without effect."""
 
     where: str
     fields: Mapping[str, Field]

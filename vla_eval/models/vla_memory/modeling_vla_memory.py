@@ -27,10 +27,7 @@ from vla_eval.models.vla_memory.memory_tokens import (
 
 
 class RemembersMixin:
-    """What the three have in common. Comes before lerobot's class.
-
-    With tokens it has the methods `remember` and `begin_memory`, and a training sample is in segments.
-    """
+    """What the three have in common; with tokens they remember. Comes before lerobot's class."""
 
     new_in_finetuning = ("memory_tokens.",)
     remembers_singly = True

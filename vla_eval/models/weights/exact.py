@@ -101,10 +101,7 @@ def check_fit(
 def check_same(
     actual: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, where: str, partial: bool = False
 ) -> None:
-    """Raise `CheckpointError` unless a model's tensors are those of the file, in its type, and all finite.
-
-    If `partial`, the model may hold more.
-    """
+    """Raise `CheckpointError` unless a model has the file's tensors, finite; `partial`: it may have more."""
     problems = {
         "missing": [] if partial else [key for key in actual if key not in expected],
         "unexpected": [key for key in expected if key not in actual],

@@ -31,11 +31,7 @@ ALIGNMENT = 8  # bytes; the header is filled up with spaces
 
 
 class WeightFile(Mapping[str, Tensor]):
-    """The tensors of a file by name; each access reads one. Its header is read and checked at once.
-
-    Raises:
-        CheckpointError: it is missing or damaged, or has a type of numbers that no policy has.
-    """
+    """The tensors of a file by name, read at each access; its header is read and checked at once."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

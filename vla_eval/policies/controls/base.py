@@ -35,11 +35,7 @@ def check_has(condition: bool, context: PolicyContext, does: str, lacks: str) ->
 
 
 def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts have a protocol of their own
-    """Return the scripted expert that the catalogue names for the task of the context.
-
-    Raises:
-        SpecMismatchError: there is none, as for half of the official package's 90 tasks.
-    """
+    """Return the scripted expert of the context's task; raise if it has none, as half of the official 90."""
     module, _, name = task_spec(context.env.task).oracle.partition(":")
     if not module:
         raise SpecMismatchError(
@@ -86,11 +82,7 @@ class ScriptedPolicy:
         raise NotImplementedError
 
     def privileged_state(self, window: ObservationWindow) -> PrivilegedState:
-        """Return the true state of the world at the last observation.
-
-        Raises:
-            SpecMismatchError: the environment was made without it.
-        """
+        """Return the true state of the world at the last observation; raise if the environment has none."""
         state = window.last.privileged
         if state is None:
             raise SpecMismatchError(

@@ -16,12 +16,7 @@ JOINT_STATES = ("qpos", "qvel")
 
 
 class TranslatedPolicy:
-    """A scripted control whose chunks are translated to another control mode.
-
-    Args:
-        planner: plans in `pd_ee_delta_pose`.
-        mode: the other one.
-    """
+    """A scripted control whose chunks, planned in `pd_ee_delta_pose`, are translated to another mode."""
 
     def __init__(self, planner: ScriptedPolicy, mode: str) -> None:
         self._planner = planner
@@ -49,11 +44,7 @@ ScriptedMaker = Callable[[PolicyContext], ScriptedPolicy]
 
 
 def in_any_control_mode(make: ScriptedMaker) -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
-    """Let a factory of controls that plan in `pd_ee_delta_pose` make them for every control mode.
-
-    Raises:
-        SpecMismatchError: the task's expert turns the wrist, and the mode does not.
-    """
+    """Make controls for every control mode; refuse one without rotation where the expert turns the wrist."""
 
     @functools.wraps(make)
     def made(context: PolicyContext) -> ScriptedPolicy | TranslatedPolicy:

@@ -67,11 +67,7 @@ class BodyMemoryPolicy(ScriptedPolicy):
 
 @in_any_control_mode
 def make_body_memory(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `body_memory` control.
-
-    Raises:
-        SpecMismatchError: the task has no candidates, or several have to be touched.
-    """
+    """Make the `body_memory` control; refuse a task without candidates or with several to touch."""
     expert = task_expert(context)
     one_is_right = context.n_candidates > 0 and not task_spec(context.env.task).several_right
     does = "keeps in its gripper which one of several candidates is right"
@@ -114,11 +110,7 @@ def _nearest(state: PrivilegedState) -> int:
 
 @in_any_control_mode
 def make_cue_touch(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `cue_touch` control.
-
-    Raises:
-        SpecMismatchError: the task has no candidates, so no place where one is shown.
-    """
+    """Make the `cue_touch` control; refuse a task without candidates, where none is shown."""
     lacks = "shows none at a place of its own"
     check_has(context.n_candidates > 0, context, "goes to where the cue is shown", lacks)
     return CueTouchPolicy(context)
@@ -172,11 +164,7 @@ class OneFrameOfCubePolicy(ScriptedPolicy):
 
 @in_any_control_mode
 def make_one_frame(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `one_frame` control.
-
-    Raises:
-        SpecMismatchError: no ball rolls in the task, and it is not TakeItBack.
-    """
+    """Make the `one_frame` control; refuse a task without a rolling ball that is not TakeItBack."""
     task = task_spec(context.env.task)
     does = "is for tasks in which a ball rolls and for TakeItBack-v0"
     check_has(task.seen_in_one_frame is not None, context, does, "is neither")

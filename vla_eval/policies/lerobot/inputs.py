@@ -80,11 +80,7 @@ class InputOptions:
 def input_map(
     loaded_config: Any, preprocessor: Any, options: InputOptions, env: EnvSpec, *, policy: str
 ) -> InputMap:
-    """Return how observations of an environment become inputs of a policy; what it renames is considered.
-
-    Raises:
-        SpecMismatchError: a camera, its size, the state or the action does not fit.
-    """
+    """Return how observations become inputs of a policy; refuse cameras, state or action that do not fit."""
     renamed = _of_steps(preprocessor, "rename_map")
     expected = _expected_cameras(loaded_config, options.absent_cameras, policy)
     by_field = {renamed.get(field, field): (camera, field) for camera, field in options.cameras.items()}
@@ -122,13 +118,9 @@ def check_training(
     *,
     policy: str,
 ) -> None:
-    """Compare what the policy saw in training with what it will see.
+    """Compare what the policy saw in training with what it will see; raise with all that differs.
 
-    Without `facts`, which a fine-tuning of ours notes, only what its configuration and statistics say is
-    compared.
-
-    Raises:
-        SpecMismatchError: expected and found, for each thing that differs.
+    Without `facts`, which a fine-tuning of ours notes, its configuration and statistics are compared alone.
     """
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     seen = {field: sizes[camera] for camera, field in inputs.cameras.items()}

@@ -173,11 +173,7 @@ class LeRobotPolicy:
         return self.act_batch([window])[0]
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
-        """Infer for each window; the draws of an episode are its own.
-
-        Raises:
-            InvalidActionError: two windows are of the same row of a pass, or a row is beyond it.
-        """
+        """Infer for each window; each draws its own, and refuses a row that is not there or is taken."""
         due = [self._shown(window) for window in windows]
         if not self._batch:
             inferred = [self._infer([episode])[0] for episode in due]
@@ -279,12 +275,7 @@ def make_lerobot(
     base_checkpoint: str | None = None,
     batch: bool | None = None,
 ) -> LeRobotPolicy:
-    """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments.
-
-    Raises:
-        CheckpointError: no checkpoint, or one that is not complete.
-        SpecMismatchError: the policy and the environment do not fit.
-    """
+    """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments."""
     if checkpoint is None:
         raise CheckpointError(
             f"policy '{context.name}' has no weights: its recipe says how to fine-tune it."

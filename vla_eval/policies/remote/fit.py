@@ -49,11 +49,7 @@ class Fit:
         return tuple(dict.fromkeys(name for layout in self.state.values() for name in layout.states))
 
     def request(self, observation: Observation, instruction: str) -> dict[str, Any]:
-        """Return what is sent of an observation.
-
-        Raises:
-            SimulationError: a state is not finite, or its rotation is none.
-        """
+        """Return what is sent of an observation; refuse a state that is not finite, or not a rotation."""
         for name in self.states:
             try:
                 as_state(observation.state[name], self.state_dims[name])
@@ -76,11 +72,7 @@ class Fit:
 
 
 def fit(settings: RemoteSettings, server: ServerMetadata, env: EnvSpec, *, where: str) -> Fit:
-    """Bring a recipe's settings, a server and an environment together.
-
-    Raises:
-        SpecMismatchError: they do not fit together, or none of them says something that has to be known.
-    """
+    """Bring settings, server and environment together; refuse what does not fit, or is not said by any."""
     _check_actions(settings, server, env, where=where)
     chunk_size = _agreed("chunk_size", settings.chunk_size, server.chunk_size, where=where)
     if chunk_size is None:

@@ -104,19 +104,13 @@ class RemotePolicy:
 def make_remote(
     context: PolicyContext, *, url: str, identity_sha256: str | None = None, **args: Any
 ) -> RemotePolicy:
-    """Connect to a policy server.
+    """Connect to a policy server; the other fields of `RemoteSettings` are in `args`.
 
     Args:
         context: what every adapter gets.
         url: `ws://HOST:PORT`; of several with commas, the one with the fewest sessions is taken.
-        identity_sha256: digest of what the server reported when the run was planned.
-        **args: the other fields of `RemoteSettings`.
-
-    Raises:
-        RecipeError: an argument is unknown or wrong.
-        RemotePolicyError: there is no server, or it does not serve a policy.
-        RemoteChangedError: the server is not what it was when the run was planned.
-        SpecMismatchError: server, recipe and environment do not fit together.
+        identity_sha256: digest of what the server reported when the run was planned; another is refused.
+        **args: see `RemoteSettings`.
     """
     where = f"policy '{context.name}'"
     settings = remote_settings({"url": url, **args}, where=where)

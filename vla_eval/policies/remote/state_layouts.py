@@ -34,11 +34,7 @@ class StateLayout(NamedTuple):
 
 
 def state_layout(name: str, env: EnvSpec, *, where: str) -> StateLayout:
-    """Return a layout by its name: `joints`, or `tcp_pose+qpos`.
-
-    Raises:
-        SpecMismatchError: there is no such layout, or the environment lacks what it is computed from.
-    """
+    """Return a layout by its name, `joints` or `tcp_pose+qpos`; refuse one that the environment lacks."""
     offered = {state.name: len(state.dims) for state in env.states}
     found = LAYOUTS.get(name)
     if found is None:
