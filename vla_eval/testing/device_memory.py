@@ -6,7 +6,7 @@ import torch
 
 
 def reset_device_peak(device: str) -> None:
-    """Free what is not used, and let the peak begin anew; a model measured before would be in it."""
+    """Free what is not used, and let the peak begin from scratch; a model measured before would be in it."""
     if torch.device(device).type == "cuda":
         gc.collect()  # a policy and its processors refer to each other
         torch.cuda.empty_cache()
