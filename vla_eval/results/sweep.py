@@ -1,7 +1,4 @@
-"""Compare results on the same episodes: chunk lengths of a policy, or policies at one chunk length.
-
-Reads and returns; changes nothing. `docs/chunk_sizes.md` explains each column.
-"""
+"""Compare results on the same episodes, by chunk length or policy; `docs/chunk_sizes.md` explains."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -151,11 +148,8 @@ def _env_arguments(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], Ma
 def episodes_to_settle(difference: float, discordance: float, *, level: float = LEVEL) -> int:
     """Return how many paired episodes a two-sided McNemar test needs to detect a difference with `POWER`.
 
-    Args:
-        difference: of the two success rates, in (0, 1].
-        discordance: share of episodes in which the two policies differ; raised to `difference` if it is
-            smaller, which is impossible.
-        level: of the test, after any correction for several comparisons, in (0, 1).
+    The difference of the rates is in (0, 1]; the discordance, the share of episodes in which the two differ,
+    is raised to it if smaller. The level is that after any correction for several comparisons, in (0, 1).
 
     Source: Connor 1987, "Sample size for testing differences in proportions for the paired-sample
     design", Biometrics 43(1):207-211, equation 3: n = (z_{1-level/2} √ψ + z_{power} √(ψ - δ²))² / δ².

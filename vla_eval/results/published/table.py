@@ -21,11 +21,7 @@ PAPER_PROTOCOL = "mean ± SEM, 3 runs × 100 episodes"
 
 
 def published_side_tables(board: str) -> list[SideTable]:
-    """Return the published results of a board, and how they were measured.
-
-    Raises:
-        UnknownNameError: there is no such board.
-    """
+    """Return a board's published results and how they were measured; errors as `of_board`."""
     published = load_published()
     results = published.of_board(board)
     tasks = published.boards[board].tasks
