@@ -180,7 +180,7 @@ def test_the_shipped_configuration_is_the_papers_question() -> None:
 
 def test_the_cues_default_length_is_the_simulators() -> None:
     from vla_eval.envs.fake import CHOICE_DEFAULTS
-    from vla_eval.results.cue import DEFAULT_CUE_STEPS
+    from vla_eval.results.sweep import DEFAULT_CUE_STEPS
 
     source = (Path(__file__).parents[2] / "vla_eval/tasks/memory_env.py").read_text()
     assert CHOICE_DEFAULTS["cue_steps"] == DEFAULT_CUE_STEPS

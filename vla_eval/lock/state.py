@@ -85,9 +85,8 @@ def may_write(place: str) -> bool:
 
 def code_folders() -> tuple[str, ...]:
     """Return the folders that Python searches now, and those of packages that are installed elsewhere."""
-    files = [
-        getattr(module, "__file__", None) for name, module in tuple(sys.modules.items()) if "." not in name
-    ]
+    modules = [module for name, module in tuple(sys.modules.items()) if "." not in name]
+    files = [getattr(module, "__file__", None) for module in modules]
     elsewhere = {os.path.realpath(os.path.dirname(file)) for file in files if file}
     elsewhere -= {"/", os.path.realpath(".")}
     compiled = os.path.join(tempfile.gettempdir(), f"torchinductor_{_user()}")

@@ -31,13 +31,7 @@ N_OPEN_MATRICES = 12  # rows of the table; those of more are folded
 
 
 class PageOptions(TypedDict, total=False):
-    """What a page is made with.
-
-    Attributes:
-        baseline, protocols: as for `build_table`.
-        probes: those that the run folders are of.
-        published: as for `render`.
-    """
+    """What a page is made with: as for `build_table` and `render`, and the probes among the run folders."""
 
     baseline: str | None
     probes: Sequence[ProbeSection]
@@ -50,10 +44,8 @@ def build_page(
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
-    Args:
-        runs: what the run folders hold. Timings and videos are read from the folders themselves.
-        folder: where the page will be, for links to captures; None: the current folder.
-        options: what it is made with.
+    Timings and videos are read from the run folders. Links to captures are relative to `folder`, where the
+    page will be; None: the current folder.
 
     Raises:
         ReportError: there is no episode yet.
@@ -96,9 +88,7 @@ def build_page(
 def write_page(runs: Sequence[StoredRun], folder: Path, **options: Unpack[PageOptions]) -> Path:
     """Write the page into a folder, which is made if it is not there, and return its path.
 
-    Raises:
-        ReportError: there is no episode yet, or the page cannot be written there.
-        UnknownNameError: there is no such baseline.
+    Errors as `build_page`; or `ReportError` if the page cannot be written there.
     """
     page = build_page(runs, folder=folder, **options)
     path = folder / PAGE_FILE

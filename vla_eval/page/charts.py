@@ -1,7 +1,7 @@
 """Draw estimates with intervals, and curves, by matplotlib. Knows nothing of runs or policies.
 
 No chart distinguishes series by color alone: each has its own marker or dash pattern, and its name in words.
-This module imports matplotlib, so only code that builds a page imports it.
+Only code that builds a page imports this module, as it imports matplotlib.
 """
 
 import io
@@ -50,7 +50,6 @@ class Series:
     """Points that belong together.
 
     Attributes:
-        name: in words.
         color: number of the color and of the marker.
         points: in order of x.
         kind: `chance` and `ceiling` are lines of reference, without markers.
@@ -95,12 +94,8 @@ def forest(
 ) -> Chart:
     """Draw rates with intervals, one below the other, chance and ceiling as ticks.
 
-    Args:
-        bars: from the top; a rate of None is said in words.
-        title: of the plot.
-        description: what it shows, for screen readers.
-        width_px: of the axis, where the screen is not narrow.
-        label_px: room for labels at least, so that the axes of several plots begin at the same place.
+    The description is for screen readers, `width_px` of the axis for a screen that is not narrow. `label_px`
+    is room for labels at least, so that the axes of several plots begin at the same place.
     """
     label = f"{title}. {description}"
     with own_style():
@@ -144,8 +139,6 @@ class Curves:
 
     Attributes:
         series: at least one point in all.
-        title: of the plot.
-        description: what it shows, for screen readers.
         x_title: what x is, with its unit.
         x_ticks: in increasing order; the first and the last are the ends of the axis.
         x_labels: what is written at each tick, if not its number.

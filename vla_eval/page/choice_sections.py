@@ -43,14 +43,7 @@ KIND_NAMES: dict[Kind, str] = {"item": "item", "place": "place (0 is the robot's
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """The choices of all rows with candidates.
-
-    Attributes:
-        explanations: of the causes.
-        table: episodes by cause.
-        missing: notes on what the records lack.
-        matrices: by the name of each row.
-    """
+    """The choices of all rows with candidates; matrices by the row's name, and what the records lack."""
 
     explanations: tuple[Explanation, ...]
     table: PrintedTable

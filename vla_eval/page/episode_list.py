@@ -9,7 +9,6 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from vla_eval.page.material import Material
-from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import rrd_file, video_file
 from vla_eval.tasks.objects.item_names import item_names
 
@@ -32,16 +31,14 @@ class _Files(NamedTuple):
 
 
 def episode_list(material: Material, folder: Path | None) -> EpisodeList:
-    """Return all episodes of the table's rows.
+    """Return all episodes of the table's rows; captures are linked from the folder, or the current one.
 
     Each is a list in the order of `FIELDS`; what is undefined is null. Texts are numbers into lists of texts,
     so that 30,000 episodes fit into a file of a few megabytes.
-
-    Captures are linked from the folder of the page; None: the current one.
     """
     files = _files(material, folder or Path())
     errors: dict[str, int] = {}
-    episodes = []
+    episodes: list[list[object]] = []
     rows = []
     for number, row in enumerate(material.table.rows):
         group = row.episodes
@@ -62,31 +59,18 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
                     error = errors.setdefault(
                         f"{record.error.kind}: {record.error.message[:200]}", len(errors)
                     )
-                episodes.append(_episode(number, record, error, files.get(id(record), _Files())))
-    data = {
-        "fields": FIELDS,
-        "outcomes": OUTCOMES,
-        "rows": rows,
-        "errors": list(errors),
-        "episodes": episodes,
-    }
+                episodes.append(
+                    [
+                        *(number, record.run, record.seed, OUTCOMES.index(record.outcome)),
+                        *(record.success_step, record.target, record.first_choice, error),
+                        *files.get(id(record), _Files()),
+                    ]
+                )
+    names = {"fields": FIELDS, "outcomes": OUTCOMES}
+    data = {**names, "rows": rows, "errors": list(errors), "episodes": episodes}
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     # `<` is escaped as JSON does it, so that no text in it can end the element.
     return EpisodeList(len(episodes), Markup(text.replace("<", "\\u003c")))
-
-
-def _episode(row: int, record: EpisodeRecord, error: int | None, files: _Files) -> list[object]:
-    return [
-        row,
-        record.run,
-        record.seed,
-        OUTCOMES.index(record.outcome),
-        record.success_step,
-        record.target,
-        record.first_choice,
-        error,
-        *files,
-    ]
 
 
 def _files(material: Material, folder: Path) -> dict[int, _Files]:

@@ -28,11 +28,7 @@ class Filmstrips:
 
 
 def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
-    """Write a sheet for each row of the table that has captured episodes.
-
-    Args:
-        runs: what the run folders hold.
-        folder: for `TASK_POLICY_Kn.png`; it is made if it is not there.
+    """Write `TASK_POLICY_Kn.png` into a folder for each row of the table that has captured episodes.
 
     Raises:
         ViewingError: no episode was captured, or a file cannot be read or written.
@@ -81,9 +77,8 @@ def _row(record: EpisodeRecord, path: Path) -> SheetRow:
     try:
         frames = read_stills(path)
     except OSError as exc:
-        raise ViewingError(
-            f"{path}: cannot be read as stills of an episode ({exc}). Remove the file."
-        ) from exc
+        problem = f"cannot be read as stills of an episode ({exc}). Remove the file."
+        raise ViewingError(f"{path}: {problem}") from exc
     lines = [f"seed {record.seed}"] + ([f"run {record.run}"] if record.run else [])
     if record.n_candidates and record.target is not None:
         names = item_names(record.task, record.n_candidates)

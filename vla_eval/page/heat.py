@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from vla_eval.page.charts import PX, Chart
 from vla_eval.page.svg import PALETTE, PNG_DPI, inline_svg, own_style
 from vla_eval.page.tables import DARKEST
-from vla_eval.results.printed_table import UNDEFINED
+from vla_eval.results.own_statistics import rate as rate_text
 
 CELL_PX = (62, 34)
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 10, 8, 44
@@ -20,14 +20,7 @@ TITLE_PX = 24
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeatMap:
-    """Rates by two numbers.
-
-    Attributes:
-        title: of the drawing.
-        row_title, column_title: what rows and columns count, with the unit.
-        rows, columns: their numbers, from the top and from the left.
-        rates: of each row, a rate in [0, 1] for each column; None where nothing is known.
-    """
+    """Rates in [0, 1] by two numbers, whose titles have the unit; None where nothing is known."""
 
     title: str
     row_title: str
@@ -48,7 +41,7 @@ class HeatMap:
     def description(self) -> str:
         """The rates in words, for screen readers."""
         return "; ".join(
-            f"{self.row_title} {row}, {self.column_title} {column}: {_shown(rate)}"
+            f"{self.row_title} {row}, {self.column_title} {column}: {rate_text(rate)}"
             for row, rates in zip(self.rows, self.rates, strict=True)
             for column, rate in zip(self.columns, rates, strict=True)
         )
@@ -97,9 +90,5 @@ def _draw(figure: Figure, heat: HeatMap, *, left: int, whole: tuple[int, int]) -
                 patch = Rectangle((x, y), 1, 1, facecolor=PALETTE["c0"], alpha=DARKEST * rate, linewidth=0)
                 axes.add_patch(patch)
             axes.add_patch(Rectangle((x, y), 1, 1, fill=False, edgecolor=PALETTE["rule"], linewidth=1))
-            axes.text(x + 0.5, y + 0.5, _shown(rate), ha="center", va="center_baseline")
+            axes.text(x + 0.5, y + 0.5, rate_text(rate), ha="center", va="center_baseline")
     return axes
-
-
-def _shown(rate: float | None) -> str:
-    return UNDEFINED if rate is None else f"{rate:.2f}"

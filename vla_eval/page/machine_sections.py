@@ -160,12 +160,9 @@ class Reproduction:
     """What is needed to reproduce a run.
 
     Attributes:
-        title: folder and name of the run.
         commands: from the checkout to the last session; empty if none was recorded.
         lock: versions of packages, and digests of all that the results depend on.
         warning: why the commands may not be enough; may be empty.
-        listings: recipes, statistics and environment.
-        config: the resolved configuration as JSON.
         environment_changes: how the machine or the versions changed between sessions.
     """
 

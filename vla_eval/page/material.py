@@ -15,7 +15,6 @@ class Material:
     """The data of a page.
 
     Attributes:
-        runs: each run folder once.
         table: as `mikasa-vla report` prints it.
         timings: run folder -> episode -> seconds.
         colors: policy -> number of its colour and marker, the same in every plot.
@@ -43,17 +42,7 @@ class Material:
 
 
 def gather(runs: Sequence[StoredRun], *, baseline: str | None, protocols: Sequence[str] = ()) -> Material:
-    """Read and compute everything that the page shows.
-
-    Args:
-        runs: what the run folders hold; a folder given twice counts once.
-        baseline: as for `build_table`.
-        protocols: as for `build_table`.
-
-    Raises:
-        ReportError: there is no episode yet.
-        UnknownNameError: there is no such baseline or protocol.
-    """
+    """Read and compute everything that the page shows; arguments as for `build_table`, which may refuse."""
     runs = tuple({run.path.resolve(): run for run in runs}.values())
     table = build_table(runs, baseline=baseline, protocols=protocols)
     policies = dict.fromkeys(row.policy for row in table.rows)

@@ -37,16 +37,8 @@ class ProbeSection:
     """A probe, or a grid.
 
     Attributes:
-        title: its folder.
-        table: its rows.
-        sentences: what it found, in words.
-        notes: what a reader has to know.
-        plots: curves; None where there are none.
-        curves_table: numbers of the curves; None where there are none.
-        heat: heat maps by their title.
         matrices: pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is
             right if some of its pairs follow both cues.
-        films: pairs of episodes.
     """
 
     title: str

@@ -23,7 +23,7 @@ from vla_eval.page.charts import (
 )
 from vla_eval.page.material import Material
 from vla_eval.page.tables import page_table
-from vla_eval.results.own_statistics import EPISODES, STEPS, SUCCESS
+from vla_eval.results.own_statistics import EPISODES, STEPS, SUCCESS, rate
 from vla_eval.results.printed_table import UNDEFINED, PrintedTable
 from vla_eval.results.relative_statistics import CEILING, CHANCE, PAIRED
 from vla_eval.results.success_table import Row
@@ -81,7 +81,7 @@ def success_plots(material: Material) -> Plots:
             for row in material.rows_of(task)
         ]
         described = "; ".join(
-            f"{bar.label}: {_rate(bar.value)} "
+            f"{bar.label}: {rate(bar.value)} "
             + ("(no interval)" if bar.low is None else f"({bar.low:.2f} to {bar.high:.2f})")
             for bar in bars
         )
@@ -103,7 +103,7 @@ def chunk_plots(material: Material) -> Plots:
                 continue
             colors |= {row.policy: material.colors[row.policy] for row in own}
             described = "; ".join(
-                f"{material.name_of(row)}: {_rate(row[SUCCESS].success_once)}" for row in own
+                f"{material.name_of(row)}: {rate(row[SUCCESS].success_once)}" for row in own
             )
             charts.append(
                 Curves(
@@ -199,9 +199,9 @@ def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
             name=policy,
             color=material.colors[policy],
             points=tuple(
-                Point(row.n_action_steps, rate, row[SUCCESS].ci_low, row[SUCCESS].ci_high)
+                Point(row.n_action_steps, success, row[SUCCESS].ci_low, row[SUCCESS].ci_high)
                 for row in rows
-                if row.policy == policy and (rate := row[SUCCESS].success_once) is not None
+                if row.policy == policy and (success := row[SUCCESS].success_once) is not None
             ),
         )
         for policy in dict.fromkeys(row.policy for row in rows)
@@ -211,9 +211,9 @@ def _by_chunk(material: Material, rows: Sequence[Row]) -> list[Series]:
         "ceiling": lambda row: row[CEILING],
     }
     for kind, rate_of in kinds.items():
-        known = {r.n_action_steps: rate for r in rows if (rate := rate_of(r)) is not None}
+        known = {r.n_action_steps: found for r in rows if (found := rate_of(r)) is not None}
         if known:
-            points = tuple(Point(size, rate) for size, rate in sorted(known.items()))
+            points = tuple(Point(size, found) for size, found in sorted(known.items()))
             series.append(Series(name=kind, color=0, points=points, kind=kind))
     return series
 
@@ -235,10 +235,6 @@ def _cumulative(material: Material, row: Row, horizon: int) -> Series:
     points = [Point(0, 0.0), *(Point(step, (i + 1) / len(results)) for i, step in enumerate(steps))]
     points.append(Point(horizon, points[-1].y))
     return Series(name=row.policy, color=material.colors[row.policy], points=tuple(points), is_step=True)
-
-
-def _rate(value: float | None) -> str:
-    return UNDEFINED if value is None else f"{value:.2f}"
 
 
 def _steps(row: Row) -> str:

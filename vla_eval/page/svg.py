@@ -10,7 +10,6 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from types import MappingProxyType
 from xml.etree import ElementTree
 
 import matplotlib
@@ -21,20 +20,18 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 # Variables of page.css with their light values: a color of a figure is replaced by the variable.
-PALETTE: Mapping[str, str] = MappingProxyType(
-    {
-        "c0": "#0072b2",
-        "c1": "#d55e00",
-        "c2": "#009e73",
-        "c3": "#cc79a7",
-        "c4": "#e69f00",
-        "c5": "#56b4e9",
-        "ink": "#1b1d21",
-        "muted": "#5a606b",
-        "rule": "#d9dce1",
-        "paper": "#ffffff",
-    }
-)
+PALETTE: Mapping[str, str] = {
+    "c0": "#0072b2",
+    "c1": "#d55e00",
+    "c2": "#009e73",
+    "c3": "#cc79a7",
+    "c4": "#e69f00",
+    "c5": "#56b4e9",
+    "ink": "#1b1d21",
+    "muted": "#5a606b",
+    "rule": "#d9dce1",
+    "paper": "#ffffff",
+}
 _VARIABLES = {color: f"var(--{name})" for name, color in PALETTE.items()}
 PNG_DPI = 144  # of drawings that are files
 GROUPS = frozenset({"whisker", "marker", "curve", "chance", "ceiling"})
@@ -81,10 +78,8 @@ def text_width_px(text: str) -> float:
 def inline_svg(figure: Figure, *, label: str | None, css_class: str | None = None) -> Markup:
     """Return a figure as an `svg` element; call it within `own_style`.
 
-    Args:
-        figure: its colors are of `PALETTE`; nothing in it reaches beyond its axes.
-        label: what it shows, for screen readers; None for a decoration.
-        css_class: of the element.
+    Its colors are of `PALETTE`, and nothing in it reaches beyond its axes. The label is for screen readers;
+    None for a decoration.
     """
     file = io.StringIO()
     with _missing_glyphs_allowed():

@@ -29,12 +29,7 @@ class Matrix(NamedTuple):
 def shaded(
     counts: Sequence[Sequence[int]], is_right: Callable[[int, int], bool]
 ) -> tuple[tuple[MatrixCell, ...], ...]:
-    """Return the cells of a matrix of counts, the most frequent one the darkest.
-
-    Args:
-        counts: of each row; one of them is above 0.
-        is_right: whether the cell of this row and column is outlined as right.
-    """
+    """Return the cells of a matrix of counts, of which one is above 0; the most frequent is the darkest."""
     most = max(map(max, counts))
     return tuple(
         tuple(MatrixCell(n, DARKEST * n / most, is_right(y, x)) for x, n in enumerate(row))

@@ -18,8 +18,6 @@ class ChoicePairs:
     """The pairs of one policy in a world with another cue.
 
     Attributes:
-        world: the other world.
-        policy, n_action_steps: whose pairs they are.
         names: of the candidates, by index, and `NO_CHOICE` last.
         counts: by the indices of the choices in `names`, in the world as drawn and in the other one: how many
             pairs have these choices, and how many of them follow the cue in both worlds.

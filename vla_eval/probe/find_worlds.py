@@ -1,7 +1,4 @@
-"""Find the worlds of probes and grids among run folders; a probe is the worlds of one folder.
-
-Which world a run is of is stated by the name in its `run.json`, whatever the folder is called.
-"""
+"""Find the worlds of probes and grids among run folders, by the names in their `run.json`."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -33,9 +30,7 @@ class FoundProbe:
     """The worlds that lie in one folder.
 
     Attributes:
-        folder: where their run folders are.
         worlds: of tasks whose world as drawn is there, too: by task, then in the order of `INTERVENTIONS`.
-        grid: of a grid.
         doubles: notes on run folders that have the name of another one, and are left out.
     """
 

@@ -1,7 +1,7 @@
 """The evaluations of a grid: chunk lengths against the length of a phase, at each first inference.
 
 Where K does not divide the phases, how much of the cue falls between two inferences depends on where the
-first one is. So every first inference below K is run there. Knows nothing of records or statistics.
+first one is. So every first inference below K is run there.
 """
 
 import re
@@ -51,16 +51,7 @@ class GridSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridWorld:
-    """One evaluation of a grid: a task, the length of a phase, and a first inference, at one or more K.
-
-    Attributes:
-        task: task id.
-        axis: the phase that has another length.
-        level: its length in control steps.
-        first_inference_step: the control step of the first inference.
-        phases: the phases with this length.
-        config: the evaluation; its name is the run folder's.
-    """
+    """One evaluation of a grid: a phase of `level` control steps, and a first inference, at some K."""
 
     task: str
     axis: Axis
@@ -105,12 +96,9 @@ class Grid:
 
 
 def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
-    """Return the evaluations that a grid consists of.
+    """Return the evaluations that a grid consists of, at `DEFAULT_N_ACTION_STEPS` unless K is configured.
 
-    Args:
-        config: tasks, policies, seeds and all that is the same everywhere; without n_action_steps, those of
-            `DEFAULT_N_ACTION_STEPS`.
-        settings: what is changed.
+    All that the configuration names is the same everywhere but for what the settings change.
 
     Raises:
         UnknownNameError: a task that is not in the catalogue.

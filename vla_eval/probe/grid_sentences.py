@@ -6,19 +6,14 @@ from vla_eval.probe.text_table import error_notes
 
 def grid_sentences(table: GridTable) -> list[str]:
     """Return a sentence for each cell in which a policy succeeds less than in its best cell."""
-    found = []
-    for cells in _by_policy(table).values():
-        best = max(cells, key=lambda cell: cell.rate or 0.0)
-        found += [sentence for cell in cells if (sentence := _sentence(table, cell, best)) is not None]
-    return found
-
-
-def _by_policy(table: GridTable) -> dict[tuple[str, str, str], list[GridCell]]:
-    """Return the cells of each policy that has a reference, those without a result left out."""
-    found: dict[tuple[str, str, str], list[GridCell]] = {}
+    by_policy: dict[tuple[str, str, str], list[GridCell]] = {}
     for cell in table.cells:
         if cell.reference is not None and cell.rate is not None:
-            found.setdefault((cell.task, cell.axis, cell.policy), []).append(cell)
+            by_policy.setdefault((cell.task, cell.axis, cell.policy), []).append(cell)
+    found = []
+    for cells in by_policy.values():
+        best = max(cells, key=lambda cell: cell.rate or 0.0)
+        found += [sentence for cell in cells if (sentence := _sentence(table, cell, best)) is not None]
     return found
 
 
@@ -26,10 +21,7 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
     now, at_best = table.reference_of(cell), table.reference_of(best)
     if not _is_below(cell, best) or now is None or at_best is None:
         return None
-    drop = (
-        f"{cell.policy} on {cell.task} succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at "
-        f"{_where(best)}"
-    )
+    drop = f"succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at {_where(best)}"
     rates = f"succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase"
     if not _is_below(now, at_best):
         said = f"{rates} do not explain the drop"
@@ -40,7 +32,8 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
             f"falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the drop, not "
             "memory"
         )
-    return f"{drop}; {now.policy}, which has the same inferences and forgets nothing, {said}."
+    same = f"{now.policy}, which has the same inferences and forgets nothing,"
+    return f"{cell.policy} on {cell.task} {drop}; {same} {said}."
 
 
 def _is_below(one: GridCell, other: GridCell) -> bool:

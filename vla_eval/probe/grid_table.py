@@ -20,12 +20,10 @@ class GridPart:
     """The episodes of a cell with one first inference.
 
     Attributes:
-        first_inference_step: its control step.
         inferences: which inferences fall into the cue, and how many steps of the response are executed
             before the first inference of the response.
         n_seen: frames of the cue that the policy is given; None while no record says what it reads.
         success, followed: episodes that succeed, and that follow the cue; None without a result.
-        n_errors: episodes without a result.
     """
 
     first_inference_step: int
@@ -41,7 +39,6 @@ class GridCell:
     """One policy at one K with one length of a phase.
 
     Attributes:
-        task, axis, level, policy, n_action_steps: which cell it is.
         n_cue_frames: control steps at which a cue is in view.
         parts: one for each first inference.
         n_seeds: different episodes; each is run at every first inference.
@@ -92,12 +89,8 @@ class GridTable:
     def reference_of(self, cell: GridCell) -> GridCell | None:
         """Return the cell of the reference at the same K and length; None without one."""
         key = (cell.task, cell.axis, cell.level, cell.reference, cell.n_action_steps)
-        same = (
-            one
-            for one in self.cells
-            if (one.task, one.axis, one.level, one.policy, one.n_action_steps) == key
-        )
-        return next(same, None)
+        keys = ((one.task, one.axis, one.level, one.policy, one.n_action_steps) for one in self.cells)
+        return next((one for one, own in zip(self.cells, keys, strict=True) if own == key), None)
 
 
 def read_grid(worlds: Sequence[GridWorld], out: Path) -> GridTable:
@@ -106,12 +99,7 @@ def read_grid(worlds: Sequence[GridWorld], out: Path) -> GridTable:
 
 
 def grid_table(worlds: Sequence[GridWorld], records: Sequence[Sequence[EpisodeRecord]]) -> GridTable:
-    """Return the table.
-
-    Args:
-        worlds: what was run.
-        records: of each world, in any order.
-    """
+    """Return the table of these worlds, each with its records in any order."""
     found: dict[tuple[str, Axis], list[_Run]] = {}
     for world, own in zip(worlds, records, strict=True):
         found.setdefault((world.task, world.axis), []).append((world, by_policy(own)))

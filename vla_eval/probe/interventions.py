@@ -22,7 +22,6 @@ OWN_FIELDS: Mapping[str, object] = {
 }
 """Fields of an evaluation that a probe changes, and their values in the world as drawn."""
 
-
 LEAST_MOTION_STEPS = 2
 """One step out and one back."""
 
@@ -31,7 +30,6 @@ class Rule(NamedTuple):
     """One intervention.
 
     Attributes:
-        worlds: its worlds of a task; none where it makes no sense.
         why_not: why there are none, for a message.
         clause: how a sentence begins that says in how many episodes the cue is followed; `{level}` is the
             level. Swaps have a sentence of their own.
@@ -154,11 +152,7 @@ class Probe:
 
 
 def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
-    """Return the evaluations that a probe consists of.
-
-    Args:
-        config: tasks, policies, seeds and all that is the same in every world.
-        settings: what is changed.
+    """Return the evaluations of a probe: the configured one, in each world that the settings name.
 
     Raises:
         UnknownNameError: a task that is not in the catalogue.

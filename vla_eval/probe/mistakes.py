@@ -92,10 +92,7 @@ def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
     Of the first touches, as many as items were shown, some are right. A policy that keeps k of L items and
     touches others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The
     number kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of
-    the bootstrap over episodes.
-
-    Returns:
-        None if touches are not known, one item is right, or all of them are.
+    the bootstrap over episodes. None if touches are not known, one item is right, or all of them are.
     """
     known = [found for record in records if (found := _touches(record)) is not None]
     if not known or any(not 1 < len(one.right) < one.n_candidates for one in known):

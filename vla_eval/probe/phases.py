@@ -25,12 +25,10 @@ class Phases:
     """The phases of a task whose lengths are not drawn per episode.
 
     Attributes:
-        cue_after_steps: control steps before the cue.
         cue_steps: control steps for which the cue, or each of its items, is shown.
         n_in_turn: how many items are shown one after another; 1 if all are shown at once.
         gap_steps: steps between two of them.
         delay_steps: steps between cue and response.
-        horizon_steps: length of the episode.
     """
 
     cue_after_steps: int
@@ -43,8 +41,7 @@ class Phases:
     @property
     def cue_end_step(self) -> int:
         """The first step after the cue."""
-        of_all = total_cue_steps(self.cue_steps, self.n_in_turn, self.gap_steps)
-        return self.cue_after_steps + of_all
+        return self.cue_after_steps + total_cue_steps(self.cue_steps, self.n_in_turn, self.gap_steps)
 
     @property
     def response_step(self) -> int:
@@ -65,21 +62,14 @@ class Phases:
 
 
 def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  # Any: a task's arguments
-    """Return the phases of a task with these arguments.
+    """Return the phases of a task with these arguments; None for a task without phases.
 
-    Returns:
-        None for a task without phases; the name of an argument that is not one number.
+    If the length of one is drawn per episode: the name of the argument that is not one number.
     """
     if spec.candidates is None:
         return None
-    given = {
-        "cue_steps": CUE_STEPS,
-        "delay_steps": default_delay_steps(spec),
-        "gap_steps": 0,
-        "cue_after_steps": 0,
-        **spec.kwargs,
-        **env,
-    }
+    usual = {"cue_steps": CUE_STEPS, "delay_steps": default_delay_steps(spec)}
+    given = {**usual, "gap_steps": 0, "cue_after_steps": 0, **spec.kwargs, **env}
     for name in ("cue_after_steps", "cue_steps", "delay_steps", "gap_steps", "horizon_steps"):
         if name in given and (not isinstance(given[name], int) or isinstance(given[name], bool)):
             return name
@@ -97,11 +87,7 @@ def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  #
 
 
 def fixed_phases(spec: TaskSpec, env: Mapping[str, Any]) -> Phases:  # Any: a task's arguments
-    """Return the phases of a task that has some.
-
-    Raises:
-        RecipeError: the length of one is drawn per episode.
-    """
+    """Return the phases of a task that has some; refuse a length that is drawn per episode."""
     phases = phases_of(spec, env)
     if isinstance(phases, str):
         raise RecipeError(
@@ -115,10 +101,8 @@ def fixed_phases(spec: TaskSpec, env: Mapping[str, Any]) -> Phases:  # Any: a ta
 def divides(phases: Phases, n_action_steps: int) -> bool:
     """Whether each phase, and each item of the cue, begins with an inference if the first one is at 0."""
     turn_steps = phases.cue_steps + phases.gap_steps
-    begins = (
-        *(phases.cue_after_steps, phases.cue_end_step, phases.response_step),
-        turn_steps if phases.n_in_turn > 1 else 0,
-    )
+    begins = [phases.cue_after_steps, phases.cue_end_step, phases.response_step]
+    begins += [turn_steps] if phases.n_in_turn > 1 else []
     return all(step % n_action_steps == 0 for step in begins)
 
 

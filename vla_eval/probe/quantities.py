@@ -101,7 +101,6 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
     """Return the quantities of the pairs of a swapped cue; None without a pair."""
     if not pairs:
         return None
-    n_pairs = len(pairs)
     moved = _share(pairs, lambda pair: pair.drawn.trajectory_sha256 != pair.other.trajectory_sha256)
     change_of = _change_of(pairs, spec)
     by_change: dict[ChangeOf | None, Share | None] = {
@@ -111,14 +110,14 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
         "actions": moved,
         None: None,
     }
-    n_successes = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs)
+    value = sum(bool(one.success_once) + bool(two.success_once) for one, two in pairs) / (2 * len(pairs))
     return SwapQuantities(
         change_of=change_of,
         sensitivity=by_change[change_of],
         actions_changed=None if spec.entry_point in CUE_IN_STATE else moved,
         warranted_choice=_share(pairs, lambda pair: follows(pair.drawn) and follows(pair.other)),
-        matched_value=n_successes / (2 * n_pairs),
-        matched_interval=wilson_of_rate(n_successes / (2 * n_pairs), n_pairs),
+        matched_value=value,
+        matched_interval=wilson_of_rate(value, len(pairs)),
         reliability=_share(pairs, lambda pair: bool(pair.drawn.success_once and pair.other.success_once)),
         p_value=_sign_test(pairs),
     )
@@ -146,10 +145,8 @@ def _share(pairs: Sequence[Pair], holds: Callable[[Pair], bool]) -> Share:
 
 
 def _touches_other_items(pair: Pair) -> bool:
-    one, other = (
-        set((record.touched_candidates or ())[: len(record.right_candidates or ())]) for record in pair
-    )
-    return one != other
+    touched = [(r.touched_candidates or ())[: len(r.right_candidates or ())] for r in pair]
+    return set(touched[0]) != set(touched[1])
 
 
 def _turns_differently(pair: Pair) -> bool:

@@ -36,7 +36,6 @@ class HalfLife:
     Attributes:
         steps: None if more than half is left at the longest delay.
         interval: at 95 %, by bootstrap over seeds; an end that is None lies beyond the longest delay.
-        longest_delay: the longest delay that was measured.
     """
 
     steps: float | None
@@ -45,14 +44,10 @@ class HalfLife:
 
 
 def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | None:
-    """Return the half-life of a memory.
+    """Return the half-life of a memory: delay in steps -> episodes, and the rate without memory.
 
     A decreasing curve is fitted to the rates (isotonic regression), and read between the delays by linear
     interpolation.
-
-    Args:
-        followed: delay in steps -> whether each episode follows the cue.
-        chance: rate of following the cue without memory.
 
     Returns:
         None if there are fewer than two delays, or if at the shortest one the cue is not followed more often
@@ -69,16 +64,11 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
         n_episodes, lambda chosen: _halved_at(delays, episodes[:, chosen].mean(axis=1), chance)
     )
     steps = _halved_at(delays, episodes.mean(axis=1), chance)
-    if (
-        low == high and steps != BEYOND
-    ):  # all draws are alike: then no more is known than between which delays
+    if low == high and steps != BEYOND:  # all draws are alike: known is only between which delays
         low = max((delay for delay in delays if delay < steps), default=delays[0])
         high = min(delay for delay in delays if delay >= steps)
-    return HalfLife(
-        steps=_known(steps),
-        interval=Range(_known(low), _known(high)),
-        longest_delay=delays[-1],
-    )
+    interval = Range(_known(low), _known(high))
+    return HalfLife(steps=_known(steps), interval=interval, longest_delay=delays[-1])
 
 
 def _halved_at(delays: Sequence[int], rates: NDArray[np.float64], chance: float) -> float:
@@ -90,8 +80,7 @@ def _halved_at(delays: Sequence[int], rates: NDArray[np.float64], chance: float)
     below = np.flatnonzero(fitted <= middle)
     if not below.size:
         return BEYOND
-    after = int(below[0])
-    before = after - 1
+    before, after = int(below[0]) - 1, int(below[0])
     share = (fitted[before] - middle) / (fitted[before] - fitted[after])
     return float(delays[before] + share * (delays[after] - delays[before]))
 
@@ -127,15 +116,10 @@ class Contrast(NamedTuple):
 
 
 def contrast(delay_steps: int, after: Followed, other: Followed) -> Contrast:
-    """Return the difference of two worlds with the same episodes.
+    """Return the difference of two worlds with the same episodes in the same order: other minus after.
 
     The interval is that of the bootstrap over seeds; where all draws are alike, it reaches from the least to
     the most that both Wilson intervals allow.
-
-    Args:
-        delay_steps: the delay.
-        after: whether the episodes follow the cue after it.
-        other: the same in another world, in the same order.
     """
     per_episode = other.astype(float) - after
     low, high = _bootstrap(len(per_episode), lambda chosen: float(per_episode[chosen].mean()))

@@ -28,7 +28,6 @@ class Retention:
     """How the delay affects one policy on one task.
 
     Attributes:
-        task, policy, n_action_steps: whose curve it is.
         of: of the episodes, those that follow the cue; or of the pairs, those that follow it in both worlds.
         points: by growing delay, of all episodes or pairs with a result.
         half_life: of the episodes or pairs that have a result at each delay; None where it is undefined.

@@ -33,13 +33,9 @@ class ProbeRow:
     """One policy in one world, compared with the world as it is drawn, or with another one of its delay.
 
     Attributes:
-        task, policy, n_action_steps: whose row it is.
-        intervention, level: the world.
         delay_steps: its delay; None for a task without one.
         inferences: which inferences fall into the cue; None without phases, or if their lengths are drawn.
         n_pairs: episodes with a result in this world and in the one that it is compared with.
-        swap: of a swapped cue or order.
-        followed: episodes of this world that follow the cue.
         n_without_choice: episodes of this world in which no candidate was touched; None without candidates.
         success: episodes of this world that succeed; None without a result.
         chance: rate of following the cue without memory; None where it is not known.
@@ -48,7 +44,6 @@ class ProbeRow:
         over_delay: of another appearance: by how much more is followed than after the longest delay.
         left: share of following that this world leaves, and its interval; None for swaps and `none`.
         p_value: exact paired test against that world; corrected_p: after Holm, over the table.
-        n_errors: episodes of this world without a result.
     """
 
     task: str
@@ -107,12 +102,9 @@ def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:
 def probe_table(
     worlds: Sequence[World], records: Sequence[Sequence[EpisodeRecord]], *, order: Sequence[str] = ()
 ) -> ProbeTable:
-    """Return the table.
+    """Return the table of worlds, each with its records in any order; each task's `none` comes first.
 
-    Args:
-        worlds: what was run; each task's `none` comes before its other worlds.
-        records: of each world, in any order.
-        order: the policies' names in the order of the rows; others come last, by name.
+    `order` is that of the policies' names; others come last, by name.
     """
     by_world = [(world, by_policy(found)) for world, found in zip(worlds, records, strict=True)]
     drawn = {world.task: found for world, found in by_world if world.intervention == AS_DRAWN}

@@ -1,8 +1,4 @@
-"""The worlds of a probe: a task with one thing changed, on the same seeds.
-
-What is changed is the cue, the length of the delay, the policy's memory … Knows nothing of records or
-statistics.
-"""
+"""The worlds of a probe: a task with one thing changed (cue, delay, the policy's memory …), same seeds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,7 +26,6 @@ CONTROLS_OF_ONE = ("body_memory",)
 ITEMS = ("items", "cubes")
 """Kinds of candidates that can be shown, and so can distract."""
 
-
 MASKS: Mapping[str, CueViewKind] = {
     "cue": "hidden",
     "elsewhere": "hidden_elsewhere",
@@ -49,21 +44,16 @@ APPEARANCES: Mapping[str, AppearanceSettings] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeSettings:
-    """What a probe changes.
+    """What a probe changes; see `interventions.INTERVENTIONS`, of which `probes` are keys.
 
     Attributes:
-        probes: keys of `interventions.INTERVENTIONS`.
         swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
-        delays: values of `env.delay_steps`.
-        cues: values of `env.cue_steps`.
-        masks: keys of `MASKS`.
-        lates: values of `env.cue_after_steps`.
-        appearances: keys of `APPEARANCES`.
-        distractors: values of `env.distract_steps`.
+        delays, cues, lates, distractors: values of `env.delay_steps`, `env.cue_steps`, `env.cue_after_steps`
+            and `env.distract_steps`.
+        masks, appearances: keys of `MASKS` and `APPEARANCES`.
         instructions: prompt sets.
         reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
             of the response if that is later.
-        controls: whether the controls are run with the policies.
     """
 
     probes: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
@@ -84,11 +74,9 @@ class World:
     """One evaluation of a probe.
 
     Attributes:
-        task: task id.
         intervention: what is changed; `none` for the world that the others are compared with. `delay_swap`
             is compared with the `delay` of the same level.
         level: by how much: the swap's number, a number of steps, the step of a reset, or a prompt set.
-        config: the evaluation of this task; its name is the run folder's.
     """
 
     task: str
@@ -129,10 +117,8 @@ class TaskWorlds:
         """Return the worlds in which a phase has another length, with as many steps for the response."""
         phases = self.phases
         usual = phases.cue_steps if phase == "cue" else phases.delay_steps
-        return [
-            self.world(phase, length, phases.with_length(phase, length))
-            for length in sorted(set(lengths) - {usual})
-        ]
+        others = sorted(set(lengths) - {usual})
+        return [self.world(phase, steps, phases.with_length(phase, steps)) for steps in others]
 
     def swapped_after_delays(self) -> list[World]:
         """Return the worlds of each delay, as drawn and with the first of the other cues."""
@@ -150,11 +136,9 @@ class TaskWorlds:
 
     def late(self) -> list[World]:
         """Return the worlds in which nothing is shown before the cue, with as many steps after it."""
-        horizon_steps = self.phases.horizon_steps
-        return [
-            self.world("late", steps, {"cue_after_steps": steps, "horizon_steps": horizon_steps + steps})
-            for steps in self.settings.lates
-        ]
+        usual, lates = self.phases.horizon_steps, self.settings.lates
+        envs = [{"cue_after_steps": steps, "horizon_steps": usual + steps} for steps in lates]
+        return [self.world("late", *late) for late in zip(lates, envs, strict=True)]
 
     def distracted(self) -> list[World]:
         """Return the worlds with another item in the delay, if the delay is long enough."""

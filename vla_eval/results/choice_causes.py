@@ -1,7 +1,4 @@
-"""Outcomes of the choice in a row's episodes: right, not finished, forgot, habit, never chose, not moved.
-
-Reads records and returns counts; changes nothing. `docs/report_page.md` explains each cause.
-"""
+"""Outcomes of the choice in a row's episodes; `docs/report_page.md` explains each cause."""
 
 from collections import Counter
 from collections.abc import Mapping

@@ -45,13 +45,7 @@ class PairCounts(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunsEstimate:
-    """A success rate from several runs.
-
-    Attributes:
-        mean: mean of the run means.
-        sem: standard error of that mean, from the spread of the run means; None for a single run.
-        interval: t interval over the run means; None for a single run.
-    """
+    """A success rate from several runs: mean of the run means; their SEM and t interval, None for one run."""
 
     mean: float
     sem: float | None

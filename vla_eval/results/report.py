@@ -1,7 +1,4 @@
-"""Build the success table of one or more run folders; `render` writes it as text.
-
-Reads and returns; changes nothing. `docs/statistics.md` explains each column.
-"""
+"""Build the success table of run folders; `docs/statistics.md` explains each column."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -38,7 +38,6 @@ class Row:
     `docs/statistics.md` says what each statistic means and how it is computed.
 
     Attributes:
-        episodes: which episodes it is of.
         estimates: the value of each statistic, in the order of the columns of CSV and JSON.
         run: which run, for one of several; it is compared with nothing, so that no test counts twice.
     """
@@ -94,9 +93,7 @@ class ProtocolRow:
         n_tasks, n_runs: over how many tasks and runs the figure is.
         mean: mean over the tasks of success once; over several runs the mean of the run means. None where
             something departs from the protocol.
-        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
         sem: standard error over the runs.
-        lowest, highest: of the tasks' rates.
         departures: what is not as the protocol says.
     """
 
@@ -125,8 +122,6 @@ class Table:
     Attributes:
         rows: in the order of the configuration.
         run_rows: the runs of each row that has several.
-        notes: footnotes, whole sentences.
-        baselines: the policies with which the others are compared.
         n_comparisons: how many p values were corrected together.
         runs: run folder -> name of its configuration.
         protocols: the summary figures of published protocols, as far as the runs name any.

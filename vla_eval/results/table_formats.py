@@ -28,21 +28,12 @@ def render(
     preset: Preset | None = None,
     width: int | None = None,
 ) -> str:
-    """Write the table.
+    """Write the table; the text has no newline at its end.
 
-    Args:
-        table: what `build_table` returned.
-        fmt: `markdown`, `latex` and `html-table` are for reading, `csv` and `json` have every column in full
-            precision.
-        paper: add the paper's results for the same tasks, marked and separate from the measured ones.
-        published: add the published results of this board, marked and separate from the measured ones.
-        columns: names of the columns in the formats for reading, in this order; none: those that fit.
-        wide: all columns in the formats for reading, however wide the table becomes, and a row per run.
-        preset: `paper`: LaTeX with tasks as columns and policies as rows.
-        width: characters that the chosen columns have to fit into; None: `FITS_CHARACTERS`.
-
-    Returns:
-        The text, without a newline at its end.
+    `markdown`, `latex` and `html-table` are for reading: with these columns, in this order, or those that
+    fit `width` (None: `FITS_CHARACTERS`); `wide`: all of them, and a row per run. `csv` and `json` have every
+    column in full precision. The paper's results, or those of a published board, are marked and separate from
+    the measured ones. The preset `paper` is LaTeX with tasks as columns and policies as rows.
 
     Raises:
         UnknownNameError: there is no such column or board.

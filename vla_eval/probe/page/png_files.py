@@ -8,18 +8,13 @@ from vla_eval.lock.switch import let_write
 
 
 def write_beside(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write `FOLDER_NAME.png` for each name, such as `OUT_TASK_delay.png`, and return their paths.
-
-    Raises:
-        ReportError: a file cannot be written.
-    """
+    """Write `FOLDER_NAME.png` for each name, or raise `ReportError`; return their paths."""
     paths = [folder.parent / f"{folder.resolve().name}_{name}.png" for name in files]
     for path, png in zip(paths, files.values(), strict=True):
         let_write(path)
         try:
             path.write_bytes(png)
         except OSError as exc:
-            raise ReportError(
-                f"{path}: cannot be written ({exc.strerror or exc}). Name another --out."
-            ) from exc
+            problem = f"cannot be written ({exc.strerror or exc}). Name another --out."
+            raise ReportError(f"{path}: {problem}") from exc
     return paths

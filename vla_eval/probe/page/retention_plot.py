@@ -18,10 +18,7 @@ CURVES: dict[str, str] = {
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     """Write a PNG file per task and kind of curve, such as `OUT_TASK_follows.png`, and return their paths.
 
-    They go next to the folder, which holds run folders alone.
-
-    Raises:
-        ReportError: a file cannot be written.
+    They go next to the folder, which holds run folders alone; errors as `write_beside`.
     """
     curves = by_kind(table.retention)
     return write_beside(folder, {f"{own[0].task}_{own[0].of}": retention_png(own) for own in curves})
@@ -48,14 +45,11 @@ def retention_lines(curves: Sequence[Retention], colors: Mapping[str, int]) -> C
     delays = sorted({point.delay_steps for curve in curves for point in curve.points})
     series = [
         Series(
-            name=line_name(curve),
-            color=colors[line_name(curve)],
-            points=tuple(
-                Point(_x(point.delay_steps), point.share.rate, *point.share.interval)
-                for point in curve.points
-            ),
+            name=line_name(one),
+            color=colors[line_name(one)],
+            points=tuple(Point(_x(p.delay_steps), p.share.rate, *p.share.interval) for p in one.points),
         )
-        for curve in curves
+        for one in curves
     ]
     points = [point for curve in curves for point in curve.points]
     chances = {point.delay_steps: point.chance for point in points if point.chance is not None}

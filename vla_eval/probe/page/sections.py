@@ -81,11 +81,7 @@ def _half_lives(table: ProbeTable) -> PrintedTable:
         ]
         for curve in table.retention
     ]
-    return page_table(
-        rows,
-        text=("policy", "curve", "half-life"),
-        numbers=("chance",),
-    )
+    return page_table(rows, text=("policy", "curve", "half-life"), numbers=("chance",))
 
 
 def _matrix(pairs: ChoicePairs) -> Matrix:

@@ -42,8 +42,6 @@ class Board:
     """Results that are listed together.
 
     Attributes:
-        title: what is compared.
-        tasks: columns of the table.
         mean_over_tasks: whether the mean of all tasks is the figure that is compared; then it is computed
             where a source states every task but no mean.
     """
@@ -58,18 +56,13 @@ class PublishedResult:
     """One method as one source reports it. None, or nothing, is what the source does not state.
 
     Attributes:
-        method, family: its name and kind.
         source: key of `Published.sources`; where: the place in it.
         board: key of `Published.boards`.
-        control_mode, image_px, n_action_steps: of the policy.
         training: one model per task, or one for all tasks.
-        runs, episodes, seeds: of the evaluation.
         spread: which spread the rates have.
-        rates: task -> rate.
         mean: as the source states it.
         differs: what is known to differ from the protocol or from other rows.
         contested: task -> what contradicts its rate.
-        is_measured_here: whether it was measured by this project.
     """
 
     method: str
@@ -121,11 +114,7 @@ class Published:
             require(not unrated, f"{one.method}: contested", unrated, "tasks with a rate")
 
     def of_board(self, name: str) -> tuple[PublishedResult, ...]:
-        """Return the results of a board, in the file's order.
-
-        Raises:
-            UnknownNameError: there is no such board.
-        """
+        """Return the results of a board, in the file's order, or raise `UnknownNameError`."""
         if name not in self.boards:
             raise unknown_name("list of published results", name, self.boards, where="--published")
         return tuple(one for one in self.results if one.board == name)

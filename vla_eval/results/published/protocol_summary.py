@@ -1,7 +1,4 @@
-"""The summary figure of a published protocol, for each policy, and what departs from the protocol.
-
-A figure is given only where nothing departs. Reads and returns; changes nothing.
-"""
+"""The summary figures of a published protocol, where nothing departs from it; else what departs."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,11 +24,7 @@ class Summaries(NamedTuple):
 
 
 def protocol_summaries(runs: Sequence[StoredRun], grouping: Grouping, *, names: Sequence[str]) -> Summaries:
-    """Return the summary figures of the protocols that are asked for, and of those that the runs name.
-
-    Raises:
-        UnknownNameError, RecipeError: a protocol that is asked for does not exist, or cannot be read.
-    """
+    """Return the figures of protocols asked for, errors as `load_protocol`, and of those the runs name."""
     wanted = {name: load_protocol(name).value for name in names}
     notes = []
     for name in dict.fromkeys(name for run in runs if (name := named_protocol(run)) is not None):

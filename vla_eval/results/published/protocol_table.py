@@ -1,7 +1,7 @@
 """Summary figures of protocols as a table below the success table."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 from vla_eval.results.own_statistics import mean_text, rate
@@ -59,9 +59,8 @@ def _protocol_notes(rows: Sequence[ProtocolRow]) -> list[str]:
 
 
 def _csv_row(row: ProtocolRow) -> dict[str, Any]:  # Any: numbers and texts
-    own = {one.name: getattr(row, one.name) for one in fields(ProtocolRow)}
     return {
-        **own,
+        **asdict(row),
         "source": f"protocol {row.protocol} v{row.version}",
         "task": f"mean of {row.n_tasks} tasks" + (f" ({row.group})" if row.group else ""),
         "success_once": row.mean,

@@ -17,15 +17,12 @@ from vla_eval.results.success_table import Table
 
 CONTESTED, COMPUTED = "‡", "(computed)"
 PAPER_SOURCE = "“Memory, Benchmark & Robots” (ICLR 2026), appendix “VLA baselines”, table of VLA models"
+NO_FIGURES = "The paper's table of VLA models has none of these tasks."
 PAPER_PROTOCOL = "mean ± SEM, 3 runs × 100 episodes"
 
 
 def published_side_tables(board: str) -> list[SideTable]:
-    """Return the published results of a board, and how they were measured.
-
-    Raises:
-        UnknownNameError: there is no such board.
-    """
+    """Return a board's published results and how they were measured; errors as `of_board`."""
     published = load_published()
     results = published.of_board(board)
     tasks = published.boards[board].tasks
@@ -57,11 +54,7 @@ def paper_side_table(table: Table) -> SideTable:
         title=f"The paper's figures, not measured here ({PAPER_PROTOCOL})",
         columns=_PAPER_COLUMNS,
         rows=cells_of(_PAPER_COLUMNS, figures),
-        notes=[
-            f"Source: {PAPER_SOURCE}."
-            if figures
-            else "The paper's table of VLA models has none of these tasks."
-        ],
+        notes=[f"Source: {PAPER_SOURCE}." if figures else NO_FIGURES],
         csv_rows=[{"source": "paper", "policy": one["model"], **one} for one in fields],
         json={"paper": {"source": PAPER_SOURCE, "protocol": PAPER_PROTOCOL, "rows": fields}},
     )
